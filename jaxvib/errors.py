@@ -1,0 +1,44 @@
+"""The two ways in which a question to jaxvib can fail."""
+
+from __future__ import annotations
+
+__all__ = ["ComputationError", "InputError"]
+
+
+class InputError(ValueError):
+    """A value that was given is not allowed.
+
+    The message is one sentence that says which value it is, what is allowed and how to mend it.
+    `field` holds the dotted name of the value ("machine.mass[1]"), so that a file or a form can point at it.
+
+    >>> raise InputError("loads.count", "is 0; a machine needs at least 1 load")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: loads.count is 0; a machine needs at least 1 load
+    """
+
+    field: str
+    problem: str
+
+    def __init__(self, field: str, problem: str):
+        super().__init__(f"{field} {problem}")
+        self.field = field
+        self.problem = problem
+
+
+class ComputationError(RuntimeError):
+    """The input is good, the computation still has no answer; `status` names why.
+
+    Functions that raise it take `throw=False` to return the status in place of raising.
+
+    >>> raise ComputationError("max_steps_reached", "the run needs more than 16 steps")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.ComputationError: max_steps_reached: the run needs more than 16 steps
+    """
+
+    status: str
+
+    def __init__(self, status: str, message: str):
+        super().__init__(f"{status}: {message}")
+        self.status = status

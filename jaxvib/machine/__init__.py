@@ -1,0 +1,1 @@
+"""What is built: frozen parameters, no time."""

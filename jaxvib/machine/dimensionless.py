@@ -1,0 +1,175 @@
+"""The dimensionless forms of the two platform papers: a way to build a scene and to read its results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import Number, number, numbers
+from jaxvib.machine.units import count as whole
+
+__all__ = ["Dimensionless"]
+
+_LINKS: dict[int, tuple[tuple[int, int], ...]] = {1: (), 2: ((1, 2),), 3: ((1, 2), (1, 3), (2, 3))}
+_KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
+
+
+class Dimensionless(eqx.Module):
+    """A platform machine in the papers' dimensionless numbers; the exciter is on platform 2 (1 where there is only one).
+
+    With the exciter's total mass M2S = M2 + N m (loads included), time tau = w t, unbalance scale s~ and length y~ = s~/M2S:
+
+        v_i = y_i/(rho_i y~), rho_i = M2S/M_i, n = speed/w, n_i^2 = k_i/(M_i w^2), n_ij^2 = k_ij/(M2S w^2),
+        h_i = b_i/(2 M_i w), h_ij = b_ij/(2 M2S w), eps = y~/(kappa R), beta = b_W/(eps kappa m w)
+
+    The two papers scale the unbalance differently, and eps and v_i with it:
+
+    - `form="antiphase"`: s~ = m R, so that s_y = sum sin phi_j, collected loads have s = N, eps is that of one load
+    - `form="criterion"`: s~ = N m R, so that s_y = (1/N) sum sin phi_j, s = 1, eps is that of all loads
+
+    **Arguments**: `natural` n_i and `damping` h_i, one a platform; `link_natural` n_ij and `link_damping` h_ij, one a link
+    (12 for two masses; 12, 13, 23 for three); `rho` rho_i of the platforms without the exciter, in order; `eps`, `beta`,
+    `speed` n; `count` N. The machine's size is free: `mass_scale` M2S kg, `frequency_scale` w rad/s, `radius` R m,
+    `kappa` at least 1 (the loads are pendulums with that kappa).
+
+    **Raises** `InputError` for lengths that do not fit, values not positive, or loads heavier than M2S.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> form.scene().machine.stiffness.round(6).tolist()
+    [0.111111, 0.111111]
+
+    Source: the antiphase paper, equations (2)-(8); Filimonikhin et al. 2022, equations (9)-(11), (20), (39).
+    """
+
+    natural: Array
+    damping: Array
+    link_natural: Array
+    link_damping: Array
+    rho: Array
+    eps: Array
+    beta: Array
+    speed: Array
+    mass_scale: Array
+    frequency_scale: Array
+    radius: Array
+    kappa: Array
+    count: int = eqx.field(static=True)
+    form: Literal["antiphase", "criterion"] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        form: Literal["antiphase", "criterion"],
+        *,
+        natural: Number | Sequence[Number],
+        damping: Number | Sequence[Number],
+        link_natural: Number | Sequence[Number] = (),
+        link_damping: Number | Sequence[Number] = (),
+        rho: Number | Sequence[Number] = (),
+        eps: Number,
+        beta: Number,
+        speed: Number,
+        count: int = 1,
+        mass_scale: Number = 1.0,
+        frequency_scale: Number = 1.0,
+        radius: Number = 1.0,
+        kappa: Number = 1.0,
+    ):
+        if form not in ("antiphase", "criterion"):
+            raise InputError("form", f"is {form!r}; it must be 'antiphase' or 'criterion'")
+        n_i = numbers(natural, "", "natural", None, low=0.0)
+        n = 1 if n_i.ndim == 0 else n_i.shape[0]
+        if n not in _LINKS:
+            raise InputError("natural", f"has {n} values; the papers' machines have 1, 2 or 3 platforms")
+        self.form = form
+        self.count = whole(count, "count")
+        self.natural = jnp.broadcast_to(n_i, (n,))
+        self.damping = numbers(damping, "", "damping", n, low=0.0)
+        links = len(_LINKS[n])
+        self.link_natural = numbers(link_natural, "", "link_natural", links, low=0.0) if links else jnp.zeros((0,))
+        self.link_damping = numbers(link_damping, "", "link_damping", links, low=0.0) if links else jnp.zeros((0,))
+        self.rho = numbers(rho, "", "rho", n - 1, low=0.0, open_low=True) if n > 1 else jnp.zeros((0,))
+        positive = {"low": 0.0, "open_low": True}
+        self.eps = number(eps, "", "eps", **positive)
+        self.beta = number(beta, "", "beta", **positive)
+        self.speed = number(speed, "", "speed", **positive)
+        self.mass_scale = number(mass_scale, "kg", "mass_scale", **positive)
+        self.frequency_scale = number(frequency_scale, "rad/s", "frequency_scale", **positive)
+        self.radius = number(radius, "m", "radius", **positive)
+        self.kappa = number(kappa, "", "kappa", low=1.0)
+        share = self.eps * self.kappa * (self.count if form == "antiphase" else 1)
+        number(1.0 - share, "", "1 - (mass of all loads)/M2S", **positive)
+
+    @property
+    def _load_mass(self) -> Array:
+        return self.eps * self.kappa * self.mass_scale / (1 if self.form == "antiphase" else self.count)
+
+    @property
+    def length(self) -> Array:
+        """y~ = s~/M2S in m, the unit of v_2; it equals eps kappa R in both forms."""
+        return self.eps * self.kappa * self.radius
+
+    @property
+    def lengths(self) -> Array:
+        """The unit rho_i y~ of each platform's v_i, (n,) m."""
+        return self._by_platform(self.rho, 1.0) * self.length
+
+    @property
+    def force(self) -> Array:
+        """M2S w^2 y~ in N, the unit of the foundation force."""
+        return self.mass_scale * self.frequency_scale**2 * self.length
+
+    def _by_platform(self, others: Array, exciter: float) -> Array:
+        where = min(1, others.shape[0])
+        return jnp.concatenate([others[:where], jnp.full((1,), exciter, dtype=others.dtype), others[where:]])
+
+    def scene(self) -> Scene:
+        """The scene in SI numbers, at the chosen size."""
+        n = self.natural.shape[0]
+        w, m_total, m = self.frequency_scale, self.mass_scale, self._load_mass
+        mass = m_total / self._by_platform(self.rho, 1.0)
+        loads_mass = self._by_platform(jnp.zeros_like(self.rho), 1.0) * self.count * m
+        machine = Platforms(
+            mass=mass - loads_mass,
+            stiffness=self.natural**2 * mass * w**2,
+            damping=2.0 * self.damping * mass * w,
+            link_stiffness=self.link_natural**2 * m_total * w**2,
+            link_damping=2.0 * self.link_damping * m_total * w,
+            links=_LINKS[n],
+            exciter=min(n, 2),
+            kind=_KINDS[n],
+        )
+        loads = CircularLoads(
+            mass=m,
+            radius=self.radius,
+            drag=self.beta * self.eps * self.kappa * m * w,
+            inertia=(self.kappa - 1.0) * m * self.radius**2,
+            count=self.count,
+            kind="pendulum",
+        )
+        return Scene(machine, loads, ConstantSpeed(self.speed * w))
+
+    def read(self, *, omega: Array | None = None, amplitude: Array | None = None, force: Array | None = None) -> dict[str, Array]:
+        """Results in SI as the paper's numbers; any of them may be given.
+
+        **Arguments**: `omega` rad/s, any shape; `amplitude` m, last axis over the platforms; `force` N, any shape.
+
+        **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
+        """
+        units = {"omega": self.frequency_scale, "amplitude": self.lengths, "force": self.force}
+        given = {"omega": omega, "amplitude": amplitude, "force": force}
+        return {name: value / units[name] for name, value in given.items() if value is not None}
+
+
+
+

@@ -1,0 +1,147 @@
+"""Balls, rollers and pendulums: what runs free in the auto-balancer."""
+
+from __future__ import annotations
+
+import abc
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.units import Number, count, numbers
+
+__all__ = ["CircularLoads", "Loads", "balls", "pendulums", "rollers"]
+
+
+class Loads(eqx.Module):
+    """Loads that move on the carrier. A new kind of load is a new subclass with its own position function.
+
+    All arrays are one entry a load, or one scalar that all loads share; functions act elementwise on (count,) arrays.
+    """
+
+    mass: eqx.AbstractVar[Array]
+    count: eqx.AbstractVar[int]
+    kind: eqx.AbstractVar[str]
+
+    @abc.abstractmethod
+    def position(self, *u: Array) -> tuple[Array, Array]:
+        """The load's own position p(u) in the rotor's plane, (across, up), in m."""
+
+    @abc.abstractmethod
+    def inertia_factor(self) -> Array:
+        """kappa: the load's inertia along its track is kappa times that of its mass alone."""
+
+    @abc.abstractmethod
+    def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
+        """Generalised force of the viscous resistance against the rotor that turns at `speed`, N m."""
+
+
+class CircularLoads(Loads):
+    """Loads on a circle of radius R about the rotor's axis: p(phi) = R (cos phi, sin phi).
+
+        kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (port's acceleration)
+
+    kappa is 7/5 for a ball and 3/2 for a roller that roll on the track, 1 + J_C/(m R^2) for a pendulum.
+
+    **Attributes** (scalar: shared by all loads; or (count,)): `mass` m kg; `radius` R m of the circle of the mass centres;
+    `drag` b_W N s/m at that radius; `inertia` J_C kg m^2 about the mass centre (pendulums; None for the others);
+    `count` N; `kind` "ball", "roller" or "pendulum".
+
+    Source: the antiphase paper, equations (1), (2), (6).
+    """
+
+    mass: Array
+    radius: Array
+    drag: Array
+    inertia: Array | None
+    count: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def position(self, *u: Array) -> tuple[Array, Array]:
+        """R (cos phi, sin phi)."""
+        (phi,) = u
+        return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
+
+    def inertia_factor(self) -> Array:
+        """7/5 (ball), 3/2 (roller), 1 + J_C/(m R^2) (pendulum)."""
+        if self.inertia is not None:
+            return 1.0 + self.inertia / (self.mass * self.radius**2)
+        return jnp.asarray({"ball": 1.4, "roller": 1.5}[self.kind], dtype=self.mass.dtype)
+
+    def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
+        """- b_W R^2 (phi' - speed)."""
+        (rate_phi,) = rate
+        return (self.drag * self.radius**2 * (speed - rate_phi),)
+
+    def unbalance(self) -> Array:
+        """sum m R of all loads, kg m: the unbalance they make when they are collected at one point."""
+        return jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
+
+    def drag_sum(self) -> Array:
+        """sum b_W R^2 of all loads, N m s: the torque that turns them, per speed difference to the rotor."""
+        return jnp.sum(jnp.broadcast_to(self.drag * self.radius**2, (self.count,)))
+
+
+def _circular(kind: str, count_: int, mass: Number, radius: Number, drag: Number, inertia: Number | None) -> CircularLoads:
+    n = count(count_, "loads.count")
+
+    def each(value: Number, unit: str, name: str, open_low: bool) -> Array:
+        return numbers(value, unit, f"loads.{name}", n, low=0.0, open_low=open_low, shared=True)
+
+    return CircularLoads(
+        mass=each(mass, "kg", "mass", True),
+        radius=each(radius, "m", "radius", True),
+        drag=each(drag, "N s/m", "drag", False),
+        inertia=None if inertia is None else each(inertia, "kg m^2", "inertia", False),
+        count=n,
+        kind=kind,
+    )
+
+
+def balls(*, count: int, mass: Number | Sequence[Number], radius: Number, drag: Number | Sequence[Number]) -> CircularLoads:
+    """Balls that roll in an annular track, kappa = 7/5.
+
+    **Arguments**: `count` N; `mass` kg, `radius` m of the circle of their centres, `drag` b_W N s/m: one number shared by
+    all, or N of them.
+
+    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, values not positive.
+
+    >>> import jaxvib as jv
+    >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5).unbalance().round(6))
+    0.288
+    """
+    return _circular("ball", count, mass, radius, drag, None)
+
+
+def rollers(*, count: int, mass: Number | Sequence[Number], radius: Number, drag: Number | Sequence[Number]) -> CircularLoads:
+    """Cylindrical rollers that roll in an annular track, kappa = 3/2. Arguments as `balls`.
+
+    >>> import jaxvib as jv
+    >>> float(jv.rollers(count=2, mass=1.0, radius=0.1, drag=1.0).inertia_factor())
+    1.5
+    """
+    return _circular("roller", count, mass, radius, drag, None)
+
+
+def pendulums(
+    *,
+    count: int,
+    mass: Number | Sequence[Number],
+    radius: Number,
+    drag: Number | Sequence[Number],
+    inertia: Number | Sequence[Number] = 0.0,
+) -> CircularLoads:
+    """Pendulums hung on the shaft, kappa = 1 + J_C/(m R^2).
+
+    **Arguments**: as `balls`, with `radius` the distance of the mass centre from the axis, and `inertia` J_C kg m^2 about
+    the mass centre (0: a point mass). `drag` acts at that radius: a bearing's viscous coefficient mu (N m s) is b_W = mu/R^2.
+
+    **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
+
+    >>> import jaxvib as jv
+    >>> float(jv.pendulums(count=1, mass=2.0, radius=0.1, drag=1.0, inertia=0.01).inertia_factor())
+    1.5
+    """
+    return _circular("pendulum", count, mass, radius, drag, inertia)

@@ -1,0 +1,223 @@
+"""Machines of platforms that move up and down: one, two, three masses, or any network of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.units import Number, count, number, numbers
+
+__all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
+
+
+class Platforms(Machine):
+    """Platforms that translate vertically, on supports to the bed and links to each other.
+
+        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [b_ij (y_i' - y_j') + k_ij (y_i - y_j)] = loads' force on the exciter's platform
+
+    y_i is counted upward from static equilibrium, in m. Build one with `one_mass`, `two_mass`, `three_mass` or `network`.
+
+    **Attributes** (n platforms, L links)
+
+    - `mass` (n,) kg: of the platforms; the exciter's platform includes the auto-balancer's body, not its loads
+    - `stiffness` (n,) N/m, `damping` (n,) N s/m: of the supports
+    - `link_stiffness` (L,) N/m, `link_damping` (L,) N s/m
+    - `links`: the pair of platforms each link joins; platforms are numbered from 1
+    - `exciter`: the platform that carries the auto-balancer
+
+    Source: Filimonikhin et al. 2022, equations (1)-(39) for one, two and three masses.
+    """
+
+    mass: Array
+    stiffness: Array
+    damping: Array
+    link_stiffness: Array
+    link_damping: Array
+    links: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    exciter: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def carrier(self) -> Carrier:
+        """The linear structure of the platforms; one port, one direction (up)."""
+        n = self.mass.shape[0]
+        ends = np.zeros((len(self.links), n))
+        for row, (i, j) in enumerate(self.links):
+            ends[row, i - 1], ends[row, j - 1] = 1.0, -1.0
+
+        def assembled(support: Array, link: Array) -> Array:
+            return jnp.diag(support) + jnp.einsum("la,l,lb->ab", ends.astype(link.dtype), link, ends.astype(link.dtype))
+
+        port = np.zeros((1, n))
+        port[0, self.exciter - 1] = 1.0
+        return Carrier(
+            mass=jnp.diag(self.mass),
+            damping=assembled(self.damping, self.link_damping),
+            stiffness=assembled(self.stiffness, self.link_stiffness),
+            gyroscopic=None,
+            port=jnp.asarray(port, dtype=self.mass.dtype),
+            bed_stiffness=self.stiffness[None, :],
+            bed_damping=self.damping[None, :],
+            axes=(1,),
+            coordinates=tuple(f"y{i + 1}" for i in range(n)),
+        )
+
+
+def _platforms(
+    kind: str,
+    n: int,
+    mass: Number,
+    stiffness: Number,
+    damping: Number,
+    links: Sequence[Sequence[int]],
+    link_stiffness: Number,
+    link_damping: Number,
+    exciter: int,
+) -> Platforms:
+    joined = _links(links, n)
+    which = count(exciter, "machine.exciter")
+    if which > n:
+        raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
+
+    def links_of(value: Number, unit: str, field: str) -> Array:
+        return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.zeros((0,), dtype=float)
+
+    return Platforms(
+        mass=numbers(mass, "kg", "machine.mass", n, low=0.0, open_low=True),
+        stiffness=numbers(stiffness, "N/m", "machine.stiffness", n, low=0.0),
+        damping=numbers(damping, "N s/m", "machine.damping", n, low=0.0),
+        link_stiffness=links_of(link_stiffness, "N/m", "machine.link_stiffness"),
+        link_damping=links_of(link_damping, "N s/m", "machine.link_damping"),
+        links=joined,
+        exciter=which,
+        kind=kind,
+    )
+
+
+def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...]:
+    joined = []
+    for index, link in enumerate(links):
+        field = f"machine.links[{index}]"
+        if not isinstance(link, (list, tuple)) or len(link) != 2:
+            raise InputError(field, f"is {link!r}; a link is a pair of platforms such as [1, 2]")
+        i, j = (count(end, field) for end in link)
+        if i == j or max(i, j) > n:
+            raise InputError(field, f"is [{i}, {j}]; a link joins two different platforms of 1 to {n}")
+        joined.append((i, j))
+    return tuple(joined)
+
+
+def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
+    """One platform on a support; it carries the exciter.
+
+    **Arguments**: `mass` kg (loads not counted), `stiffness` N/m, `damping` N s/m; one number each.
+
+    **Returns** `Platforms`. **Raises** `InputError` for a mass that is not positive or a negative coefficient.
+
+    >>> import jaxvib as jv
+    >>> jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0).stiffness.tolist()
+    [40000.0]
+
+    Source: Filimonikhin et al. 2022, equation (9).
+    """
+    one = {"low": 0.0}
+    return _platforms(
+        "one_mass",
+        1,
+        number(mass, "kg", "machine.mass", low=0.0, open_low=True),
+        number(stiffness, "N/m", "machine.stiffness", **one),
+        number(damping, "N s/m", "machine.damping", **one),
+        (),
+        (),
+        (),
+        1,
+    )
+
+
+def two_mass(
+    *,
+    mass: Sequence[Number],
+    stiffness: Sequence[Number],
+    damping: Sequence[Number],
+    link_stiffness: Number,
+    link_damping: Number,
+    exciter: int = 2,
+) -> Platforms:
+    """Two platforms on supports, joined by a link.
+
+    **Arguments**: `mass` (2,) kg, `stiffness` (2,) N/m and `damping` (2,) N s/m of the supports, `link_stiffness` N/m,
+    `link_damping` N s/m, `exciter` the platform with the auto-balancer (2 unless said otherwise).
+
+    **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, units, masses not positive, negative coefficients.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
+    >>> machine.carrier().stiffness.tolist()
+    [[250000.0, -200000.0], [-200000.0, 250000.0]]
+
+    Source: the antiphase paper, equation (2); Filimonikhin et al. 2022, equation (20).
+    """
+    return _platforms("two_mass", 2, mass, stiffness, damping, ((1, 2),), link_stiffness, link_damping, exciter)
+
+
+def three_mass(
+    *,
+    mass: Sequence[Number],
+    stiffness: Sequence[Number],
+    damping: Sequence[Number],
+    link_stiffness: Sequence[Number],
+    link_damping: Sequence[Number],
+    exciter: int = 2,
+) -> Platforms:
+    """Three platforms on supports, every two joined by a link.
+
+    **Arguments**: `mass` (3,) kg, `stiffness` (3,) N/m and `damping` (3,) N s/m of the supports; `link_stiffness` (3,) N/m
+    and `link_damping` (3,) N s/m of the links 1-2, 1-3, 2-3 (0 where there is none); `exciter` the platform with the
+    auto-balancer.
+
+    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`.
+
+    >>> import jaxvib as jv
+    >>> jv.three_mass(mass=(10.0, 20.0, 10.0), stiffness=(0.0, 4e4, 0.0), damping=(0.0, 20.0, 0.0),
+    ...               link_stiffness=(1e4, 0.0, 1e4), link_damping=(5.0, 0.0, 5.0), exciter=3).links
+    ((1, 2), (1, 3), (2, 3))
+
+    Source: Filimonikhin et al. 2022, equation (39) with the third platform's misprint mended.
+    """
+    links = ((1, 2), (1, 3), (2, 3))
+    return _platforms("three_mass", 3, mass, stiffness, damping, links, link_stiffness, link_damping, exciter)
+
+
+def network(
+    *,
+    mass: Sequence[Number],
+    stiffness: Sequence[Number],
+    damping: Sequence[Number],
+    links: Sequence[Sequence[int]] = (),
+    link_stiffness: Sequence[Number] = (),
+    link_damping: Sequence[Number] = (),
+    exciter: int,
+) -> Platforms:
+    """Any number of platforms, supports and links, the exciter on any platform.
+
+    **Arguments**: `mass` (n,) kg, `stiffness` (n,) N/m, `damping` (n,) N s/m (0 where a platform has no support); `links`
+    pairs of platforms numbered from 1, with `link_stiffness` (L,) N/m and `link_damping` (L,) N s/m; `exciter` the
+    platform with the auto-balancer.
+
+    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`, and for a link to a platform that is not there.
+
+    >>> import jaxvib as jv
+    >>> chain = jv.network(mass=[5.0] * 4, stiffness=[1e4, 0, 0, 1e4], damping=[5, 0, 0, 5], links=[(1, 2), (2, 3), (3, 4)],
+    ...                    link_stiffness=[2e4] * 3, link_damping=[4.0] * 3, exciter=4)
+    >>> chain.carrier().mass.shape
+    (4, 4)
+    """
+    masses = numbers(mass, "kg", "machine.mass", None, low=0.0, open_low=True)
+    n = 1 if masses.ndim == 0 else masses.shape[0]
+    return _platforms("network", n, masses, stiffness, damping, links, link_stiffness, link_damping, exciter)

@@ -1,0 +1,55 @@
+"""A scene: a machine, its loads, its drive and the effects it calls for."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drive import Drive
+from jaxvib.machine.effects import Effect
+from jaxvib.machine.loads import Loads
+
+__all__ = ["Scene"]
+
+
+class Scene(eqx.Module):
+    """Everything that is needed to ask how a machine moves; a frozen pytree of SI numbers.
+
+    `jax.grad`, `jax.vmap` and `jax.jit` go through every number in it; `equinox.tree_at` replaces one.
+
+    **Arguments**: `machine` from `one_mass`, `two_mass`, `three_mass`, `network`; `loads` from `balls`, `rollers`,
+    `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, only those the scene calls for.
+
+    **Raises** `InputError` where a part is not of its kind, or an effect is named twice.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, loads=jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), drive=jv.ConstantSpeed("600 rpm"))
+    >>> scene.loads.count
+    2
+    """
+
+    machine: Machine
+    loads: Loads
+    drive: Drive
+    effects: tuple[Effect, ...]
+
+    def __init__(self, machine: Machine, loads: Loads, drive: Drive, effects: tuple[Effect, ...] = ()):
+        parts = (("machine", machine, Machine, "two_mass(...)"), ("loads", loads, Loads, "balls(...)"))
+        parts += (("drive", drive, Drive, 'ConstantSpeed("1500 rpm")'),)
+        for name, part, kind, example in parts:
+            if not isinstance(part, kind):
+                raise InputError(name, f"is {part!r}; it must be a {kind.__name__}, for example {example}")
+        effects = (effects,) if isinstance(effects, Effect) else tuple(effects)
+        for index, effect in enumerate(effects):
+            if not isinstance(effect, Effect):
+                raise InputError(f"effects[{index}]", f"is {effect!r}; it must be an Effect, for example Gravity()")
+        kinds = [effect.kind for effect in effects]
+        for kind in kinds:
+            if kinds.count(kind) > 1:
+                raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
+        self.machine = machine
+        self.loads = loads
+        self.drive = drive
+        self.effects = effects

@@ -1,0 +1,160 @@
+"""Numbers with units come in here and nowhere else; inside, everything is SI."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+
+__all__ = ["Number", "count", "number", "numbers", "to_float"]
+
+Number = Any
+"""What the edges accept as a number: a float, an array, a traced value, a string with a unit, a pint quantity."""
+
+
+def _unit_name(unit: str) -> str:
+    return unit or "no unit"
+
+
+def to_float(value: Number, unit: str, field: str) -> Any:
+    """The SI magnitude of `value` in `unit`; numbers without a unit are taken to be in `unit` already.
+
+    Strings and pint quantities are converted. A frequency in hertz given where rad/s is wanted counts as
+    revolutions per second (pint alone would take 25 Hz for 25 rad/s).
+
+    **Raises** `InputError` for a text that is no number, an unknown unit or a unit of another dimension.
+
+    >>> round(to_float("1500 rpm", "rad/s", "drive.speed"), 4)
+    157.0796
+    >>> round(to_float("25 Hz", "rad/s", "drive.speed"), 4)
+    157.0796
+    >>> to_float("3 kg", "N/m", "machine.stiffness")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: machine.stiffness is '3 kg', which is not in N/m; write for example '1.0 N/m'
+    """
+    if isinstance(value, bool):
+        raise InputError(field, f"is {value}, which is not a number; write a number in {_unit_name(unit)}")
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    if isinstance(value, str) or hasattr(value, "m_as"):
+        import pint  # slow to import, and needed only for text and quantities
+
+        wrong = InputError(
+            field,
+            f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example '1.0 {unit}'".replace(" '1.0 '", " 1.0"),
+        )
+        try:
+            given = pint.get_application_registry().Quantity(value) if isinstance(value, str) else value
+            turns = "hertz" in str(given.units) and unit == "rad/s"
+            return given.m_as("hertz") * 2.0 * math.pi if turns else given.m_as(unit or "dimensionless")
+        except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError, SyntaxError) as error:
+            raise wrong from error
+    if value is None or isinstance(value, (dict, set)):
+        raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}")
+    return value
+
+
+def _checked(value: Any, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
+    """Value checks, for concrete numbers only: a traced value has none to look at."""
+    if isinstance(value, jax.core.Tracer):
+        return
+    flat = np.atleast_1d(np.asarray(value))
+    for index, entry in enumerate(flat):
+        name = f"{field}[{index}]" if place == "each" else field
+        shown = f"{entry:g} {unit}".strip()
+        if not np.isfinite(entry):
+            raise InputError(name, f"is {shown}; a finite number is needed")
+        if entry < low or (open_low and entry == low):
+            raise InputError(name, f"is {shown}; it must be {'greater than' if open_low else 'at least'} {low:g}")
+
+
+def number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Array:
+    """One number as a floating-point scalar array in SI units, checked against a lower bound (`open_low`: exclusive).
+
+    **Raises** `InputError` for a wrong unit, a list, a value that is not finite or below the bound.
+
+    >>> float(number("2 t", "kg", "machine.mass"))
+    2000.0
+    """
+    if isinstance(value, (list, tuple)):
+        raise InputError(field, f"is a list of {len(value)} values; one number in {_unit_name(unit)} is needed")
+    return _array(to_float(value, unit, field), unit, field, (), low, open_low)
+
+
+def numbers(
+    value: Number | Sequence[Number],
+    unit: str,
+    field: str,
+    length: int | None,
+    *,
+    low: float = -math.inf,
+    open_low: bool = False,
+    shared: bool = False,
+) -> Array:
+    """`length` numbers as an array in SI units; `length` None takes any number of them, one at least.
+
+    A single number stands for all of them: it is repeated, or kept as one scalar that all share if `shared`.
+
+    **Raises** `InputError` as `number` does, and for a list of another length.
+
+    >>> numbers(["44 N/mm", 5e4], "N/m", "machine.stiffness", 2).tolist()
+    [44000.0, 50000.0]
+    """
+    if isinstance(value, (list, tuple)):
+        parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
+        for i, part in enumerate(parts):
+            if np.ndim(part) != 0:
+                raise InputError(f"{field}[{i}]", f"is not a single number; write a number in {_unit_name(unit)}")
+        if length is not None and len(parts) != length:
+            raise InputError(field, f"has {len(parts)} values; {length} are needed")
+        if not parts:
+            raise InputError(field, "is an empty list; at least 1 value is needed")
+        if not all(isinstance(part, jax.Array) for part in parts):
+            for i, part in enumerate(parts):
+                _array(part, unit, f"{field}[{i}]", (), low, open_low)
+        stacked = jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
+        return _array(stacked, unit, field, stacked.shape, low, open_low)
+    magnitude = to_float(value, unit, field)
+    if np.ndim(magnitude) == 0:
+        scalar = _array(magnitude, unit, field, (), low, open_low)
+        return scalar if shared or length is None else jnp.broadcast_to(scalar, (length,))
+    if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
+        raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
+    return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)
+
+
+def _array(value: Any, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
+    try:
+        array = jnp.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}") from error
+    if array.shape != shape:
+        raise InputError(field, f"has shape {array.shape}; one number in {_unit_name(unit)} is needed")
+    _checked(array, field, unit, low, open_low, place="each" if shape else "")
+    return array
+
+
+def count(value: Any, field: str, *, low: int = 1) -> int:
+    """A whole number of things, at least `low`.
+
+    **Raises** `InputError` for anything else.
+
+    >>> count(0, "loads.count")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: loads.count is 0; it must be a whole number, at least 1
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
+        raise InputError(field, f"is {value!r}; it must be a whole number, at least {low}")
+    return int(value)

@@ -1,0 +1,1 @@
+"""Design: what may change, what is wanted, who searches."""
