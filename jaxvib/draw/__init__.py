@@ -1,0 +1,1 @@
+"""Plain arrays onto axes, one style; knows no machine."""

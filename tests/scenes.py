@@ -1,0 +1,47 @@
+"""The scenes that tests go through: one of every machine, load and effect."""
+
+import jaxvib as jv
+
+
+def machines():
+    return {
+        "one_mass": jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+        "two_mass": jv.two_mass(
+            mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0
+        ),
+        "three_mass": jv.three_mass(
+            mass=(30.0, 40.0, 20.0),
+            stiffness=(1e4, 4e4, 3e3),
+            damping=(10.0, 20.0, 5.0),
+            link_stiffness=(1e4, 5e3, 2e4),
+            link_damping=(5.0, 1.0, 7.0),
+            exciter=3,
+        ),
+        "network": jv.network(
+            mass=[5.0, 6.0, 7.0, 8.0, 9.0],
+            stiffness=[1e4, 0.0, 0.0, 2e4, 1e3],
+            damping=[5.0, 0.0, 0.0, 5.0, 1.0],
+            links=[(1, 2), (2, 3), (3, 4), (4, 5), (5, 1), (2, 4)],
+            link_stiffness=[2e4, 1e4, 3e4, 2e4, 1e4, 5e3],
+            link_damping=[4.0, 3.0, 2.0, 1.0, 0.0, 2.0],
+            exciter=2,
+        ),
+    }
+
+
+def loads():
+    return {
+        "balls": jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5),
+        "rollers": jv.rollers(count=1, mass=0.5, radius=0.1, drag=0.7),
+        "pendulums": jv.pendulums(count=4, mass=[0.5, 0.6, 0.7, 0.8], radius=0.1, drag=[0.7, 0.8, 0.9, 1.0], inertia=1e-3),
+    }
+
+
+def scene(machine="two_mass", load="balls", speed=120.0, effects=()):
+    return jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(speed), effects)
+
+
+def published(speed=3.0, eps=1e-3, damping=0.01, count=1, form="antiphase", **more):
+    """The machine of the antiphase paper, equation (40)."""
+    numbers = dict(natural=(1 / 3, 1 / 3), damping=(damping, damping), link_natural=2 / 3, link_damping=damping, rho=1.0)
+    return jv.Dimensionless(form, **{**numbers, "eps": eps, "beta": 1.0, "speed": speed, "count": count, **more})
