@@ -5,9 +5,14 @@ from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.drive import ConstantSpeed, Drive, SpinUp
 from jaxvib.machine.effects import Effect, Gravity
+from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
 from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
+from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.simulate import simulate
+from jaxvib.motion.start import initial_state
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.response import natural_frequencies, steady_displacement
