@@ -279,25 +279,13 @@ def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array
 
 
 def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
-    """The root of `f` between `low` and `high` (scalars), where f changes sign once.
+    """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digit by halving.
 
-    Newton steps that stay inside the bracket, halving otherwise. Derivatives by the implicit function theorem.
+    Derivatives of any order by the implicit function theorem.
     """
 
     def solve(g: Callable[[Array], Array], _: Array) -> Array:
         rises = g(high) > 0.0
-
-        def step(_: int, bracket: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            a, b, x = bracket
-            value, slope = jax.jvp(g, (x,), (jnp.ones_like(x),))
-            above = (value > 0.0) == rises
-            a, b = jnp.where(above, a, x), jnp.where(above, x, b)
-            newton = x - value / jnp.where(slope == 0.0, 1.0, slope)
-            good = (slope != 0.0) & (newton > a) & (newton < b)
-            return a, b, jnp.where(good, newton, (a + b) / 2.0)
-
-        # A Newton step can crawl along one side of the bracket; halving first makes sure that it does not.
-        halvings = 3 * jnp.finfo(low.dtype).nmant // 4
 
         def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
             a, b = bracket
@@ -305,8 +293,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
             above = (g(middle) > 0.0) == rises
             return jnp.where(above, a, middle), jnp.where(above, middle, b)
 
-        a, b = jax.lax.fori_loop(0, halvings, halve, (low, high))
-        return jax.lax.fori_loop(0, 6, step, (a, b, (a + b) / 2.0))[2]
+        a, b = jax.lax.fori_loop(0, jnp.finfo(low.dtype).nmant + 8, halve, (low, high))
+        return (a + b) / 2.0
 
     low, high = jax.lax.stop_gradient((low, high))
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
