@@ -12,7 +12,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.response import natural_frequencies, steady_displacement

@@ -1,1 +1,31 @@
 """Design: what may change, what is wanted, who searches."""
+
+from optimize.quantities import (
+    Quantity,
+    amplitude,
+    force_per_amplitude,
+    foundation_force,
+    jam_frequency,
+    negative,
+    support_frequency_squared,
+    total,
+)
+from optimize.space import DesignSpace, Held, hold
+from optimize.synthesize import Outcome, Synthesis, synthesize
+
+__all__ = [
+    "DesignSpace",
+    "Held",
+    "Outcome",
+    "Quantity",
+    "Synthesis",
+    "amplitude",
+    "force_per_amplitude",
+    "foundation_force",
+    "hold",
+    "jam_frequency",
+    "negative",
+    "support_frequency_squared",
+    "synthesize",
+    "total",
+]

@@ -67,8 +67,8 @@ def branch_diagram(
     series += [(axes[2], force, COLORS[0], "force")]
     for axis, values, color, label in series:
         _solid_and_dashed(axis, n, values, stable, color, label)
-    for w in resonances:
-        axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":")
+    for k, w in enumerate(resonances):
+        axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
     low, high = 0.0, float(np.max(view))
     axes[0].plot([low, high], [low, high], color="#bbbbbb", lw=0.8, label="rotor")
     for label, x, y in marks:
@@ -82,8 +82,10 @@ def branch_diagram(
     axes[0].set_ylim(0.0, None)
     axes[0].legend(loc="upper left")
     axes[1].legend(loc="best")
-    for axis in axes[1:]:
+    for axis, values in zip(axes[1:], (1e3 * amplitude, force[:, None]), strict=True):
+        shown = values[np.isfinite(rotor_speed)]
         axis.set_yscale("log")
+        axis.set_ylim(1e-5 * np.max(shown), 2.0 * np.max(shown))
     return figure
 
 

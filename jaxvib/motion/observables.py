@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import Dynamics, State
+from jaxvib.motion.dynamics import Dynamics, State, vector_field
 
 __all__ = ["Measured", "Trajectory", "energy", "foundation_force", "measure", "power"]
 
@@ -191,3 +191,11 @@ def _away_from_zero(x: Array) -> Array:
     return jnp.where(jnp.abs(x) < tiny, tiny, x)
 
 
+
+
+def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Array:
+    """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
+    acceleration = jax.vmap(vector_field(scene))(stretch.time, stretch.state).velocity
+    x, v, a = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration))
+    step = stretch.time[1] - stretch.time[0]
+    return _zero_to_peak(x, v * step, a * step**2)

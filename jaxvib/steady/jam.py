@@ -168,37 +168,56 @@ def _jam_modes(scene: Scene) -> JamModes:
     pieces = _pieces(scene)
     omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(scene, lo, hi))(pieces.low, pieces.high)
 
-    nd = pieces.resonances.shape[0]
-    numbers = jnp.arange(1, 2 * nd + 2)
+    numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
     hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
-    chosen = jnp.argmax(hits, axis=1)
     there = jnp.any(hits, axis=1)
-    omega = jnp.where(there, omega[chosen], n)
+    omega = jnp.where(there, omega[jnp.argmax(hits, axis=1)], n)
 
     def jam(number: Array, w: Array, is_there: Array) -> Jam:
-        displacement = steady_displacement(scene, w)
-        slope = jax.jvp(lambda x: jam_rotor_speed(scene, x), (w,), (jnp.ones_like(w),))[1]
-        flat = jnp.abs(slope) < jnp.sqrt(jnp.finfo(slope.dtype).eps)
-        known = JamStatus.where(flat, JamStatus.at_fold, JamStatus.found)
-
-        def or_nan(value: Array) -> Array:
-            return jnp.where(is_there, value, jnp.nan)
-
-        return Jam(
-            mode=number,
-            status=JamStatus.where(is_there, known, JamStatus.absent),
-            omega=or_nan(w),
-            rotor_speed=n,
-            stable=is_there & (slope > 0.0),
-            slope=or_nan(slope),
-            displacement=or_nan(displacement),
-            amplitude=or_nan(magnitude(displacement)),
-            foundation_force=or_nan(_bed_force(scene, w, displacement)),
+        found = _jam_at(scene, number, w, n)
+        values = jax.tree.map(
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, found
+        )
+        return eqx.tree_at(
+            lambda j: (j.status, j.stable, j.rotor_speed),
+            values,
+            (JamStatus.where(is_there, found.status, JamStatus.absent), is_there & found.stable, n),
         )
 
     jams = jax.vmap(jam)(numbers, omega, there)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return JamModes(**fields, resonances=natural_frequencies(scene), folds=pieces.folds)
+
+
+def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array) -> Jam:
+    displacement = steady_displacement(scene, omega)
+    slope = _slope(scene, omega)
+    flat = jnp.abs(slope) < jnp.sqrt(jnp.finfo(slope.dtype).eps)
+    return Jam(
+        mode=number,
+        status=JamStatus.where(flat, JamStatus.at_fold, JamStatus.found),
+        omega=omega,
+        rotor_speed=rotor_speed,
+        stable=slope > 0.0,
+        slope=slope,
+        displacement=displacement,
+        amplitude=magnitude(displacement),
+        foundation_force=_bed_force(scene, omega, displacement),
+    )
+
+
+def branch_points(scene: Scene, omega: Array) -> tuple[Jam, Folds]:
+    """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
+    pieces = _pieces(scene)
+    cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
+    numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
+    jams = jax.vmap(lambda k, w: _jam_at(scene, k, w, jam_rotor_speed(scene, w)))(numbers, omega)
+    return jams, pieces.folds
+
+
+def _slope(scene: Scene, omega: Array) -> Array:
+    """dn/dOmega along the branch."""
+    return jax.jvp(lambda w: jam_rotor_speed(scene, w), (omega,), (jnp.ones_like(omega),))[1]
 
 
 def _bed_force(scene: Scene, omega: Array, displacement: Array) -> Array:
@@ -218,17 +237,13 @@ class _Pieces(NamedTuple):
 def _pieces(scene: Scene) -> _Pieces:
     """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(scene)
-    grid, resonances = _fold_grid(frozen)
+    grid, resonances = fold_points(frozen, _POINTS)
     nd = resonances.shape[0]
-
-    def slope(s: Scene, w: Array) -> Array:
-        return jax.jvp(lambda x: jam_rotor_speed(s, x), (w,), (jnp.ones_like(w),))[1]
-
-    falling = jax.vmap(lambda w: slope(frozen, w))(grid) < 0.0
+    falling = jax.vmap(lambda w: _slope(frozen, w))(grid) < 0.0
     (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=2 * nd, fill_value=grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
-    omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: slope(scene, w), lo, hi))(grid[change], grid[change + 1])
+    omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: _slope(scene, w), lo, hi))(grid[change], grid[change + 1])
     end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
@@ -251,20 +266,24 @@ def _pieces(scene: Scene) -> _Pieces:
     return _Pieces(low, high, jnp.stack([*mode, jnp.asarray(2 * nd + 1)]), resonances, folds)
 
 
-def _fold_grid(scene: Scene) -> tuple[Array, Array]:
-    """Load speeds that crowd about every resonance as closely as its width asks; folds lie between some of them."""
+def fold_points(scene: Scene, per_side: int) -> tuple[Array, Array]:
+    """Load speeds, `per_side` on each side of every resonance, that crowd there as closely as its width asks; and the
+    resonances themselves. Folds lie between some of these points."""
     resonances, shapes = _modes(scene)
     carrier = scene.machine.carrier()
     width = jnp.einsum("ar,ab,br->r", shapes, carrier.damping, shapes) / 2.0
     top = jnp.max(resonances)
     tiny = jnp.finfo(top.dtype).eps * 16.0
-    width = jnp.maximum(width, tiny * top)
-    reach = 5.0 * top
-    s = jnp.linspace(0.0, 1.0, _POINTS)[None, :]
-    offset = width[:, None] * jnp.sinh(s * jnp.arcsinh(reach / width)[:, None])
-    grid = jnp.concatenate([resonances[:, None] - offset, resonances[:, None] + offset]).ravel()
+    width = jnp.maximum(width, tiny * top)[:, None]
     low = 1e-3 * jnp.min(jnp.where(resonances > 0.0, resonances, top))
-    return jnp.sort(jnp.clip(grid, low, top + reach)), resonances
+    s = jnp.linspace(0.0, 1.0, per_side)[None, :]
+
+    def crowded(reach: Array) -> Array:
+        return width * jnp.sinh(s * jnp.arcsinh(reach / width))
+
+    below = resonances[:, None] - crowded(jnp.maximum(resonances - low, 0.0)[:, None])
+    above = resonances[:, None] + crowded(jnp.full_like(width, 5.0 * top))
+    return jnp.sort(jnp.maximum(jnp.concatenate([below, above]).ravel(), low)), resonances
 
 
 def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
