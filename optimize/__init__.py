@@ -1,5 +1,6 @@
 """Design: what may change, what is wanted, who searches."""
 
+from optimize.files import Design, load_design
 from optimize.quantities import (
     Quantity,
     amplitude,
@@ -14,6 +15,7 @@ from optimize.space import DesignSpace, Held, hold
 from optimize.synthesize import Outcome, Synthesis, synthesize
 
 __all__ = [
+    "Design",
     "DesignSpace",
     "Held",
     "Outcome",
@@ -24,6 +26,7 @@ __all__ = [
     "foundation_force",
     "hold",
     "jam_frequency",
+    "load_design",
     "negative",
     "support_frequency_squared",
     "synthesize",

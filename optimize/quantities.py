@@ -12,7 +12,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.jam import Jam, jam_modes
+from jaxvib.steady.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.response import loaded_mass, magnitude
 
 __all__ = [
@@ -34,16 +34,23 @@ Pair = int | tuple[int, int] | None
 class Quantity:
     """A number of a scene with a name and a unit.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` from a `Scene` to a scalar, differentiable, NaN where the quantity
-    does not exist; `mode` the jam mode it belongs to, if any; `of` whose amplitude it is about, if any.
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `Scene` and its jam modes (`jaxvib.JamModes`) that gives a
+    scalar, differentiable, NaN where the quantity does not exist; `mode` the jam mode it belongs to, if any; `of` whose
+    amplitude it is about, if any.
 
     >>> import jaxvib as jv
     >>> from optimize import Quantity
-    >>> heaviest = Quantity("heaviest", "kg", lambda scene: scene.machine.mass.max())
+    >>> heaviest = Quantity("heaviest", "kg", lambda scene, modes: scene.machine.mass.max())
     """
 
     def __init__(
-        self, name: str, unit: str, function: Callable[[Scene], Array], *, mode: int | None = None, of: Pair = None
+        self,
+        name: str,
+        unit: str,
+        function: Callable[[Scene, JamModes], Array],
+        *,
+        mode: int | None = None,
+        of: Pair = None,
     ):
         self.name = name
         self.unit = unit
@@ -51,9 +58,9 @@ class Quantity:
         self.mode = mode
         self.of = of
 
-    def __call__(self, scene: Scene) -> Array:
-        """The quantity's value for a scene, a scalar in `unit`."""
-        return self.function(scene)
+    def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
+        """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
+        return self.function(scene, jam_modes(scene) if modes is None else modes)
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
@@ -72,10 +79,6 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     return chosen
 
 
-def _jam(scene: Scene, mode: int) -> Jam:
-    return jam_modes(scene).select(mode, throw=False)
-
-
 def _amplitude(scene: Scene, jam: Jam, of: Pair) -> Array:
     chosen = between(scene, of)
     if isinstance(chosen, int):
@@ -91,7 +94,7 @@ def amplitude(*, mode: int, of: Pair = None) -> Quantity:
     >>> amplitude(mode=3, of=1).unit
     'm'
     """
-    return Quantity("amplitude", "m", lambda scene: _amplitude(scene, _jam(scene, mode), of), mode=mode, of=of)
+    return Quantity("amplitude", "m", lambda scene, modes: _amplitude(scene, modes.select(mode, throw=False), of), mode=mode, of=of)
 
 
 def foundation_force(*, mode: int) -> Quantity:
@@ -101,7 +104,7 @@ def foundation_force(*, mode: int) -> Quantity:
     >>> foundation_force(mode=3).unit
     'N'
     """
-    return Quantity("foundation_force", "N", lambda scene: _jam(scene, mode).foundation_force, mode=mode)
+    return Quantity("foundation_force", "N", lambda _, modes: modes.select(mode, throw=False).foundation_force, mode=mode)
 
 
 def force_per_amplitude(*, mode: int, of: Pair = None) -> Quantity:
@@ -112,8 +115,8 @@ def force_per_amplitude(*, mode: int, of: Pair = None) -> Quantity:
     'N/m'
     """
 
-    def ratio(scene: Scene) -> Array:
-        jam = _jam(scene, mode)
+    def ratio(scene: Scene, modes: JamModes) -> Array:
+        jam = modes.select(mode, throw=False)
         return jam.foundation_force / _amplitude(scene, jam, of)
 
     return Quantity("force_per_amplitude", "N/m", ratio, mode=mode, of=of)
@@ -126,7 +129,7 @@ def jam_frequency(*, mode: int) -> Quantity:
     >>> jam_frequency(mode=3).unit
     'rad/s'
     """
-    return Quantity("jam_frequency", "rad/s", lambda scene: _jam(scene, mode).omega, mode=mode)
+    return Quantity("jam_frequency", "rad/s", lambda _, modes: modes.select(mode, throw=False).omega, mode=mode)
 
 
 def support_frequency_squared() -> Quantity:
@@ -140,7 +143,7 @@ def support_frequency_squared() -> Quantity:
     0.222222
     """
 
-    def budget(scene: Scene) -> Array:
+    def budget(scene: Scene, _: JamModes) -> Array:
         if not isinstance(scene.machine, Platforms):
             raise InputError("machine.kind", f"is {scene.machine.kind!r}; the budget is that of platforms' supports")
         return jnp.sum(scene.machine.stiffness / jnp.diagonal(loaded_mass(scene)))
@@ -156,7 +159,7 @@ def total(field: str) -> Quantity:
     'total machine.stiffness'
     """
 
-    def summed(scene: Scene) -> Array:
+    def summed(scene: Scene, _: JamModes) -> Array:
         part, _, name = field.partition(".")
         leaf = getattr(getattr(scene, part, None), name, None)
         if not isinstance(leaf, jax.Array):
@@ -174,5 +177,5 @@ def negative(quantity: Quantity) -> Quantity:
     'negative amplitude'
     """
     return Quantity(
-        f"negative {quantity.name}", quantity.unit, lambda s: -quantity(s), mode=quantity.mode, of=quantity.of
+        f"negative {quantity.name}", quantity.unit, lambda scene, modes: -quantity(scene, modes), mode=quantity.mode, of=quantity.of
     )

@@ -15,6 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number
+from jaxvib.steady.jam import JamModes
 from optimize.quantities import Quantity
 
 __all__ = ["DesignSpace", "Held", "hold"]
@@ -157,11 +158,11 @@ class DesignSpace(eqx.Module):
             values[f.name] = (leaf if f.index is None else leaf[f.index]).tolist()
         return values
 
-    def residuals(self, scene: Scene) -> Array:
+    def residuals(self, scene: Scene, modes: JamModes) -> Array:
         """By how much each held quantity is off, relative to the value it is held at (m,)."""
         if not self.held:
             return jnp.zeros((0,))
-        return jnp.stack([held.quantity(scene) / held.value - 1.0 for held in self.held])
+        return jnp.stack([held.quantity(scene, modes) / held.value - 1.0 for held in self.held])
 
 
 def _leaf(scene: Any, path: tuple[str, ...]) -> Any:

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
-_CONVERGED = 1e-5
-"""What may be left of the gradient, relative to the objective, per full range of a free number."""
+_CONVERGED = 1e-6
+"""By how much, in relation to its value, the objective may still be above its least value nearby."""
 
 _SAME = 1e-3
 """How near two designs must be, relative to the ranges of the free numbers, to count as the same machine."""
@@ -142,7 +142,7 @@ def synthesize(
     starts: int = 256,
     seed: int = 0,
     iterations: int = 150,
-    polishing: int = 12,
+    polishing: int = 16,
     rate: float = 0.05,
     verify: bool = True,
     progress: Callable[[str, float], None] | None = None,
@@ -191,24 +191,21 @@ def synthesize(
 
     tell("drawing starts", 0.0)
     drawn = draw_starts(search, starts, seed)
-    if drawn.z.shape[0] == 0:
+    if len(drawn.z) == 0:
         raise ComputationError(
             "no_feasible_start",
             f"of {drawn.drawn} random designs in the bounds none has {objective.name} and keeps what is held; "
             "widen the bounds, hold other values or ask for another mode",
         )
-    tell("descending", 0.1)
-    z, descent = descend(search, drawn.z, iterations, rate)
-    z.block_until_ready()
-    tell("polishing", 0.5)
-    z, polished, left, good = polish(search, z, polishing)
-    values = np.where(np.asarray(good), np.asarray(jnp.asarray(_last(polished, descent))), np.inf)
-    done = np.asarray(good) & (np.asarray(left) < _CONVERGED)
+    z, descent = descend(search, drawn.z, iterations, rate, lambda share: tell("descending", 0.1 + 0.4 * share))
+    ends = polish(search, z, polishing, lambda share: tell("polishing", 0.5 + 0.4 * share))
+    values = np.where(ends.good, ends.history[-1], np.inf)
+    done = ends.good & (ends.left < _CONVERGED)
     if not np.any(np.isfinite(values)):
         raise ComputationError("diverged", f"no search from {starts} starts ended at a possible design; give a smaller rate")
     best = int(np.argmin(values))
-    scene = space.at(z[best])
-    tell("checking by time integration", 0.8)
+    scene = space.at(jnp.asarray(ends.z[best]))
+    tell("checking by time integration", 0.9)
     run = settle(scene, mode=objective.mode) if verify and objective.mode is not None else None
     tell("done", 1.0)
     return Synthesis(
@@ -217,20 +214,16 @@ def synthesize(
         after=_by_algebra(space, scene, objective),
         verified=None if run is None else _by_run(space, run, objective),
         run=run,
-        starts=drawn.z.shape[0],
+        starts=len(drawn.z),
         drawn=drawn.drawn,
         converged=int(np.sum(done)),
-        same=int(np.sum(np.max(np.abs(np.asarray(z) - np.asarray(z[best])), axis=1) < _SAME)),
-        designs=np.asarray(z),
+        same=int(np.sum(np.max(np.abs(ends.z - ends.z[best]), axis=1) < _SAME)),
+        designs=ends.z,
         values=values,
         done=done,
-        history=np.concatenate([np.asarray(descent), np.asarray(polished)]),
+        history=np.concatenate([descent, ends.history]),
         objective=objective.name,
     )
-
-
-def _last(polished: Any, descent: Any) -> Any:
-    return polished[-1] if polished.shape[0] else descent[-1]
 
 
 def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcome:

@@ -19,7 +19,7 @@ from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.scene import Scene
 
-__all__ = ["TEMPLATES", "closest", "load_scene", "read_toml", "save_scene", "scene_from_toml", "scene_to_toml"]
+__all__ = ["TEMPLATES", "called", "closest", "load_scene", "read_toml", "save_scene", "scene_from_toml", "scene_to_toml"]
 
 _MACHINES = {"one_mass": one_mass, "two_mass": two_mass, "three_mass": three_mass, "network": network}
 _LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}
@@ -112,7 +112,7 @@ def scene_from_tables(tables: Mapping[str, Any]) -> Scene:
         if name not in _EFFECTS:
             raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(_EFFECTS))}")
         if isinstance(value, Mapping):
-            effects.append(_called(_EFFECTS[name], value, f"effects.{name}"))
+            effects.append(called(_EFFECTS[name], value, f"effects.{name}"))
         elif value is True:
             effects.append(_EFFECTS[name]())
         elif value is not False:
@@ -128,10 +128,11 @@ def _built(table: Any, section: str, kinds: Mapping[str, Callable[..., Any]]) ->
     kind = table["kind"]
     if kind not in kinds:
         raise InputError(f"{section}.kind", f"is {kind!r}; {closest(str(kind), list(kinds))}")
-    return _called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
+    return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
-def _called(build: Callable[..., Any], values: Mapping[str, Any], section: str) -> Any:
+def called(build: Callable[..., Any], values: Mapping[str, Any], section: str) -> Any:
+    """`build(**values)`, with every unknown or missing name said as a field of `section`. **Raises** `InputError`."""
     parameters = inspect.signature(build).parameters
     for name in values:
         if name not in parameters:
