@@ -48,8 +48,8 @@ def load_design(path: str | Path) -> Design:
     """Reads a design file.
 
     `scene` names the scene file, relative to the design file; `[free]` gives bounds for each number that may change;
-    every `[[hold]]` a quantity and, unless it shall stay as it is, its value; `[objective]` the quantity to make small, or large
-    with `maximize = true`; `[search]` the number of starts, the seed and the iterations.
+    every `[[hold]]` a quantity and, unless it shall stay as it is, its value; `[objective]` the quantity to make small, or
+    large with `maximize = true`; `[search]` the number of starts, the seed and the iterations.
 
     **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field named.
     """

@@ -69,14 +69,15 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     **Raises** `InputError` for a platform that is not there.
     """
     n = scene.machine.carrier().mass.shape[0]
-    chosen = ((1, 2) if n > 1 else 1) if of is None else of
-    if isinstance(chosen, list):
-        chosen = tuple(chosen)
-    pair = chosen if isinstance(chosen, tuple) else (chosen,)
-    whole = all(isinstance(p, (int, np.integer)) and not isinstance(p, bool) for p in pair)
-    if not whole or not all(1 <= p <= n for p in pair) or len(set(pair)) != len(pair) or len(pair) not in (1, 2):
-        raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms of 1 to {n}")
-    return chosen
+    if of is None:
+        return (1, 2) if n > 1 else 1
+    platforms = tuple(of) if isinstance(of, (tuple, list)) else (of,)
+    whole = all(isinstance(p, (int, np.integer)) and not isinstance(p, bool) and 1 <= p <= n for p in platforms)
+    if whole and len(platforms) == 1:
+        return platforms[0]
+    if whole and len(platforms) == 2 and platforms[0] != platforms[1]:
+        return platforms[0], platforms[1]
+    raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms of 1 to {n}")
 
 
 def _amplitude(scene: Scene, jam: Jam, of: Pair) -> Array:
@@ -94,7 +95,9 @@ def amplitude(*, mode: int, of: Pair = None) -> Quantity:
     >>> amplitude(mode=3, of=1).unit
     'm'
     """
-    return Quantity("amplitude", "m", lambda scene, modes: _amplitude(scene, modes.select(mode, throw=False), of), mode=mode, of=of)
+    return Quantity(
+        "amplitude", "m", lambda scene, modes: _amplitude(scene, modes.select(mode, throw=False), of), mode=mode, of=of
+    )
 
 
 def foundation_force(*, mode: int) -> Quantity:
@@ -160,7 +163,7 @@ def total(field: str) -> Quantity:
     """
 
     def summed(scene: Scene, _: JamModes) -> Array:
-        part, _, name = field.partition(".")
+        part, name = [*field.split(".", 1), ""][:2]
         leaf = getattr(getattr(scene, part, None), name, None)
         if not isinstance(leaf, jax.Array):
             raise InputError("of", f"is {field!r}; it must name numbers of the scene such as machine.stiffness")
@@ -177,5 +180,9 @@ def negative(quantity: Quantity) -> Quantity:
     'negative amplitude'
     """
     return Quantity(
-        f"negative {quantity.name}", quantity.unit, lambda scene, modes: -quantity(scene, modes), mode=quantity.mode, of=quantity.of
+        f"negative {quantity.name}",
+        quantity.unit,
+        lambda scene, modes: -quantity(scene, modes),
+        mode=quantity.mode,
+        of=quantity.of,
     )

@@ -32,7 +32,7 @@ Tell = Callable[[float], None]
 
 
 class Point(NamedTuple):
-    """Designs z (s, d), their values (s, 1 + m): the objective, then by how much what is held is off; derivatives (s, 1 + m, d)."""
+    """Designs z (s, d), their values (s, 1 + m), the objective first, then by how much what is held is off, and derivatives."""
 
     z: np.ndarray
     values: np.ndarray
@@ -46,12 +46,7 @@ class Point(NamedTuple):
 
     def where(self, chosen: np.ndarray, other: Point) -> Point:
         """This point where `chosen`, the other elsewhere."""
-        return Point(
-            *(
-                np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
-                for a, b in zip(self, other, strict=True)
-            )
-        )
+        return Point(*(np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b) for a, b in zip(self, other, strict=True)))
 
 
 class Search(eqx.Module):

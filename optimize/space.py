@@ -88,7 +88,8 @@ class DesignSpace(eqx.Module):
 
     >>> import jaxvib as jv
     >>> from optimize import DesignSpace
-    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
     >>> scene = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("1500 rpm"))
     >>> space = DesignSpace(scene, free={"machine.stiffness": (1e4, 2e5), "machine.link_stiffness": ("50 N/mm", 5e5)})
     >>> space.size
@@ -132,10 +133,7 @@ class DesignSpace(eqx.Module):
             start += f.size
             value = f.low * (f.high / f.low) ** part if f.log else f.low + (f.high - f.low) * part
             leaf = _leaf(scene, f.path)
-            if f.index is not None:
-                new = leaf.at[f.index].set(value[0])
-            else:
-                new = jnp.reshape(value, leaf.shape)
+            new = jnp.reshape(value, leaf.shape) if f.index is None else leaf.at[f.index].set(value[0])
             scene = eqx.tree_at(lambda s, path=f.path: _leaf(s, path), scene, new)
         return scene
 
@@ -160,9 +158,8 @@ class DesignSpace(eqx.Module):
 
     def residuals(self, scene: Scene, modes: JamModes) -> Array:
         """By how much each held quantity is off, relative to the value it is held at (m,)."""
-        if not self.held:
-            return jnp.zeros((0,))
-        return jnp.stack([held.quantity(scene, modes) / held.value - 1.0 for held in self.held])
+        off = [held.quantity(scene, modes) / held.value - 1.0 for held in self.held if held.value is not None]
+        return jnp.stack(off) if off else jnp.zeros((0,))
 
 
 def _leaf(scene: Any, path: tuple[str, ...]) -> Any:

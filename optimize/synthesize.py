@@ -38,9 +38,9 @@ _SAME = 1e-3
 class Outcome:
     """A machine in numbers, in one jam mode.
 
-    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m and
-    `foundation_force` N, zero to peak; `force_per_amplitude` N/m; `objective` what the search made small. NaN where the mode
-    does not exist.
+    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m
+    and `foundation_force` N, zero to peak; `force_per_amplitude` N/m; `objective` what the search made small. NaN
+    where the mode does not exist.
     """
 
     parameters: dict[str, float | list[float]]
@@ -73,8 +73,8 @@ class Synthesis:
     **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
     integration of the full equations (None if not asked for), from `run`; `starts` searches made, from `drawn` random designs;
     `converged` how many of them ended where no free number can improve; `same` how many ended at the best design; `designs`
-    (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history` (iterations, starts)
-    of the objective; `objective` its name.
+    (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history` (iterations,
+    starts) of the objective; `objective` and `unit` its name and unit.
     """
 
     scene: Scene
@@ -91,6 +91,7 @@ class Synthesis:
     done: np.ndarray
     history: np.ndarray
     objective: str
+    unit: str
 
     def summary(self) -> str:
         """Before, after and verified, for a person to read."""
@@ -114,7 +115,7 @@ class Synthesis:
 
     def plot_convergence(self) -> Figure:
         """The objective of every start over the iterations. **Returns** a matplotlib figure."""
-        return convergence(self.history, label=self.objective)
+        return convergence(self.history, label=f"{self.objective}, {self.unit}".rstrip(", "))
 
 
 def _show(value: float | list[float]) -> str:
@@ -223,6 +224,7 @@ def synthesize(
         done=done,
         history=np.concatenate([descent, ends.history]),
         objective=objective.name,
+        unit=objective.unit,
     )
 
 
@@ -248,7 +250,12 @@ def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
     of: Pair = between(run.scene, objective.of)
     force = float(run.foundation_force)
     whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.scene, run.window, *of))
-    read = {"amplitude": whose, "foundation_force": force, "force_per_amplitude": force / whose, "jam_frequency": float(run.omega)}
+    read = {
+        "amplitude": whose,
+        "foundation_force": force,
+        "force_per_amplitude": force / whose,
+        "jam_frequency": float(run.omega),
+    }
     return Outcome(
         parameters=space.parameters(run.scene),
         exists=True,

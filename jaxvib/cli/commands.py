@@ -16,7 +16,6 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.motion.run import RunStatus
 from optimize import Outcome, Synthesis, load_design, synthesize
 from optimize.files import TEMPLATE
 
@@ -80,9 +79,7 @@ def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
             }
             for jam in jams
         ],
-        "folds": [
-            {"omega": float(found.folds.omega[k]), "rotor_speed": float(found.folds.rotor_speed[k])} for k in folds
-        ],
+        "folds": [{"omega": float(found.folds.omega[k]), "rotor_speed": float(found.folds.rotor_speed[k])} for k in folds],
     }
 
     def text() -> str:
@@ -116,7 +113,9 @@ def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
 @app.command("simulate")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time, such as 20s or '0.5 min'.")
-@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state.")
+@click.option(
+    "--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state."
+)
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, default=1e-8, show_default=True, help="Error a step may make.")
@@ -151,7 +150,8 @@ def simulate(
         run.plot().savefig(picture)
         run.save(data)
     document = {
-        "status": RunStatus[run.status],
+        "status": "done",
+        "message": run.message,
         "time": float(run.window.time[-1]),
         "rotor_speed": float(run.window.rotor_speed[-1]),
         "omega": float(run.omega),
@@ -178,7 +178,11 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
     given = {"starts": starts, "seed": seed}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
+        TextColumn("{task.description}"),
+        BarColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
     ) as bar:
         task = bar.add_task("", total=1.0)
         best = synthesize(

@@ -22,7 +22,8 @@ def time_histories(
     *,
     names: Sequence[str],
 ) -> Figure:
-    """Three panels over time (s): displacements (nt, nd) mm, load speeds (nt, count) and the rotor's rad/s, force (nt, nb) N."""
+    """Three panels over time (s): displacements (nt, nd) mm, speeds of the loads (nt, count) and of the
+    rotor (nt,) rad/s, force on the bed (nt, nb) N."""
     figure, (top, middle, bottom) = panels(3, size=(8.0, 2.4), share_x=True)
     for k, name in enumerate(names):
         top.plot(time, 1e3 * displacement[:, k], color=COLORS[k % len(COLORS)], label=name, lw=0.7)
@@ -106,10 +107,10 @@ def before_after(before: Mapping[str, float], after: Mapping[str, float], *, tit
     figure, (axis,) = panels(1, size=(8.0, 0.55 * len(shared) + 1.4))
     ratios = [after[name] / before[name] for name in shared]
     places = np.arange(len(shared))[::-1]
-    axis.barh(places, ratios, color=[COLORS[2] if r <= 1.0 else COLORS[1] for r in ratios], height=0.6)
+    axis.barh(places, ratios, color=COLORS[0], height=0.6)
     axis.axvline(1.0, color="black", lw=0.9)
     for place, name, ratio in zip(places, shared, ratios, strict=True):
-        axis.text(max(ratio, 1.0), place, f"  {before[name]:.4g} → {after[name]:.4g}", va="center", fontsize=9)
+        axis.text(max(ratio, 1.0), place, f"   {before[name]:.4g} → {after[name]:.4g}", va="center", fontsize=9)
     axis.set_yticks(places, shared)
     axis.set_xlim(0.0, 1.45 * max([1.0, *ratios]))
     axis.set_xlabel("after / before")

@@ -15,7 +15,7 @@ __all__ = ["COLORS", "panels"]
 COLORS = ("#1f5aa6", "#c8501e", "#2d8a4e", "#7a4fa3", "#b8860b", "#555555", "#0f8b8d", "#a8324a")
 """Colours told apart by every reader; further series start over."""
 
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "font.size": 10.0,
     "axes.grid": True,
     "grid.color": "#dddddd",
@@ -30,7 +30,9 @@ _STYLE: dict[str, Any] = {
 }
 
 
-def panels(rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False) -> tuple[Figure, list[Axes]]:
+def panels(
+    rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False
+) -> tuple[Figure, list[Axes]]:
     """A figure with `rows` x `columns` axes in the house's style, `size` inches each. **Returns** the figure and its axes.
 
     >>> figure, axes = panels(2)

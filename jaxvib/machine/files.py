@@ -19,7 +19,16 @@ from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.scene import Scene
 
-__all__ = ["TEMPLATES", "called", "closest", "load_scene", "read_toml", "save_scene", "scene_from_toml", "scene_to_toml"]
+__all__ = [
+    "TEMPLATES",
+    "called",
+    "closest",
+    "load_scene",
+    "read_toml",
+    "save_scene",
+    "scene_from_toml",
+    "scene_to_toml",
+]
 
 _MACHINES = {"one_mass": one_mass, "two_mass": two_mass, "three_mass": three_mass, "network": network}
 _LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}

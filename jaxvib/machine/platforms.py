@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.units import Number, count, number, numbers
+from jaxvib.machine.units import Number, count, numbers
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 
@@ -125,18 +125,7 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
 
     Source: Filimonikhin et al. 2022, equation (9).
     """
-    one = {"low": 0.0}
-    return _platforms(
-        "one_mass",
-        1,
-        number(mass, "kg", "machine.mass", low=0.0, open_low=True),
-        number(stiffness, "N/m", "machine.stiffness", **one),
-        number(damping, "N s/m", "machine.damping", **one),
-        (),
-        (),
-        (),
-        1,
-    )
+    return _platforms("one_mass", 1, mass, stiffness, damping, (), (), (), 1)
 
 
 def two_mass(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -67,7 +66,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
 def energy(scene: Scene, state: State) -> Array:
     """Kinetic and potential energy of a state, J.
 
-        E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ]
+    E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ]
     """
     carrier, loads = scene.machine.carrier(), scene.loads
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
@@ -84,7 +83,7 @@ def energy(scene: Scene, state: State) -> Array:
 def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     """Power that the rotor puts in, and power that dampers and drag dissipate, W; dE/dt is their difference.
 
-        P_in = speed sum_j b_W R^2 (speed - phi_j'),    P_diss = q'.C q' + sum_j b_W R^2 (speed - phi_j')^2
+    P_in = speed sum_j b_W R^2 (speed - phi_j'),    P_diss = q'.C q' + sum_j b_W R^2 (speed - phi_j')^2
     """
     speed = scene.drive.speed_at(t)
     torque = scene.loads.resistance(state.angle, state.rate, speed)
@@ -191,11 +190,11 @@ def _away_from_zero(x: Array) -> Array:
     return jnp.where(jnp.abs(x) < tiny, tiny, x)
 
 
-
-
 def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Array:
     """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
     acceleration = jax.vmap(vector_field(scene))(stretch.time, stretch.state).velocity
-    x, v, a = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration))
+    x, v, a = (
+        values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
+    )
     step = stretch.time[1] - stretch.time[0]
     return _zero_to_peak(x, v * step, a * step**2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -37,7 +39,7 @@ class ProgressBar(diffrax.AbstractProgressMeter):
         """The progress shown last."""
         return jnp.array(0.0)
 
-    def step(self, state: Array, progress: Array) -> Array:
+    def step(self, state: Array, progress: Any) -> Array:
         """Shows `progress` where it is a per cent further."""
         progress = jnp.asarray(progress, dtype=state.dtype)
         further = (progress - state > 0.01) | (progress >= 1.0)

@@ -48,6 +48,11 @@ class Run(Measured):
     rejected: Array
     scene: Scene
 
+    @property
+    def message(self) -> str:
+        """How the run ended, a sentence."""
+        return RunStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
         names = self.scene.machine.carrier().coordinates
@@ -56,7 +61,7 @@ class Run(Measured):
         state = "settled" if bool(self.settled) else "not settled"
         return "\n".join(
             [
-                f"{RunStatus[self.status]}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
@@ -111,7 +116,7 @@ class Run(Measured):
                 "direction": list(range(1, kept.foundation_force.shape[1] + 1)),
             },
             attrs={
-                "status": RunStatus[self.status],
+                "status": self.message,
                 "omega": float(self.omega),
                 "amplitude": np.asarray(self.amplitude).tolist(),
                 "foundation_force_amplitude": float(self.foundation_force),
@@ -126,7 +131,8 @@ class Run(Measured):
         """
         arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(eqx.filter(self, eqx.is_array)))}
         path = Path(path).with_suffix(".npz")
-        np.savez(path, scene=scene_to_toml(self.scene), kept_all=self.trajectory is not None, **arrays)
+        arrays |= {"scene": np.asarray(scene_to_toml(self.scene)), "kept_all": np.asarray(self.trajectory is not None)}
+        np.savez(path, allow_pickle=False, **arrays)
         return path
 
     @classmethod

@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import traced
 from jaxvib.steady.response import _modes, circular_loads, magnitude, natural_frequencies, steady_displacement, turning
 
 __all__ = ["Folds", "Jam", "JamModes", "JamStatus", "jam_modes", "jam_rotor_speed"]
@@ -89,7 +90,7 @@ class JamModes(Jam):
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
         jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
-        if throw and not isinstance(self.omega, jax.core.Tracer) and not bool(self.exists[mode - 1]):
+        if throw and not traced(self.omega) and not bool(self.exists[mode - 1]):
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",
@@ -157,7 +158,7 @@ def jam_modes(scene: Scene) -> JamModes:
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
     drag = circular_loads(scene).drag_sum()
-    if not isinstance(drag, jax.core.Tracer) and not float(drag) > 0.0:
+    if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
     return _jam_modes(scene)
 
@@ -176,7 +177,8 @@ def _jam_modes(scene: Scene) -> JamModes:
     def jam(number: Array, w: Array, is_there: Array) -> Jam:
         found = _jam_at(scene, number, w, n)
         values = jax.tree.map(
-            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value, found
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
+            found,
         )
         return eqx.tree_at(
             lambda j: (j.status, j.stable, j.rotor_speed),
