@@ -13,7 +13,15 @@ from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.response import _modes, circular_loads, magnitude, natural_frequencies, steady_displacement, turning
+from jaxvib.steady.response import (
+    _modes,
+    circular_loads,
+    loaded_mass,
+    magnitude,
+    natural_frequencies,
+    steady_displacement,
+    turning,
+)
 
 __all__ = ["Folds", "Jam", "JamModes", "JamStatus", "jam_modes", "jam_rotor_speed"]
 
@@ -141,6 +149,7 @@ def jam_modes(scene: Scene) -> JamModes:
     the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls
     from it, 2 nd + 1 is beyond the last; so mode 3 is the jam just below the second resonance even where the first one is
     damped so much that modes 1 and 2 have vanished. Rising pieces (odd modes) are stable by slope, falling ones are not.
+    Where the branch has more peaks than resonances, the lowest ripples, each over a narrow range of rotor speeds, are left out.
 
     **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
@@ -175,10 +184,14 @@ def _jam_modes(scene: Scene) -> JamModes:
     there = jnp.any(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    def jam(number: Array, w: Array, is_there: Array) -> Jam:
+    # Closer to a fold than this, its rotor speed cannot be told from the scene's, and a derivative has no digits left.
+    speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
+    close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
+    close = (close | jnp.roll(close, -1))[chosen]
+
+    def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
         displacement = steady_displacement(scene, w)
         slope = jax.jvp(lambda x: jam_rotor_speed(scene, x), (w,), (jnp.ones_like(w),))[1]
-        flat = jnp.abs(slope) < jnp.sqrt(jnp.finfo(slope.dtype).eps)
         known = JamStatus.where(flat, JamStatus.at_fold, JamStatus.found)
 
         def or_nan(value: Array) -> Array:
@@ -196,7 +209,7 @@ def _jam_modes(scene: Scene) -> JamModes:
             foundation_force=or_nan(_bed_force(scene, w, displacement)),
         )
 
-    jams = jax.vmap(jam)(numbers, omega, there)
+    jams = jax.vmap(jam)(numbers, omega, there, close)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return JamModes(**fields, resonances=natural_frequencies(scene), folds=pieces.folds)
 
@@ -224,26 +237,32 @@ def _pieces(scene: Scene) -> _Pieces:
     def slope(s: Scene, w: Array) -> Array:
         return jax.jvp(lambda x: jam_rotor_speed(s, x), (w,), (jnp.ones_like(w),))[1]
 
+    grid = _with_close_folds(lambda w: slope(frozen, w), grid, 2 * nd)
     falling = jax.vmap(lambda w: slope(frozen, w))(grid) < 0.0
-    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=2 * nd, fill_value=grid.shape[0] - 1)
+    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: slope(scene, w), lo, hi))(grid[change], grid[change + 1])
+    speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
+    main = _without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
+    omega, speeds, found = omega[main], speeds[main], found[main]
     end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
-        rotor_speed=jnp.where(found, jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega), jnp.nan),
+        rotor_speed=jnp.where(found, speeds, jnp.nan),
         exists=found,
     )
     cuts = jax.lax.stop_gradient(jnp.where(found, omega, end))
     low = jnp.concatenate([jnp.zeros_like(cuts[:1]), cuts])
     high = jnp.concatenate([cuts, jnp.reshape(end, (1,))])
 
-    # Each peak belongs to the resonance it is nearest to; two peaks never share one.
+    # Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
     owners: list[Array] = []
+    later = jnp.sum(found) // 2 - 1
     for k, peak in enumerate(cuts[0::2]):
         nearest = 1 + jnp.argmin(jnp.abs(resonances - peak))
-        owners.append(jnp.clip(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), k + 1, nd))
+        free = jnp.clip(nd - (later - k), 1, nd)
+        owners.append(jnp.minimum(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), free))
     mode = []
     for k, owner in enumerate(owners):
         last = 2 * nd + 1
@@ -251,20 +270,73 @@ def _pieces(scene: Scene) -> _Pieces:
     return _Pieces(low, high, jnp.stack([*mode, jnp.asarray(2 * nd + 1)]), resonances, folds)
 
 
+def _without_ripples(speeds: Array, count: Array, most: int) -> Array:
+    """Indices of the `most` folds that matter, of twice as many with rotor speeds `speeds`, of which the first `count` exist.
+
+    A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
+    """
+    index = jnp.arange(2 * most)
+    keep = index
+    for _ in range(most // 2):
+        known = speeds[keep]
+        span = jnp.abs(jnp.log(known[1:] / known[:-1]))
+        least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
+        skip = (count > most) & (index >= least)
+        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * most - 1), index)]
+        count = jnp.where(count > most, count - 2, count)
+    return keep[:most]
+
+
 def _fold_grid(scene: Scene) -> tuple[Array, Array]:
-    """Load speeds that crowd about every resonance as closely as its width asks; folds lie between some of them."""
-    resonances, shapes = _modes(scene)
+    """Load speeds that crowd about every pole as closely as its width asks; folds lie between some of them.
+
+    Poles s of det(K + s^2 M + s C) = 0, not undamped resonances: a strong damper between two platforms locks them into one,
+    whose sharp peak is at neither's resonance.
+    """
+    resonances, _ = _modes(scene)
     carrier = scene.machine.carrier()
-    width = jnp.einsum("ar,ab,br->r", shapes, carrier.damping, shapes) / 2.0
-    top = jnp.max(resonances)
+    poles = _poles(loaded_mass(scene), carrier.damping, carrier.stiffness)
+    top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
-    width = jnp.maximum(width, tiny * top)
+    width = jnp.maximum(jnp.abs(poles.real), tiny * top)
     reach = 5.0 * top
     s = jnp.linspace(0.0, 1.0, _POINTS)[None, :]
     offset = width[:, None] * jnp.sinh(s * jnp.arcsinh(reach / width)[:, None])
-    grid = jnp.concatenate([resonances[:, None] - offset, resonances[:, None] + offset]).ravel()
+    # Of a pair of poles one has the points above, the other one those below; a pole that is real has nothing below.
+    side = jnp.where(poles.imag >= 0.0, 1.0, -1.0)[:, None]
+    grid = (jnp.abs(poles.imag)[:, None] + side * offset).ravel()
     low = 1e-3 * jnp.min(jnp.where(resonances > 0.0, resonances, top))
     return jnp.sort(jnp.clip(grid, low, top + reach)), resonances
+
+
+def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
+    """The 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    n = mass.shape[0]
+    solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
+    return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
+
+
+def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> Array:
+    """The grid with points added where the slope comes closest to 0 and turns back: two folds may hide in one interval."""
+    value = jax.vmap(slope)(grid)
+    sign, size = jnp.sign(value), jnp.abs(value)
+    same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
+    dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
+    (at,) = jnp.nonzero(dips, size=most, fill_value=0)
+    step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
+
+    def lowest(low: Array, high: Array, side: Array) -> Array:
+        def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            a, b = bracket
+            x, y = b - step * (b - a), a + step * (b - a)
+            left = side * slope(x) < side * slope(y)
+            return jnp.where(left, a, x), jnp.where(left, y, b)
+
+        a, b = jax.lax.fori_loop(0, 40, narrow, (low, high))
+        return (a + b) / 2.0
+
+    return jnp.sort(jnp.concatenate([grid, jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])]))
 
 
 def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
