@@ -35,6 +35,7 @@ class JamStatus(eqx.Enumeration):
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
+    unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
 
 
 class Folds(eqx.Module):
@@ -71,7 +72,7 @@ class Jam(eqx.Module):
 class JamModes(Jam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
 
-    A mode that does not exist holds NaN and the status `absent`. Adds `resonances` (nd,) rad/s and the `folds` of the branch.
+    A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`. Adds `resonances` (nd,) rad/s and the `folds` of the branch.
     """
 
     resonances: Array
@@ -93,7 +94,7 @@ class JamModes(Jam):
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
         most = self.mode.shape[0]
-        if not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
         jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
@@ -192,15 +193,17 @@ def _jam_modes(scene: Scene) -> JamModes:
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
         displacement = steady_displacement(scene, w)
         slope = jax.jvp(lambda x: jam_rotor_speed(scene, x), (w,), (jnp.ones_like(w),))[1]
+        bounded = jnp.all(jnp.isfinite(displacement))
         known = JamStatus.where(flat, JamStatus.at_fold, JamStatus.found)
+        known = JamStatus.where(bounded, known, JamStatus.unbounded)
 
         def or_nan(value: Array) -> Array:
-            return jnp.where(is_there, value, jnp.nan)
+            return jnp.where(is_there & bounded, value, jnp.nan)
 
         return Jam(
             mode=number,
             status=JamStatus.where(is_there, known, JamStatus.absent),
-            omega=or_nan(w),
+            omega=jnp.where(is_there, w, jnp.nan),
             rotor_speed=n,
             stable=is_there & (slope > 0.0),
             slope=or_nan(slope),

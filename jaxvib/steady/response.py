@@ -82,7 +82,8 @@ def steady_displacement(scene: Scene, omega: Array) -> Array:
 def magnitude(value: Array) -> Array:
     """|value| of complex numbers, with derivative 0 in place of NaN where the value is exactly 0."""
     square = value.real**2 + value.imag**2
-    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+    zero = square == 0.0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
 
 
 def small_solve(a: Array, b: Array) -> Array:
