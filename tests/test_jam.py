@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import polynomial as poly
-from scenes import loads, machines, published, scene
+from scenes import loads, machines, published
 
 import jaxvib as jv
 from jaxvib.steady.response import small_solve
