@@ -159,7 +159,15 @@ def through_time(adjoint, until):
 
     def outputs(x):
         run = jv.simulate(
-            moved(s, x), until, start=start, save="window", turns=4, tolerance=1e-9, adjoint=adjoint, max_steps=2**15, throw=False
+            moved(s, x),
+            until,
+            start=start,
+            save="window",
+            turns=4,
+            tolerance=1e-9,
+            adjoint=adjoint,
+            max_steps=2**15,
+            throw=False,
         )
         return jnp.append(run.amplitude, run.foundation_force)
 

@@ -1,5 +1,7 @@
 """Motion in time against independent engines, energy, leading order; and what a run can do."""
 
+import itertools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -35,15 +37,17 @@ def small_start():
 def mujoco_model(s, gravity):
     """The small machine in MuJoCo's own words: slides, a tendon for the link, hinges that turn x toward z."""
     m, load = s.machine, s.loads
-    mass, radius, inertia, drag = (np.broadcast_to(np.asarray(x), (3,)) for x in (load.mass, load.radius, load.inertia, load.drag))
+    given = (load.mass, load.radius, load.inertia, load.drag)
+    mass, radius, inertia, drag = (np.broadcast_to(np.asarray(x), (3,)) for x in given)
     bobs = "".join(
         f"""<body><joint name="phi{k}" type="hinge" axis="0 -1 0" damping="{drag[k] * radius[k] ** 2:.17g}"/>
         <inertial pos="{radius[k]:.17g} 0 0" mass="{mass[k]:.17g}" diaginertia="0.01 {inertia[k]:.17g} 0.01"/></body>"""
         for k in range(3)
     )
     platforms = "".join(
-        f"""<body><joint name="y{k}" type="slide" axis="0 0 1" stiffness="{m.stiffness[k]:.17g}" damping="{m.damping[k]:.17g}"/>
-        <inertial pos="0 0 0" mass="{m.mass[k]:.17g}" diaginertia="1 1 1"/>{bobs if k == 1 else ""}</body>"""
+        f"""<body><joint name="y{k}" type="slide" axis="0 0 1"
+        stiffness="{m.stiffness[k]:.17g}" damping="{m.damping[k]:.17g}"/>
+        <inertial pos="0 0 0" mass="{m.mass[k]:.17g}" diaginertia="1 1 1"/>{bobs if k else ""}</body>"""
         for k in range(2)
     )
     return mujoco.MjModel.from_xml_string(
@@ -89,7 +93,7 @@ def test_smaller_tolerance_means_smaller_error():
         run = jv.simulate(s, 20.0, start=start, samples=2, tolerance=tolerance)
         last = jax.tree.map(lambda leaf: leaf[-1], run.trajectory.state)
         error.append(np.max(np.abs(ravel_pytree(last)[0] - exact)))
-    assert all(b < 0.1 * a for a, b in zip(error, error[1:], strict=False)), error
+    assert all(b < 0.1 * a for a, b in itertools.pairwise(error)), error
     assert error[-1] < 1e-8
 
 
@@ -285,7 +289,7 @@ def test_spin_up_starts_at_rest_and_ends_at_speed():
 
 
 def test_what_float32_cannot_deliver_is_refused():
-    with jax.enable_x64(False), pytest.raises(jv.InputError, match="in float32 it must be at least .* switch JAX to float64"):
+    with jax.enable_x64(False), pytest.raises(jv.InputError, match=r"in float32 .* switch JAX to float64"):
         jv.simulate(published().scene(), 10.0)
 
 

@@ -129,7 +129,8 @@ def test_wrong_input_is_one_sentence(case):
 
 
 def test_dimensionless_forms_refuse_what_cannot_be():
-    numbers_ = dict(natural=(0.3, 0.3), damping=0.01, link_natural=0.6, link_damping=0.01, rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    numbers_ = dict(natural=(0.3, 0.3), damping=0.01, link_natural=0.6, link_damping=0.01, rho=1.0)
+    numbers_ |= dict(eps=1e-3, beta=1.0, speed=3.0)
     for changed, sentence in (
         (dict(form="other"), "form is 'other'; it must be 'antiphase' or 'criterion'"),
         (dict(natural=(1.0,) * 4), "natural has 4 values; the papers' machines have 1, 2 or 3 platforms"),
@@ -202,7 +203,7 @@ def tables(**changed):
     [
         (dict(machine=None), "machine is missing; a scene file needs the table [machine]"),
         (dict(machine=5), "machine is 5; it must be a table, write [machine]"),
-        (dict(machin={}), "machin is no table of a scene file; did you mean 'machine'? allowed: machine, loads, drive, effects"),
+        (dict(machin={}), "machin is no table of a scene file; did you mean 'machine'? allowed: machine, loads"),
         (dict(machine__kind=None), "machine.kind is missing; allowed: one_mass, two_mass, three_mass, network"),
         (dict(machine__kind="twomass"), "machine.kind is 'twomass'; did you mean 'two_mass'? allowed: one_mass, two_mass"),
         (dict(machine__kind=["two_mass"]), "machine.kind is ['two_mass']; "),
@@ -239,10 +240,10 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
     with pytest.raises(jv.InputError, match=r"missing.toml cannot be read \(No such file or directory\)"):
         jv.load_scene(tmp_path / "missing.toml")
     (tmp_path / "broken.toml").write_text("[machine\nkind = 3")
-    with pytest.raises(jv.InputError, match="broken.toml is no TOML file"):
+    with pytest.raises(jv.InputError, match=r"broken\.toml is no TOML file"):
         jv.load_scene(tmp_path / "broken.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(jv.InputError, match="bytes.toml is no TOML file"):
+    with pytest.raises(jv.InputError, match=r"bytes\.toml is no TOML file"):
         jv.load_scene(tmp_path / "bytes.toml")
     with pytest.raises(jv.InputError, match="cannot be read"):
         jv.load_scene(tmp_path)

@@ -72,7 +72,8 @@ class Jam(eqx.Module):
 class JamModes(Jam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
 
-    A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`. Adds `resonances` (nd,) rad/s and the `folds` of the branch.
+    A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`.
+    Adds `resonances` (nd,) rad/s and the `folds` of the branch.
     """
 
     resonances: Array
