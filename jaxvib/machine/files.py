@@ -13,6 +13,7 @@ import numpy as np
 import tomli_w
 
 from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, SpinUp
 from jaxvib.machine.effects import Gravity
 from jaxvib.machine.loads import balls, pendulums, rollers
@@ -135,7 +136,7 @@ def _built(table: Any, section: str, kinds: Mapping[str, Callable[..., Any]]) ->
     if "kind" not in table:
         raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
     kind = table["kind"]
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise InputError(f"{section}.kind", f"is {kind!r}; {closest(str(kind), list(kinds))}")
     return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
@@ -176,7 +177,9 @@ def _fields(part: Any, build: Callable[..., Any]) -> dict[str, Any]:
             fields[name] = value
         else:
             array = np.asarray(value, dtype=float)
-            fields[name] = array.item() if array.size == 1 else array.tolist()
+            # A machine's single value is written as a number; one load's own value stays a list, apart from a shared one.
+            single = array.ndim == 0 or (array.size == 1 and isinstance(part, Machine))
+            fields[name] = array.item() if single else array.tolist()
     return fields
 
 

@@ -85,6 +85,8 @@ def _platforms(
         raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
 
     def links_of(value: Number, unit: str, field: str) -> Array:
+        if not joined and np.size(value) > 0:
+            raise InputError(field, f"has {np.size(value)} values; the machine has no links, leave it out or give links")
         return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.zeros((0,), dtype=float)
 
     return Platforms(
@@ -100,6 +102,8 @@ def _platforms(
 
 
 def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...]:
+    if not isinstance(links, (list, tuple)):
+        raise InputError("machine.links", f"is {links!r}; it must be a list of pairs of platforms such as [[1, 2]]")
     joined = []
     for index, link in enumerate(links):
         field = f"machine.links[{index}]"
