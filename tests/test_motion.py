@@ -301,3 +301,25 @@ def test_batch_over_rotor_speeds_is_a_loop():
     for k, n in enumerate(speeds):
         for a, b in zip(batch, one(n), strict=True):
             np.testing.assert_allclose(a[k], b, rtol=1e-8)
+
+
+def test_a_lane_whose_start_does_not_exist_says_so():
+    s = published(eps=1e-3).scene()
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def lanes(speed):
+        there = eqx.tree_at(lambda x: x.drive.speed, s, speed)
+        run = jv.simulate(there, 20.0, start="jam", mode=4, save="window", max_steps=4096)
+        return run.status == jv.RunStatus.no_start, run.omega, run.steps
+
+    missing, omega, steps = lanes(jnp.array([1.2, 3.0]))
+    assert missing.tolist() == [True, False]
+    assert jnp.isnan(omega).tolist() == [True, False]
+    assert int(steps[0]) < 4096
+
+
+def test_a_start_given_whole_takes_no_mode():
+    s = published(eps=1e-3).scene()
+    with pytest.raises(jv.InputError, match="leave it out"):
+        jv.simulate(s, 1.0, start=jv.initial_state(s), mode=3)

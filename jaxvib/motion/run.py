@@ -31,6 +31,7 @@ class RunStatus(eqx.Enumeration):
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
+    no_start = "the state to start from does not exist or is not finite"
 
 
 class Run(Measured):

@@ -145,6 +145,8 @@ def simulate(
             raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
         drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
         scene = eqx.tree_at(lambda s: s.drive, scene, drive)
+    if isinstance(start, State) and mode is not None:
+        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
     state = start if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
         max_steps = _enough_steps(scene, end)
@@ -189,6 +191,9 @@ def _run(
     max_steps: int,
     progress: bool,
 ) -> Run:
+    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    exists = _finite(state)
+    state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     field = vector_field(scene)
     frequencies = natural_frequencies(jax.lax.stop_gradient(scene))
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, jax.lax.stop_gradient(scene.drive.speed)))
@@ -219,11 +224,12 @@ def _run(
     assert solution.ts is not None and solution.ys is not None
     times, states = solution.ts[0], solution.ys[0]
     measured = measure(scene, field, times, states)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(states)]))
     finished = solution.result == diffrax.RESULTS.successful
     status = RunStatus.where(
-        finished, RunStatus.where(finite, RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached
+        finished, RunStatus.where(_finite(states), RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached
     )
+    status = RunStatus.where(exists, status, RunStatus.no_start)
+    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), measured)
     return Run(
         status=status,
         trajectory=trajectory(scene, solution.ts[1], solution.ys[1]) if samples else None,
@@ -235,10 +241,15 @@ def _run(
     )
 
 
+def _finite(state: State) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
+
+
 def _raise_if_failed(run: Run, max_steps: int) -> None:
     if bool(run.status == RunStatus.done):
         return
-    name = "max_steps_reached" if bool(run.status == RunStatus.max_steps_reached) else "not_finite"
+    names = ("max_steps_reached", "not_finite", "no_start")
+    name = next(name for name in names if bool(run.status == getattr(RunStatus, name)))
     reached = np.asarray(run.window.time)
     reached = reached[np.isfinite(reached)]
     where = f" at t = {reached[-1]:.6g} s" if name == "not_finite" and reached.size else ""
