@@ -363,7 +363,8 @@ def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -
         def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
             a, b = bracket
             x, y = b - step * (b - a), a + step * (b - a)
-            left = side * slope(x) < side * slope(y)
+            at_x, at_y = jax.vmap(slope)(jnp.stack([x, y]))
+            left = side * at_x < side * at_y
             return jnp.where(left, a, x), jnp.where(left, y, b)
 
         a, b = jax.lax.fori_loop(0, 16, narrow, (low, high))
@@ -414,7 +415,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
             share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
             return steps + 1, a, fa, b, fb, share
 
-        start = (jnp.asarray(0), low, g(low), high, g(high), jnp.full_like(low, 0.5))
+        f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
+        start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5))
         _, a, fa, b, fb, _ = jax.lax.while_loop(open_, step, start)
         return jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
 
