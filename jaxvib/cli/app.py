@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
+from rich.table import Table
 
 from jaxvib.errors import ComputationError, InputError
 
-__all__ = ["Output", "app", "run"]
+__all__ = ["Output", "app", "run", "shared", "table"]
 
 
 class Output:
@@ -60,6 +62,19 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
+    """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right."""
+    drawn = Table(title=title, title_justify="left")
+    for k, name in enumerate(columns):
+        drawn.add_column(name, justify="left" if k == 0 else "right")
+    for row in rows:
+        drawn.add_row(*row)
+    console = Console(width=118)
+    with console.capture() as capture:
+        console.print(drawn)
+    return capture.get().rstrip()
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
 @click.version_option(package_name="jaxvib")
 def app() -> None:
@@ -86,7 +101,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 def run(arguments: list[str]) -> int:
     """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
-    from jaxvib.cli import commands  # noqa: F401 - registers the commands
+    from jaxvib.cli import commands, modes  # noqa: F401 - registers the commands
 
     wants_json = "--json" in arguments
     try:

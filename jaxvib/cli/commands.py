@@ -1,4 +1,4 @@
-"""jaxvib new, modes, simulate, optimize."""
+"""jaxvib new, simulate, optimize."""
 
 from __future__ import annotations
 
@@ -7,31 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
 from optimize import Outcome, Synthesis, load_design, synthesize
 from optimize.files import TEMPLATE
-
-_RPM = 30.0 / np.pi
-
-
-def _table(title: str, columns: list[str], rows: list[list[str]]) -> str:
-    table = Table(title=title, title_justify="left")
-    for k, name in enumerate(columns):
-        table.add_column(name, justify="left" if k == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    console = Console(width=118)
-    with console.capture() as capture:
-        console.print(table)
-    return capture.get().rstrip()
 
 
 @app.command("new")
@@ -48,66 +32,6 @@ def new(kind: str, output: Output) -> None:
         raise InputError("--out", f"has a file {path.name} already, which is left as it is; name another folder")
     path.write_text(text, encoding="utf-8")
     output.done({"kind": kind, "toml": text}, lambda: f"a commented file for {kind}", "new")
-
-
-@app.command("modes")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
-@click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
-@shared
-def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
-    """Every jam mode of SCENE at its rotor speed, by the equations for light loads; --out adds the branch diagram."""
-    loaded = jv.load_scene(scene)
-    if speed is not None:
-        loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
-    found = jv.jam_modes(loaded)
-    picture = output.file("branches.png")
-    if picture is not None:
-        jv.branches(loaded).plot(unit=unit).savefig(picture)
-    jams = [found.select(k) for k in found.mode_numbers()]
-    folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
-    document = {
-        "rotor_speed": float(loaded.drive.speed),
-        "resonances": found.resonances.tolist(),
-        "modes": [
-            {
-                "mode": int(jam.mode),
-                "omega": float(jam.omega),
-                "stable": bool(jam.stable),
-                "amplitude": jam.amplitude.tolist(),
-                "foundation_force": float(jam.foundation_force),
-            }
-            for jam in jams
-        ],
-        "folds": [{"omega": float(found.folds.omega[k]), "rotor_speed": float(found.folds.rotor_speed[k])} for k in folds],
-    }
-
-    def text() -> str:
-        names = loaded.machine.carrier().coordinates
-        rows = [
-            [
-                f"{int(jam.mode)}",
-                f"{float(jam.omega):.5g}",
-                f"{_RPM * float(jam.omega):.5g}",
-                "stable" if jam.stable else "unstable",
-                *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
-                f"{float(jam.foundation_force):.4g}",
-            ]
-            for jam in jams
-        ]
-        speed = float(loaded.drive.speed)
-        resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
-        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in names), "force on bed, N"]
-        lines = [
-            f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            _table("jam modes of light loads; amplitudes and force zero to peak", head, rows),
-        ]
-        if folds:
-            pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
-            lines.append(_table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
-        return "\n".join(lines)
-
-    output.done(document, text, "modes")
 
 
 @app.command("simulate")
@@ -240,4 +164,4 @@ def _outcomes(best: Synthesis) -> str:
     row("force per amplitude, N/m", lambda o: o.force_per_amplitude)
     counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
     checked = "" if best.verified is None else "\nverified: measured on the full equations, integrated until they settled"
-    return counted + "\n" + _table(f"least {best.objective}", ["", *(name for name, _ in columns)], rows) + checked
+    return counted + "\n" + table(f"least {best.objective}", ["", *(name for name, _ in columns)], rows) + checked
