@@ -9,6 +9,15 @@ from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.steady.balance import (
+    BalancedStability,
+    BalancedStates,
+    BalanceStatus,
+    balanced_growth,
+    balanced_intervals,
+    balanced_stability,
+    balanced_states,
+)
 from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.response import natural_frequencies, steady_displacement
