@@ -22,3 +22,4 @@ from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, crite
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.study.criterion_map import CriterionMap, criterion_map
