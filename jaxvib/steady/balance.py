@@ -35,7 +35,7 @@ class BalanceStatus(eqx.Enumeration):
     unique = "the loads cancel in one arrangement, up to a common turn and a mirror image"
     family = "the loads cancel in a family of arrangements, with neutral directions besides the common turn"
     alone = "a single load has nothing to cancel it"
-    outweighed = "one load's m R is larger than that of all others together, so nothing can cancel it"
+    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together: nothing can cancel it"
 
 
 class BalancedStates(eqx.Module):
@@ -62,17 +62,20 @@ class BalancedStates(eqx.Module):
         return "\n".join([BalanceStatus[self.status], *rows, directions])
 
 
-def balanced_states(scene: Scene) -> BalancedStates:
+def balanced_states(scene: Scene, *, imbalance: float = 0.0) -> BalancedStates:
     """All arrangements in which the scene's loads cancel each other.
 
-        sum_j m_j R_j exp(i alpha_j) = 0
+        sum_j m_j R_j exp(i alpha_j) + imbalance = 0
 
     Two loads cancel if equal, opposite each other. Three do in one triangle and its mirror image. From four on there
     is a family with N - 2 dimensions; the arrangement given for it spreads the loads most (the sides m_j R_j of a
     polygon inscribed in a circle: equal loads are evenly spaced), and its mirror image; `neutral` says where the
     family goes.
 
-    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle.
+    **Arguments**: `imbalance` kg m, the rotor's own, at angle 0 of its frame. Where there is one it counts as one more
+    side of the polygon, and the loads have no common turn.
+
+    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle, a negative imbalance.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -86,27 +89,30 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
     """
-    sides = _sides(circular_loads(scene))
-    n = sides.size
-    nothing = {"angles": np.zeros((0, n)), "dimension": 0, "neutral": [], "names": ()}
+    loads = _sides(circular_loads(scene))
+    n = loads.size
+    sides = loads if imbalance == 0.0 else np.append(loads, imbalance)
+    if not imbalance >= 0.0:
+        raise InputError("imbalance", f"is {imbalance:g} kg m; it must be at least 0")
     largest = sides.max()
     rest = sides.sum() - largest
     rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
-    if n == 1:
-        return BalancedStates(BalanceStatus.alone, **nothing)
     if largest > rest + rounding:
-        return BalancedStates(BalanceStatus.outweighed, **nothing)
+        status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
+        return BalancedStates(status, np.zeros((0, n)), 0, [], ())
     if largest > rest - rounding:
         # In one line: the largest against all others.
-        one = np.where(np.arange(n) == np.argmax(sides), 0.0, np.pi)
-        angles = np.abs(one - one[0])[None, :]
+        one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
     else:
-        one = _inscribed(sides)
-        angles = np.mod(np.stack([one, -one]), 2.0 * np.pi)
-    neutral = [_neutral(sides, row) for row in angles]
-    names = ("turn of all loads", *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - 1)))
-    status = BalanceStatus.unique if n <= 3 else BalanceStatus.family
-    return BalancedStates(status, angles, n - 1 if n == 2 else n - 2, neutral, names)
+        one = _inscribed(sides) * np.array([[1.0], [-1.0]])
+    fixed = 0 if imbalance == 0.0 else n
+    angles = np.mod(one - one[:, fixed, None], 2.0 * np.pi)[:, :n]
+    neutral = [_neutral(loads, row, turns=imbalance == 0.0) for row in angles]
+    turn = ("turn of all loads",) if imbalance == 0.0 else ()
+    names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
+    status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
+    dimension = max(n - 2, 1 if imbalance == 0.0 else 0)
+    return BalancedStates(status, angles, dimension, neutral, names)
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
@@ -145,16 +151,16 @@ def _inscribed(sides: np.ndarray) -> np.ndarray:
     return direction - direction[0]
 
 
-def _neutral(sides: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Orthonormal changes of the angles (N, d) under which the sum stays 0 to first order; the common turn first."""
+def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
+    """Orthonormal changes of the angles (N, d) that keep the sum to first order; the common turn first, if free."""
     n = sides.size
-    common = np.full((n, 1), 1.0 / np.sqrt(n))
     change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
     _, values, right = np.linalg.svd(change)
-    rank = int(np.sum(values > 1e-6))
-    others = right[rank:].T
-    others = others - common @ (common.T @ others)
-    basis, size, _ = np.linalg.svd(others, full_matrices=False)
+    others = right[int(np.sum(values > 1e-6)) :].T
+    if not turns:
+        return others
+    common = np.full((n, 1), 1.0 / np.sqrt(n))
+    basis, size, _ = np.linalg.svd(others - common @ (common.T @ others), full_matrices=False)
     return np.concatenate([common, basis[:, size > 0.5]], axis=1)
 
 
@@ -250,7 +256,7 @@ def balanced_intervals(
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
     >>> [[round(w, 2) for w in row] for row in jv.balanced_intervals(scene, 20.0, 60.0, points=40)]
-    [[28.29, 60.0]]
+    [[28.28, 60.0]]
     """
     if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
@@ -112,7 +113,8 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes judges
     many machines.
 
-    **Raises** `InputError` where no coordinate moves the port, or a gyroscopic carrier has a motion no spring holds.
+    **Raises** `InputError` where no coordinate moves the port, a spring is too stiff beside the others for the
+    precision, or a gyroscopic carrier has a motion that no spring holds.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
@@ -155,14 +157,34 @@ def _direction(scene: Scene) -> Array:
 
 
 def _require_port_that_moves(scene: Scene) -> None:
+    """Input checks, for concrete numbers only."""
     carrier = scene.machine.carrier()
-    if isinstance(carrier.port, jax.core.Tracer) or isinstance(carrier.stiffness, jax.core.Tracer):
+    parts = (carrier.port, carrier.stiffness, loaded_mass(scene))
+    if any(isinstance(part, jax.core.Tracer) for part in parts):
         return
-    if not bool(jnp.any(carrier.port != 0.0)):
+    port, stiffness, mass = (np.asarray(part) for part in parts)
+    if not np.any(port):
         problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
         raise InputError("machine.port", problem)
-    if carrier.gyroscopic is not None and not bool(jnp.all(jnp.linalg.eigvalsh(carrier.stiffness) > 0.0)):
-        raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
+    if carrier.gyroscopic is not None:
+        if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
+            raise InputError(
+                "machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one"
+            )
+        return
+    # Resonances that rounding takes to 0 beside the highest, though a spring holds the motion.
+    rounding = mass.shape[0] * np.finfo(mass.dtype).eps
+    inverse = np.linalg.inv(np.linalg.cholesky(mass))
+    squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)
+    size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
+    free = np.sum(np.linalg.eigvalsh(stiffness / np.outer(size, size)) <= 100.0 * rounding)
+    if np.sum(squares <= rounding * squares[-1]) > free:
+        stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
+        name = carrier.coordinates[stiff]
+        cannot = "cannot move beside the others in this precision; soften its spring, or leave it out of the machine"
+        if np.any(port[:, stiff]):
+            raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
+        raise InputError("machine.stiffness", f"is so high at {name} that it {cannot}")
 
 
 def _inverse_root(values: Array) -> Array:
