@@ -74,9 +74,7 @@ def _small_factor_inverse(metric: Array) -> Array:
 
 
 def root_or_zero(values: Array) -> Array:
-    """Square roots of ascending eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its
-    derivative.
-    """
+    """Roots of eigenvalues that are never negative; one that rounding cannot tell from 0 is 0, and so is its derivative."""
     there = values > values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
     return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
 
@@ -129,7 +127,9 @@ def _small_modes(square: Array) -> tuple[Array, Array]:
 
 
 @hermitian_modes.defjvp
-def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _hermitian_modes_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     values, vectors = hermitian_modes(*primals)
     change = (tangents[0] + tangents[0].conj().mT) / 2.0
     turned = vectors.conj().mT @ change @ vectors
