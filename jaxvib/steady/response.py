@@ -74,7 +74,7 @@ def _small_factor_inverse(metric: Array) -> Array:
 
 
 def root_or_zero(values: Array) -> Array:
-    """Roots of eigenvalues that are never negative; one that rounding cannot tell from 0 is 0, and so is its derivative."""
+    """Roots of eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its derivative."""
     there = values > values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
     return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
 
