@@ -15,16 +15,35 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.steady.balance import (
+    BalancedStability,
+    BalancedStates,
+    BalanceStatus,
+    balanced_growth,
+    balanced_intervals,
+    balanced_stability,
+    balanced_states,
+)
 from jaxvib.steady.branches import Branches, branches
+from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.response import natural_frequencies, steady_displacement
+from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.study.criterion_map import CriterionMap, criterion_map
 
 __all__ = [
+    "BalanceStatus",
+    "BalancedStability",
+    "BalancedStates",
     "Branches",
     "Carrier",
+    "CharacteristicSpeeds",
     "CircularLoads",
     "ComputationError",
     "ConstantSpeed",
+    "Criterion",
+    "CriterionMap",
+    "CriterionStatus",
     "Dimensionless",
     "Drive",
     "Dynamics",
@@ -45,8 +64,17 @@ __all__ = [
     "SpinUp",
     "State",
     "Trajectory",
+    "balanced_growth",
+    "balanced_intervals",
+    "balanced_stability",
+    "balanced_states",
     "balls",
     "branches",
+    "characteristic_speeds",
+    "criterion",
+    "criterion_functional",
+    "criterion_map",
+    "criterion_table",
     "energy",
     "foundation_force",
     "initial_state",
@@ -57,6 +85,7 @@ __all__ = [
     "network",
     "one_mass",
     "pendulums",
+    "port_receptance",
     "power",
     "rollers",
     "save_scene",

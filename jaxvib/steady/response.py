@@ -11,7 +11,7 @@ from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["loaded_mass", "magnitude", "natural_frequencies", "steady_displacement"]
+__all__ = ["dynamic_stiffness", "loaded_mass", "magnitude", "natural_frequencies", "steady_displacement"]
 
 
 def loaded_mass(scene: Scene) -> Array:
@@ -41,13 +41,101 @@ def natural_frequencies(scene: Scene) -> Array:
 
 def _modes(scene: Scene) -> tuple[Array, Array]:
     """Natural frequencies (nd,) and mass-normalised mode shapes (nd, nd), a column a mode."""
-    factor = jnp.linalg.cholesky(loaded_mass(scene))
-    half = jax.scipy.linalg.solve_triangular(factor, scene.machine.carrier().stiffness, lower=True)
-    square, vectors = jnp.linalg.eigh(jax.scipy.linalg.solve_triangular(factor, half.T, lower=True))
-    shapes = jax.scipy.linalg.solve_triangular(factor.T, vectors, lower=False)
-    # What rounding leaves of a 0 is no frequency.
-    moves = square > 4.0 * square.shape[0] * jnp.finfo(square.dtype).eps * jnp.max(square)
-    return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0), shapes
+    square, inverse = relative_to(loaded_mass(scene), scene.machine.carrier().stiffness)
+    values, vectors = hermitian_modes(square)
+    return root_or_zero(values), inverse.T @ vectors
+
+
+def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
+    """L^-1 A L^-T (nd, nd) and L^-1 of a positive definite metric L L^T; its eigenvalues solve A x = value L L^T x."""
+    n = metric.shape[0]
+    if n > 3:
+        eye = jnp.eye(n, dtype=metric.dtype)
+        inverse = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(metric), eye, lower=True)
+    else:
+        inverse = _small_factor_inverse(metric)
+    return inverse @ matrix @ inverse.T, inverse
+
+
+def _small_factor_inverse(metric: Array) -> Array:
+    """L^-1 of L L^T up to 3 x 3, written out: see `_small_modes`."""
+    n = metric.shape[0]
+    zero = jnp.zeros_like(metric[0, 0])
+    factor: list[list[Array]] = [[zero] * n for _ in range(n)]
+    inverse: list[list[Array]] = [[zero] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i):
+            factor[i][j] = (metric[i, j] - sum(factor[i][k] * factor[j][k] for k in range(j))) / factor[j][j]
+        factor[i][i] = jnp.sqrt(metric[i, i] - sum(factor[i][k] ** 2 for k in range(i)))
+        for j in range(i):
+            inverse[i][j] = -sum(factor[i][k] * inverse[k][j] for k in range(j, i)) / factor[i][i]
+        inverse[i][i] = 1.0 / factor[i][i]
+    return jnp.stack([jnp.stack(row) for row in inverse])
+
+
+def root_or_zero(values: Array) -> Array:
+    """Roots of eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its derivative."""
+    there = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
+    return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
+
+
+@jax.custom_jvp
+def hermitian_modes(square: Array) -> tuple[Array, Array]:
+    """Ascending eigenvalues (..., n) and eigenvectors (..., n, n) of Hermitian matrices.
+
+    The vectors of equal eigenvalues, which are not unique, have derivative 0 among each other in place of NaN.
+    """
+    if square.shape[-1] > 3 or jnp.iscomplexobj(square):
+        return jnp.linalg.eigh(square)
+    return _small_modes(square)
+
+
+def _small_modes(square: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by Jacobi's rotations, written out.
+
+    Not for speed alone: on two cores, library calls for large batches in one program can wait for each other for
+    ever (jaxlib 0.10), and machines of up to three platforms are the ones that are judged by the hundred thousand.
+    """
+    n = square.shape[-1]
+    entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
+    axes = tuple(tuple(jnp.full_like(square[..., 0, 0], float(i == j)) for j in range(n)) for i in range(n))
+
+    def sweep(_: int, state: tuple) -> tuple:
+        a, v = ([list(row) for row in part] for part in state)
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                off = a[p][q]
+                ratio = (a[q][q] - a[p][p]) / (2.0 * jnp.where(off == 0.0, 1.0, off))
+                tangent = jnp.where(ratio < 0.0, -1.0, 1.0) / (jnp.abs(ratio) + jnp.sqrt(ratio**2 + 1.0))
+                tangent = jnp.where(off == 0.0, 0.0, tangent)
+                cosine = 1.0 / jnp.sqrt(tangent**2 + 1.0)
+                sine = tangent * cosine
+                a[p][p], a[q][q] = a[p][p] - tangent * off, a[q][q] + tangent * off
+                a[p][q] = a[q][p] = jnp.zeros_like(off)
+                for r in range(n):
+                    if r not in (p, q):
+                        a[r][p], a[r][q] = cosine * a[r][p] - sine * a[r][q], sine * a[r][p] + cosine * a[r][q]
+                        a[p][r], a[q][r] = a[r][p], a[r][q]
+                    v[r][p], v[r][q] = cosine * v[r][p] - sine * v[r][q], sine * v[r][p] + cosine * v[r][q]
+        return tuple(tuple(row) for row in a), tuple(tuple(row) for row in v)
+
+    a, v = jax.lax.fori_loop(0, (0, 0, 1, 6)[n], sweep, (entries, axes))
+    values = jnp.stack([a[i][i] for i in range(n)], axis=-1)
+    vectors = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
+    order = jnp.argsort(values, axis=-1)
+    return jnp.take_along_axis(values, order, -1), jnp.take_along_axis(vectors, order[..., None, :], -1)
+
+
+@hermitian_modes.defjvp
+def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    values, vectors = hermitian_modes(*primals)
+    change = (tangents[0] + tangents[0].conj().mT) / 2.0
+    turned = vectors.conj().mT @ change @ vectors
+    gap = values[..., None, :] - values[..., :, None]
+    top = jnp.max(jnp.abs(values), axis=-1)[..., None, None]
+    apart = jnp.abs(gap) > values.shape[-1] * jnp.finfo(values.dtype).eps * top
+    mixing = jnp.where(apart, turned / jnp.where(apart, gap, 1.0), 0.0)
+    return (values, vectors), (jnp.diagonal(turned, axis1=-2, axis2=-1).real, vectors @ mixing)
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
@@ -62,6 +150,16 @@ def turning(carrier: Carrier) -> Array:
     return jnp.asarray([(1.0, -1.0j)[axis] for axis in carrier.axes])
 
 
+def dynamic_stiffness(scene: Scene, omega: Array) -> Array:
+    """K - w^2 (M + sum m_j B^T B) + i w (C + w G) (nd, nd) complex: force per displacement at speed `omega` (scalar).
+
+    Loads and rotor turn together at w = `omega` rad/s, which is the speed that the gyroscopic matrix G takes.
+    """
+    carrier = scene.machine.carrier()
+    damping = carrier.damping if carrier.gyroscopic is None else carrier.damping + omega * carrier.gyroscopic
+    return carrier.stiffness - omega**2 * loaded_mass(scene) + 1j * omega * damping
+
+
 def steady_displacement(scene: Scene, omega: Array) -> Array:
     """Complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
 
@@ -74,9 +172,8 @@ def steady_displacement(scene: Scene, omega: Array) -> Array:
     carrier = scene.machine.carrier()
     if carrier.gyroscopic is not None:
         raise InputError("machine.kind", f"is {scene.machine.kind!r}; leading-order jams hold for machines of platforms")
-    stiffness = carrier.stiffness - omega**2 * loaded_mass(scene) + 1j * omega * carrier.damping
     force = circular_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
-    return small_solve(stiffness, force)
+    return small_solve(dynamic_stiffness(scene, omega), force)
 
 
 def magnitude(value: Array) -> Array:

@@ -1,0 +1,391 @@
+"""The balanced motion: how loads can cancel each other, and whether that motion is stable, exactly."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.dynamics import State, vector_field
+from jaxvib.steady.response import circular_loads
+
+__all__ = [
+    "BalanceStatus",
+    "BalancedStability",
+    "BalancedStates",
+    "balanced_growth",
+    "balanced_intervals",
+    "balanced_stability",
+    "balanced_states",
+]
+
+_BATCH = 16
+"""Rotor speeds whose monodromies are computed side by side."""
+
+
+class BalanceStatus(eqx.Enumeration):
+    """Whether loads can cancel each other; the members are the sentences a user reads."""
+
+    unique = "the loads cancel in one arrangement, up to a common turn and a mirror image"
+    family = "the loads cancel in a family of arrangements, with neutral directions besides the common turn"
+    alone = "a single load has nothing to cancel it"
+    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together: nothing can cancel it"
+
+
+class BalancedStates(eqx.Module):
+    """How a set of loads can cancel each other: sum m_j R_j exp(i alpha_j) = 0 in the frame of the rotor.
+
+    **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
+    0 (no rows where nothing cancels); `dimension` of the set of arrangements, the common turn counted: N - 2, or N -
+    1 for two loads; `neutral` (k, N, d) orthonormal changes of the angles that keep each arrangement balanced to
+    first order; and their `names` (d,): "turn of all loads" first, then "shape 1", ...
+
+    Loads in one line have one neutral direction more than the family has dimensions.
+    """
+
+    status: BalanceStatus
+    angles: np.ndarray
+    dimension: int
+    neutral: list[np.ndarray]
+    names: tuple[str, ...]
+
+    def summary(self) -> str:
+        """A table a person can read."""
+        rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
+        directions = f"neutral directions: {', '.join(self.names) or 'none'}"
+        return "\n".join([BalanceStatus[self.status], *rows, directions])
+
+
+def balanced_states(scene: Scene, *, imbalance: float = 0.0) -> BalancedStates:
+    """All arrangements in which the scene's loads cancel each other.
+
+        sum_j m_j R_j exp(i alpha_j) + imbalance = 0
+
+    Two loads cancel if equal, opposite each other. Three do in one triangle and its mirror image. From four on there
+    is a family with N - 2 dimensions; the arrangement given for it spreads the loads most (the sides m_j R_j of a
+    polygon inscribed in a circle: equal loads are evenly spaced), and its mirror image; `neutral` says where the
+    family goes.
+
+    **Arguments**: `imbalance` kg m, the rotor's own, at angle 0 of its frame. Where there is one it counts as one more
+    side of the polygon, and the loads have no common turn.
+
+    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle, a negative imbalance.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> loads = jv.balls(count=3, mass=[0.3, 0.4, 0.5], radius=0.1, drag=1.0)
+    >>> states = jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0)))
+    >>> print(states.summary())
+    the loads cancel in one arrangement, up to a common turn and a mirror image
+      0, 90, 233.1 deg
+      0, 270, 126.9 deg
+    neutral directions: turn of all loads
+
+    Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
+    """
+    loads = _sides(circular_loads(scene))
+    n = loads.size
+    sides = loads if imbalance == 0.0 else np.append(loads, imbalance)
+    if not imbalance >= 0.0:
+        raise InputError("imbalance", f"is {imbalance:g} kg m; it must be at least 0")
+    largest = sides.max()
+    rest = sides.sum() - largest
+    rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
+    if largest > rest + rounding:
+        status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
+        return BalancedStates(status, np.zeros((0, n)), 0, [], ())
+    if largest > rest - rounding:
+        # In one line: the largest against all others.
+        one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
+    else:
+        one = _inscribed(sides) * np.array([[1.0], [-1.0]])
+    fixed = 0 if imbalance == 0.0 else n
+    angles = np.mod(one - one[:, fixed, None], 2.0 * np.pi)[:, :n]
+    neutral = [_neutral(loads, row, turns=imbalance == 0.0) for row in angles]
+    turn = ("turn of all loads",) if imbalance == 0.0 else ()
+    names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
+    status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
+    dimension = max(n - 2, 1 if imbalance == 0.0 else 0)
+    return BalancedStates(status, angles, dimension, neutral, names)
+
+
+def _sides(loads: CircularLoads) -> np.ndarray:
+    return np.asarray(jnp.broadcast_to(loads.mass * loads.radius, (loads.count,)))
+
+
+def _inscribed(sides: np.ndarray) -> np.ndarray:
+    """Directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
+    largest = int(np.argmax(sides))
+    low, high = 0.0, 1.0
+
+    def centre_angles(x: float) -> np.ndarray:
+        return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
+
+    # x = largest side / diameter. The centre is inside the polygon where the sides reach all round at x = 1; else it is
+    # beyond the largest side, which then turns by what the others turn, backward.
+    inside = centre_angles(1.0).sum() >= 2.0 * np.pi
+    others = np.arange(sides.size) != largest
+
+    def excess(x: float) -> float:
+        turns = centre_angles(x)
+        return turns.sum() - 2.0 * np.pi if inside else turns[largest] - turns[others].sum()
+
+    if not inside:
+        low = 1e-9  # at 0 both are 0
+    for _ in range(200):
+        middle = (low + high) / 2.0
+        if excess(middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    turns = centre_angles(high)
+    if not inside:
+        turns[largest] = 2.0 * np.pi - turns[largest]
+    direction = np.cumsum(turns) - turns / 2.0
+    return direction - direction[0]
+
+
+def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
+    """Orthonormal changes of the angles (N, d) that keep the sum to first order; the common turn first, if free."""
+    n = sides.size
+    change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
+    _, values, right = np.linalg.svd(change)
+    others = right[int(np.sum(values > 1e-6)) :].T
+    if not turns:
+        return others
+    common = np.full((n, 1), 1.0 / np.sqrt(n))
+    basis, size, _ = np.linalg.svd(others - common @ (common.T @ others), full_matrices=False)
+    return np.concatenate([common, basis[:, size > 0.5]], axis=1)
+
+
+class BalancedStability(eqx.Module):
+    """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
+
+    **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
+    neutral directions left out; `multipliers` (2 (nd + N),) complex, the largest first; `neutral` the number of those
+    that are 1 because the arrangements form a family (the common turn at least); `error` of the multipliers,
+    estimated from half the number of steps.
+    """
+
+    stable: bool
+    growth: float
+    multipliers: np.ndarray
+    neutral: int
+    error: float
+
+
+def balanced_stability(scene: Scene, angles: Array | None = None, *, steps: int = 48) -> BalancedStability:
+    """Exact stability of the motion in which the loads turn with the rotor and cancel each other.
+
+    The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
+    for heavy loads or weak drag, as the criterion does.
+
+    **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel; left out, the first of
+    `balanced_states`. `steps` of a sixth-order Magnus method over one turn.
+
+    **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, and for
+    effects that disturb the balanced motion (gravity); `ComputationError` with the status of `balanced_states` if
+    nothing cancels.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> loads = jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0)
+    >>> [jv.balanced_stability(jv.Scene(machine, loads, jv.ConstantSpeed(n))).stable for n in (20.0, 40.0)]
+    [False, True]
+
+    Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
+    """
+    angles, neutral = _arrangement(scene, angles)
+    matrix = _monodromies(scene, jnp.asarray(angles), steps)
+    fine = np.linalg.eigvals(np.asarray(matrix[0]))
+    coarse = np.linalg.eigvals(np.asarray(matrix[1]))
+    growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
+    # A sixth-order method: half the steps have 64 times the error.
+    error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
+    order = np.argsort(-np.abs(fine))
+    return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
+
+
+def balanced_growth(scene: Scene, speeds: Array, angles: Array | None = None, *, steps: int = 48) -> np.ndarray:
+    """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
+
+    **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own speed is not
+    used.
+
+    **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
+    >>> jv.balanced_growth(scene, [20.0, 40.0]) < 0.0
+    array([False,  True])
+    """
+    angles, neutral = _arrangement(scene, angles)
+    flat = np.ravel(np.asarray(speeds, dtype=float))
+    # Whole batches only, so that few shapes are compiled.
+    padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
+    flows = _flows(_at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(padded), steps)[: flat.size]
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
+
+
+@eqx.filter_jit
+def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
+    def flow(speed: Array) -> Array:
+        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
+
+    return jax.lax.map(flow, speeds, batch_size=_BATCH)
+
+
+def balanced_intervals(
+    scene: Scene, low: float, high: float, angles: Array | None = None, *, points: int = 200, steps: int = 48
+) -> list[list[float]]:
+    """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
+
+    Looked for on `points` speeds and refined by halving to 1e-7 of the speed; an interval narrower than the spacing
+    of the points can be missed. What the criterion says of the same range is `criterion(scene).balancing`.
+
+    **Raises** as `balanced_stability`, and `InputError` for a range that is none.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
+    >>> [[round(w, 2) for w in row] for row in jv.balanced_intervals(scene, 20.0, 60.0, points=40)]
+    [[28.28, 60.0]]
+    """
+    if not 0.0 < low < high:
+        raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")
+    grid = np.linspace(low, high, points)
+    stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
+    changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
+    ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
+    return [[float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True)]
+
+
+def stability_changes(
+    scene: Scene,
+    speeds: np.ndarray,
+    stable: np.ndarray,
+    angles: Array | None = None,
+    *,
+    close: float = 1e-7,
+    steps: int = 48,
+) -> np.ndarray:
+    """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
+
+    `stable` says for each of `speeds` whether the motion is; a change between two of them is found.
+    """
+    (change,) = np.nonzero(stable[1:] != stable[:-1])
+    left, right = speeds[change], speeds[change + 1]
+    while left.size and np.max((right - left) / right) > close:
+        middle = (left + right) / 2.0
+        same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
+        left, right = np.where(same, middle, left), np.where(same, right, middle)
+    return (left + right) / 2.0
+
+
+def _arrangement(scene: Scene, angles: Array | None) -> tuple[np.ndarray, int]:
+    """Angles at which the loads are known to cancel, and how many neutral directions they have."""
+    sides = _sides(circular_loads(scene))
+    if angles is None:
+        states = balanced_states(scene)
+        if not len(states.angles):
+            raise ComputationError(_name(states.status), BalanceStatus[states.status])
+        angles = states.angles[0]
+    angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
+    if abs(np.sum(sides * np.exp(1j * angles))) > 1e-9 * sides.sum():
+        raise InputError("angles", "leave an unbalance; take them from balanced_states(scene).angles")
+    _require_undisturbed(scene, angles)
+    return angles, _neutral(sides, angles).shape[1]
+
+
+def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: int) -> np.ndarray:
+    """The largest growth rate, 1/s, of multipliers (..., n) over a turn, without the `neutral` ones nearest to 1."""
+    nearest = np.argsort(np.abs(multipliers - 1.0), axis=-1)
+    others = np.take_along_axis(multipliers, nearest[..., neutral:], -1)
+    return np.log(np.max(np.abs(others), axis=-1)) * np.asarray(speed) / (2.0 * np.pi)
+
+
+def _name(status: BalanceStatus) -> str:
+    return next(name for name in ("unique", "family", "alone", "outweighed") if getattr(BalanceStatus, name) == status)
+
+
+def _balanced(scene: Scene, angles: Array, turn: Array) -> State:
+    """The balanced motion when the rotor has turned by `turn` rad."""
+    rest = jnp.zeros_like(scene.machine.carrier().mass[0])
+    return State(rest, rest, (turn + angles,), (jnp.full_like(angles, 1.0) * scene.drive.speed,))
+
+
+def _at_constant_speed(scene: Scene) -> Scene:
+    return Scene(scene.machine, scene.loads, ConstantSpeed(scene.drive.speed), scene.effects)
+
+
+def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
+    field = vector_field(_at_constant_speed(scene))
+    speed = float(scene.drive.speed)
+    for turn in (0.0, 1.0, 2.0):
+        change = field(jnp.zeros(()), _balanced(scene, jnp.asarray(angles), jnp.asarray(turn)))
+        if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
+            problem = "disturb the balanced motion (gravity does), which then is no motion of its own; leave them out"
+            raise InputError("effects", problem)
+
+
+def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
+    """What one turn of the rotor makes of small errors of the balanced motion, (2 (nd + N), 2 (nd + N)).
+
+        x' = A(n t) x,  x = (q / R, q' / (R n), dphi, dphi' / n),     monodromy = x(turn) for x(0) = 1
+
+    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of the Magnus method, static. `jit`,
+    `vmap` and `grad` go through it; whoever calls it makes sure that the loads cancel.
+    """
+    scene = _at_constant_speed(scene)
+    field = vector_field(scene)
+    speed = scene.drive.speed
+    radius = jnp.mean(scene.loads.radius)
+    scale = (radius, radius * speed, jnp.ones_like(speed), speed)
+    nd, n = field.stiffness.shape[0], angles.shape[0]
+    sizes = jnp.concatenate([jnp.full((k,), 1.0) * v for k, v in zip((nd, nd, n, n), scale, strict=True)])
+
+    def rate(turn: Array, x: Array) -> Array:
+        base = _balanced(scene, angles, turn)
+        e = x * sizes
+        state = State(e[:nd], e[nd : 2 * nd], (base.angle[0] + e[2 * nd : 2 * nd + n],), (base.rate[0] + e[2 * nd + n :],))
+        change = field(turn / speed, state)
+        return jnp.concatenate([change.displacement, change.velocity, change.angle[0], change.rate[0]]) / (sizes * speed)
+
+    def generator(turn: Array) -> Array:
+        return jax.jacfwd(lambda x: rate(turn, x))(jnp.zeros_like(sizes))
+
+    h = 2.0 * jnp.pi / steps
+
+    def step(flow: Array, k: Array) -> tuple[Array, None]:
+        # Three Gauss points a step.
+        a, b, c = jax.vmap(generator)((k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h)
+        a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
+        c1 = _commutator(a1, a2)
+        c2 = -_commutator(a1, 2.0 * a3 + c1) / 60.0
+        omega = a1 + a3 / 12.0 + _commutator(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
+        return _exponential(omega) @ flow, None
+
+    return jax.lax.scan(step, jnp.eye(sizes.shape[0], dtype=sizes.dtype), jnp.arange(steps) * 1.0)[0]
+
+
+@eqx.filter_jit
+def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
+    return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)
+
+
+def _exponential(a: Array) -> Array:
+    """exp(a) by Taylor's series of a/16 to the twelfth power, squared four times; written out, so that it batches."""
+    eye = jnp.eye(a.shape[0], dtype=a.dtype)
+    series = jax.lax.fori_loop(0, 12, lambda k, x: eye + (a / 16.0) @ x / (12.0 - k), eye)
+    return jax.lax.fori_loop(0, 4, lambda _, x: x @ x, series)
+
+
+def _commutator(x: Array, y: Array) -> Array:
+    return x @ y - y @ x

@@ -1,0 +1,130 @@
+"""Where the criterion of auto-balancing is right: against exact stability over rotor speed, load mass and drag."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.balance import balanced_growth, stability_changes
+from jaxvib.steady.criterion import criterion
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CriterionMap", "criterion_map"]
+
+
+class CriterionMap(eqx.Module):
+    """The criterion against exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
+
+    **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
+
+    - `speeds` (S,) rad/s; `mass_factor` (M,), `drag_factor` (D,): times the scene's own
+    - `predicted` (M, S): the criterion calls auto-balancing stable (it knows nothing of the drag)
+    - `growth` (D, M, S) 1/s: exact growth rate, stable where negative
+    - `right` (D, M): share of the speeds where both say the same
+    - `boundary` (M, B) rad/s: the criterion's boundaries, ascending, NaN where there is none
+    - `shift` (D, M, B): (exact - predicted)/predicted of the nearest exact boundary of the same kind; NaN where the
+      exact answer has none in the range of speeds
+    """
+
+    speeds: np.ndarray
+    mass_factor: np.ndarray
+    drag_factor: np.ndarray
+    predicted: np.ndarray
+    growth: np.ndarray
+    right: np.ndarray
+    boundary: np.ndarray
+    shift: np.ndarray
+
+    def summary(self) -> str:
+        """A table a person can read: share of speeds judged right, mean size of the boundaries' shift."""
+        lines = ["share of rotor speeds judged right (mean shift of the boundaries it has)"]
+        lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
+        for d, factor in enumerate(self.drag_factor):
+            cells = []
+            for m in range(self.mass_factor.size):
+                shift = np.abs(self.shift[d, m][~np.isnan(self.shift[d, m])])
+                cells.append(f"{self.right[d, m]:.3f} ({np.mean(shift):.2%})" if shift.size else f"{self.right[d, m]:.3f}")
+            lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """One panel a drag: rotor speed against load mass, where the criterion is right and where not."""
+        import matplotlib.pyplot as plt
+
+        from jaxvib.draw.criterion import agreement_map
+
+        figure, axes = plt.subplots(1, self.drag_factor.size, sharey=True, squeeze=False, layout="constrained")
+        figure.set_size_inches(3.2 * self.drag_factor.size + 0.8, 3.4)
+        for d, ax in enumerate(axes[0]):
+            entries = agreement_map(ax, self.speeds, self.mass_factor, self.predicted, self.growth[d] < 0.0)
+            ax.set_title(f"drag x {self.drag_factor[d]:.3g}")
+        axes[0, 0].set_ylabel("load mass, times the scene's")
+        figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize="small")
+        return figure
+
+
+def criterion_map(
+    scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int = 48
+) -> CriterionMap:
+    """Compares `criterion` with `balanced_growth` over rotor speed, load mass and drag.
+
+    **Arguments**: `speeds` rad/s, ascending; `mass`, `drag` factors greater than 0, times the mass and the drag of
+    the scene's loads; `steps` as `balanced_stability`. The loads are in the first arrangement of `balanced_states`.
+
+    **Returns** `CriterionMap`. **Raises** `InputError` for values that are not positive or not ascending, and as
+    `balanced_stability`.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
+    >>> found = jv.criterion_map(scene, speeds=[20.0, 26.0, 29.5, 40.0], mass=[0.1, 2.0], drag=[1.0], steps=24)
+    >>> found.right.tolist()
+    [[1.0, 0.75]]
+
+    Source: the limits of the criterion are named in Filimonikhin et al. 2022, section 6, without numbers.
+    """
+    axes = {"speeds": speeds, "mass": mass, "drag": drag}
+    values = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in axes.items()}
+    for name, value in values.items():
+        if value.ndim != 1 or not np.all(np.isfinite(value)) or np.any(value <= 0.0) or np.any(np.diff(value) <= 0.0):
+            raise InputError(name, "must be a list of numbers greater than 0, ascending")
+    grid, mass_factor, drag_factor = values.values()
+
+    def loaded(m: jax.Array, d: float = 1.0) -> Scene:
+        loads = eqx.tree_at(lambda x: (x.mass, x.drag), scene.loads, (scene.loads.mass * m, scene.loads.drag * d))
+        return eqx.tree_at(lambda s: s.loads, scene, loads)
+
+    results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]
+    predicted = np.stack([np.asarray(result.balances(jnp.asarray(grid))) for result in results])
+    boundary = np.stack([np.sort([*r.speeds.damped_resonances, *r.speeds.damped_additional]) for r in results])
+    growth = np.zeros((drag_factor.size, mass_factor.size, grid.size))
+    shift = np.full((drag_factor.size, *boundary.shape), np.nan)
+    for d, drag_times in enumerate(drag_factor):
+        for m, mass_times in enumerate(mass_factor):
+            one = loaded(jnp.asarray(mass_times), drag_times)
+            growth[d, m] = balanced_growth(one, grid, steps=steps)
+            stable = growth[d, m] < 0.0
+            exact = stability_changes(one, grid, stable, close=1e-5, steps=steps)
+            shift[d, m] = _shifts(exact, bool(stable[0]), boundary[m])
+    right = np.mean((growth < 0.0) == predicted[None], axis=-1)
+    return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, right, boundary, shift)
+
+
+def _shifts(exact: np.ndarray, stable_first: bool, boundary: np.ndarray) -> np.ndarray:
+    """Relative distance of each boundary to the nearest exact one of its kind (stability begins, or ends)."""
+    begins = (np.arange(exact.size) % 2 == 0) != stable_first
+    shifts = np.full(boundary.shape, np.nan)
+    for k, predicted in enumerate(boundary):
+        same_kind = exact[begins == (k % 2 == 0)]
+        if same_kind.size and not np.isnan(predicted):
+            shifts[k] = same_kind[np.argmin(np.abs(same_kind - predicted))] / predicted - 1.0
+    return shifts

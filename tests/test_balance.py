@@ -1,0 +1,256 @@
+"""The balanced motion: arrangements, exact stability, and what the criterion makes of it."""
+
+import itertools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from gyroscopic_rotor import rotor
+from scenes import machines
+
+import jaxvib as jv
+
+POINTS = 112
+"""Rotor speeds of one scan; the same in all tests, so that each machine is compiled once."""
+
+
+def loaded(name="two_mass", count=2, mass=0.3, drag=1.0, speed=30.0, effects=()):
+    loads = jv.balls(count=count, mass=mass, radius=0.1, drag=drag)
+    return jv.Scene(machines()[name], loads, jv.ConstantSpeed(speed), effects)
+
+
+def sum_of(s, angles):
+    side = np.broadcast_to(np.asarray(s.loads.mass * s.loads.radius), (s.loads.count,))
+    return np.sum(side * np.exp(1j * angles), axis=-1) / side.sum()
+
+
+@pytest.mark.parametrize(
+    ("mass", "rows", "dimension", "directions"),
+    [
+        ([0.3, 0.3], 1, 1, 1),
+        ([0.3, 0.3, 0.3], 2, 1, 1),
+        ([0.3, 0.4, 0.5], 2, 1, 1),
+        ([0.3, 0.4, 0.65], 2, 1, 1),
+        ([0.2, 0.3, 0.5], 1, 1, 2),
+        ([0.3] * 4, 2, 2, 2),
+        ([0.2, 0.3, 0.4, 0.85], 2, 2, 2),
+        ([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7], 2, 5, 5),
+    ],
+)
+def test_arrangements_cancel_and_know_their_neutral_directions(mass, rows, dimension, directions):
+    s = loaded(count=len(mass), mass=mass)
+    states = jv.balanced_states(s)
+    assert states.angles.shape == (rows, len(mass)) and states.dimension == dimension
+    np.testing.assert_allclose(states.angles[:, 0], 0.0)
+    assert len(states.names) == directions and states.names[0] == "turn of all loads"
+    for angles, neutral in zip(states.angles, states.neutral, strict=True):
+        assert abs(sum_of(s, angles)) < 1e-12
+        np.testing.assert_allclose(neutral.T @ neutral, np.eye(directions), atol=1e-12)
+        np.testing.assert_allclose(neutral[:, 0], 1.0 / np.sqrt(len(mass)))
+        for direction in neutral.T:
+            assert abs(sum_of(s, angles + 1e-5 * direction)) < 1e-9
+    if len(set(mass)) == 1 and len(mass) > 2:
+        np.testing.assert_allclose(np.sort(states.angles[0]), np.arange(len(mass)) * 2 * np.pi / len(mass), atol=1e-12)
+    name = "unique" if len(mass) <= 3 else "family"
+    assert states.status == getattr(jv.BalanceStatus, name) and "neutral directions: turn" in states.summary()
+
+
+@pytest.mark.parametrize(("count", "dimension", "directions"), [(1, 0, 0), (2, 0, 0), (3, 1, 1), (4, 2, 2)])
+def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
+    s = loaded(count=count)
+    imbalance = 0.03 if count == 1 else 0.013
+    states = jv.balanced_states(s, imbalance=imbalance)
+    assert states.dimension == dimension and "turn of all loads" not in states.names
+    for angles, neutral in zip(states.angles, states.neutral, strict=True):
+        assert abs(np.sum(0.03 * np.exp(1j * angles)) + imbalance) < 1e-13
+        assert neutral.shape == (count, directions)
+    with pytest.raises(jv.InputError, match="imbalance is -1"):
+        jv.balanced_states(s, imbalance=-1.0)
+    assert jv.balanced_states(s, imbalance=1.0).status == jv.BalanceStatus.outweighed
+
+
+@pytest.mark.parametrize(
+    ("mass", "status", "sentence"),
+    [
+        ([0.3], "alone", "single load"),
+        ([0.3, 0.2], "outweighed", "larger"),
+        ([0.1, 0.1, 0.1, 0.4], "outweighed", "larger"),
+    ],
+)
+def test_loads_that_cannot_cancel_are_named(mass, status, sentence):
+    s = loaded(count=len(mass), mass=mass)
+    states = jv.balanced_states(s)
+    assert states.status == getattr(jv.BalanceStatus, status) and sentence in states.summary()
+    with pytest.raises(jv.ComputationError, match=sentence) as error:
+        jv.balanced_stability(s)
+    assert error.value.status == status
+
+
+def test_motion_that_is_not_balanced_is_refused():
+    with pytest.raises(jv.InputError, match="angles leave an unbalance"):
+        jv.balanced_stability(loaded(), np.array([0.0, 3.0]))
+    with pytest.raises(jv.InputError, match="effects disturb"):
+        jv.balanced_stability(loaded(effects=(jv.Gravity(),)))
+    with pytest.raises(jv.InputError, match="low is 5"):
+        jv.balanced_intervals(loaded(), 5.0, 3.0)
+
+
+def flat_field(s):
+    field = jv.vector_field(s)
+    nd, n = s.machine.carrier().mass.shape[0], s.loads.count
+
+    def rate(t, y):
+        change = field(t, jv.State(y[:nd], y[nd : 2 * nd], (y[2 * nd : 2 * nd + n],), (y[2 * nd + n :],)))
+        return jnp.concatenate([change.displacement, change.velocity, change.angle[0], change.rate[0]])
+
+    return rate, nd, n
+
+
+@pytest.mark.parametrize("speed", [25.0, 50.0])
+def test_multipliers_are_those_of_an_independent_integration(speed):
+    """The full equations integrated by scipy from pairs of small errors, differenced; and four times the steps."""
+    s = loaded("two_mass", 3, speed=speed)
+    result = jv.balanced_stability(s)
+    assert result.error < 1e-6
+    finer = jv.balanced_stability(s, steps=192)
+    np.testing.assert_allclose(
+        np.sort_complex(result.multipliers), np.sort_complex(finer.multipliers), atol=3.0 * result.error + 1e-9
+    )
+
+    rate, nd, n = flat_field(s)
+    rate = jax.jit(rate)
+    angles = jv.balanced_states(s).angles[0]
+    base = np.concatenate([np.zeros(2 * nd), angles, np.full(n, speed)])
+    period = 2.0 * np.pi / speed
+    columns = []
+    for k in range(base.size):
+        ends = []
+        for sign in (1.0, -1.0):
+            start = base + sign * 1e-5 * np.eye(base.size)[k]
+            run = scipy.integrate.solve_ivp(
+                lambda t, y: np.asarray(rate(t, y)), (0.0, period), start, "DOP853", rtol=1e-11, atol=1e-13
+            )
+            ends.append(run.y[:, -1])
+        columns.append((ends[0] - ends[1]) / 2e-5)
+    expected = np.linalg.eigvals(np.stack(columns, axis=1))
+    nearest = np.min(np.abs(result.multipliers[:, None] - expected[None, :]), axis=1)
+    assert np.max(nearest) < 1e-5  # two real multipliers 1e-3 apart magnify the differences' 1e-9
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_neutral_directions_are_multipliers_of_one(count):
+    s = loaded("one_mass", count, speed=60.0)
+    result = jv.balanced_stability(s)
+    assert result.stable and result.neutral == max(1, count - 2)
+    ones = np.sort(np.abs(result.multipliers - 1.0))
+    assert np.all(ones[: result.neutral] < 1e-8) and ones[result.neutral] > 1e-3
+
+
+def unbalance_after(s, speeds, times, errors):
+    """Share of the loads' m R that is unbalanced at the end, of runs that start near the balanced motion (diffrax)."""
+    angles = jnp.asarray(jv.balanced_states(s).angles[0])
+
+    @eqx.filter_jit
+    @jax.vmap
+    def run(speed, until, error):
+        rate, nd, n = flat_field(eqx.tree_at(lambda x: x.drive.speed, s, speed))
+        start = jnp.concatenate([jnp.zeros(2 * nd), angles, jnp.full(n, 1.0) * speed]) + error
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, _: rate(t, y)),
+            diffrax.Tsit5(),
+            0.0,
+            until,
+            2.0 * jnp.pi / speed / 50.0,
+            start,
+            saveat=diffrax.SaveAt(t1=True),
+            max_steps=None,
+        )
+        phi = solution.ys[0, 2 * nd : 2 * nd + n]
+        return jnp.hypot(jnp.mean(jnp.cos(phi)), jnp.mean(jnp.sin(phi)))
+
+    return np.asarray(run(speeds, times, errors))
+
+
+@pytest.mark.parametrize(("name", "count"), [("one_mass", 2), ("two_mass", 3), ("three_mass", 2)])
+def test_runs_from_small_errors_balance_inside_the_exact_intervals_only(name, count):
+    """Six time constants each, on both sides of every boundary, whatever the criterion says of the same speed."""
+    s = loaded(name, count)
+    resonances = np.asarray(jv.natural_frequencies(s))
+    low, high = 0.7 * resonances[0], 1.6 * resonances[-1]
+    intervals = jv.balanced_intervals(s, low, high, points=POINTS)
+    cuts = sorted({low, high, *(w for row in intervals for w in row)})
+    # Narrow regions are left out: errors change too slowly there for a test.
+    wide = [(a, b) for a, b in itertools.pairwise(cuts) if b > 1.05 * a]
+    speeds = np.array([w for a, b in wide for w in (1.02 * a, 0.98 * b)])
+    growth = jv.balanced_growth(s, speeds)
+    inside = np.array([any(a < w < b for a, b in intervals) for w in speeds])
+    np.testing.assert_array_equal(growth < 0.0, inside)
+    assert 1 < inside.sum() < inside.size - 1
+    rng = np.random.default_rng(0)
+    nd = len(resonances)
+    sizes = np.concatenate([np.full(nd, 1e-5), np.full(nd, 1e-4), np.full(count, 2e-3), np.full(count, 1e-3)])
+    errors = rng.normal(size=(speeds.size, sizes.size)) * sizes
+    end = unbalance_after(s, jnp.asarray(speeds), jnp.asarray(6.0 / np.abs(growth)), jnp.asarray(errors))
+    assert np.all(end[inside] < 2e-4), (speeds, growth, end)
+    assert np.all(end[~inside] > 4e-3), (speeds, growth, end)
+
+
+def test_light_loads_with_strong_drag_have_the_boundaries_of_the_criterion():
+    for name, count, top in (("one_mass", 2, 40.0), ("two_mass", 3, 90.0), ("three_mass", 2, 60.0)):
+        s = loaded(name, count, mass=0.001, drag=5.0)
+        exact = np.array(jv.balanced_intervals(s, 12.0, top, points=POINTS))
+        said = np.asarray(jv.criterion(s).balancing)
+        np.testing.assert_allclose(exact[:, 0], said[:, 0], rtol=1e-4)
+        np.testing.assert_allclose(exact[:-1, 1], said[:-1, 1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("polar", [0.093, 0.9], ids=["long rotor", "disc"])
+def test_rotor_with_gyroscopic_coupling_has_the_boundaries_of_the_criterion(polar):
+    """The first balancing interval, exact to 1e-6: what turns backward is rightly left out of the functional."""
+    s = rotor(polar, mass=0.05)
+    said = np.asarray(jv.criterion(s).balancing[0])
+    (exact,) = jv.balanced_intervals(s, 0.8 * said[0], 1.2 * said[1], points=48)
+    np.testing.assert_allclose(exact, said, rtol=1e-6)
+
+
+def test_twenty_platforms():
+    s = loaded(count=2, mass=0.002, drag=3.0)
+    count = 20
+    links = [(i, i + 1) for i in range(1, count)]
+    chain = jv.network(
+        mass=np.linspace(4.0, 6.0, count),
+        stiffness=np.full(count, 2e3),
+        damping=np.full(count, 2.0),
+        links=links,
+        link_stiffness=np.full(count - 1, 8e3),
+        link_damping=np.full(count - 1, 1.0),
+        exciter=7,
+    )
+    s = eqx.tree_at(lambda x: x.machine, s, chain)
+    speeds = np.linspace(15.0, 90.0, 16)
+    said = np.asarray(jv.criterion(s).balances(speeds))
+    assert 0 < said.sum() < said.size
+    np.testing.assert_array_equal(jv.balanced_growth(s, speeds) < 0.0, said)
+
+
+def test_criterion_holds_better_for_lighter_loads_and_for_stronger_drag_on_light_ones():
+    """Loads of 0.1, 0.3 and 3 % of their platform's mass. On the heaviest, stronger drag makes it worse again."""
+    speeds = np.linspace(12.0, 90.0, POINTS)
+    found = jv.criterion_map(loaded("two_mass", 3), speeds=speeds, mass=[0.1, 0.3, 3.0], drag=[0.1, 1.0, 10.0])
+    assert np.all(np.diff(found.right, axis=1) <= 0.0) and np.all(found.right[:, 2] < found.right[:, 0] - 0.2)
+    assert np.all(np.diff(found.right[:, :2], axis=0) > 0.0)
+    assert found.right[1, 2] > found.right[2, 2] > found.right[0, 2]
+    first = found.shift[:, :, 0]
+    assert np.all(np.diff(first, axis=1) > 0.0)
+    assert np.all(np.diff(first[:, :2], axis=0) < 0.0) and first[2, 2] > first[1, 2]
+    figure = found.plot()
+    assert len(figure.axes) == 3 and "drag x" in found.summary()
+
+
+def test_map_refuses_what_is_no_range():
+    with pytest.raises(jv.InputError, match="mass must be a list"):
+        jv.criterion_map(loaded(), speeds=[20.0], mass=[1.0, -1.0], drag=[1.0])
