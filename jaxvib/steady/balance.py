@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
@@ -180,7 +181,7 @@ class BalancedStability(eqx.Module):
     error: float
 
 
-def balanced_stability(scene: Scene, angles: Array | None = None, *, steps: int = 48) -> BalancedStability:
+def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
     """Exact stability of the motion in which the loads turn with the rotor and cancel each other.
 
     The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
@@ -212,7 +213,7 @@ def balanced_stability(scene: Scene, angles: Array | None = None, *, steps: int 
     return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
 
 
-def balanced_growth(scene: Scene, speeds: Array, angles: Array | None = None, *, steps: int = 48) -> np.ndarray:
+def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int = 48) -> np.ndarray:
     """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
 
     **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own speed is not
@@ -243,7 +244,7 @@ def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
 
 
 def balanced_intervals(
-    scene: Scene, low: float, high: float, angles: Array | None = None, *, points: int = 200, steps: int = 48
+    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int = 48
 ) -> list[list[float]]:
     """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
 
@@ -271,7 +272,7 @@ def stability_changes(
     scene: Scene,
     speeds: np.ndarray,
     stable: np.ndarray,
-    angles: Array | None = None,
+    angles: ArrayLike | None = None,
     *,
     close: float = 1e-7,
     steps: int = 48,
@@ -289,7 +290,7 @@ def stability_changes(
     return (left + right) / 2.0
 
 
-def _arrangement(scene: Scene, angles: Array | None) -> tuple[np.ndarray, int]:
+def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
     """Angles at which the loads are known to cancel, and how many neutral directions they have."""
     sides = _sides(circular_loads(scene))
     if angles is None:

@@ -31,8 +31,8 @@ class CriterionMap(eqx.Module):
     - `growth` (D, M, S) 1/s: exact growth rate, stable where negative
     - `right` (D, M): share of the speeds where both say the same
     - `boundary` (M, B) rad/s: the criterion's boundaries, ascending, NaN where there is none
-    - `shift` (D, M, B): (exact - predicted)/predicted of the nearest exact boundary of the same kind; NaN where the
-      exact answer has none in the range of speeds
+    - `shift` (D, M, B): (exact - predicted)/predicted, exact being the end of the exact interval that shares most with
+      the criterion's; NaN where there is none in the range of speeds
     """
 
     speeds: np.ndarray
@@ -64,6 +64,7 @@ class CriterionMap(eqx.Module):
 
         figure, axes = plt.subplots(1, self.drag_factor.size, sharey=True, squeeze=False, layout="constrained")
         figure.set_size_inches(3.2 * self.drag_factor.size + 0.8, 3.4)
+        entries = []
         for d, ax in enumerate(axes[0]):
             entries = agreement_map(ax, self.speeds, self.mass_factor, self.predicted, self.growth[d] < 0.0)
             ax.set_title(f"drag x {self.drag_factor[d]:.3g}")
@@ -113,18 +114,26 @@ def criterion_map(
             one = loaded(jnp.asarray(mass_times), drag_times)
             growth[d, m] = balanced_growth(one, grid, steps=steps)
             stable = growth[d, m] < 0.0
-            exact = stability_changes(one, grid, stable, close=1e-5, steps=steps)
-            shift[d, m] = _shifts(exact, bool(stable[0]), boundary[m])
+            changes = stability_changes(one, grid, stable, close=1e-5, steps=steps)
+            ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
+            shift[d, m] = _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
     right = np.mean((growth < 0.0) == predicted[None], axis=-1)
     return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, right, boundary, shift)
 
 
-def _shifts(exact: np.ndarray, stable_first: bool, boundary: np.ndarray) -> np.ndarray:
-    """Relative distance of each boundary to the nearest exact one of its kind (stability begins, or ends)."""
-    begins = (np.arange(exact.size) % 2 == 0) != stable_first
+def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:
+    """How far the ends of each interval of the criterion are from those of the exact one that it shares most with.
+
+    The longest, because a sliver of stability can stay at a resonance when the interval itself has moved away from it.
+    """
     shifts = np.full(boundary.shape, np.nan)
-    for k, predicted in enumerate(boundary):
-        same_kind = exact[begins == (k % 2 == 0)]
-        if same_kind.size and not np.isnan(predicted):
-            shifts[k] = same_kind[np.argmin(np.abs(same_kind - predicted))] / predicted - 1.0
+    low, high = np.nan_to_num(exact[:, 0], nan=grid[0]), np.nan_to_num(exact[:, 1], nan=grid[-1])
+    for k in range(0, boundary.size, 2):
+        start, end = boundary[k], boundary[k + 1] if k + 1 < boundary.size else np.inf
+        shared = np.minimum(high, np.inf if np.isnan(end) else end) - np.maximum(low, start)
+        if shared.size and np.max(shared) > 0.0:
+            found = exact[np.argmax(shared)]
+            shifts[k] = found[0] / start - 1.0
+            if np.isfinite(end):
+                shifts[k + 1] = found[1] / end - 1.0
     return shifts
