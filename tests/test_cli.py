@@ -98,6 +98,19 @@ def test_optimize_json_has_the_promised_keys(typed, tmp_path):
         assert (tmp_path / "o" / picture).stat().st_size > 5_000
 
 
+def test_criterion_json_has_the_promised_keys(typed, tmp_path):
+    code, out, err = typed("criterion", "machine.toml", "--json", "--check", "--out", "o")
+    document = json.loads(out)
+    assert code == 0 and err == ""
+    assert {"resonances", "additional", "balancing", "gathering", "exact_balancing"} <= set(document)
+    assert document["balancing"][-1][1] is None
+    # The paper's statement for two masses: loads balance between resonance and additional speed, and beyond the last resonance.
+    np.testing.assert_allclose(document["balancing"][0], [document["resonances"][0], document["additional"][0]], rtol=2e-3)
+    for start, _ in document["exact_balancing"]:
+        assert any(a <= start <= (b or np.inf) for a, b in document["balancing"])
+    assert (tmp_path / "o" / "criterion.png").stat().st_size > 5_000
+
+
 WRONG = [
     (("mass = [", "masses = ["), "machine.masses is no field here; did you mean 'mass'"),
     (("drag = 1.5\n", ""), "loads.drag is missing"),

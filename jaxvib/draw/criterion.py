@@ -63,6 +63,9 @@ def pull_chart(
         ax.axvspan(start, speed[-1] if end is None else min(end, speed[-1]), color=_KINDS[1][1], alpha=0.5, linewidth=0)
     for start, end in exact or []:
         ax.axvspan(start, end, ymax=0.03, color="black", linewidth=0)
+    legend = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]
+    legend += [Patch(color="black", label="balancing, exactly")] if exact is not None else []
+    ax.legend(handles=legend, loc="lower right")
     ax.set_xlim(speed[0], speed[-1])
     ax.set_xlabel("rotor speed, rad/s")
     ax.set_ylabel("f: gathering > 0, balancing < 0")

@@ -1,0 +1,64 @@
+"""jaxvib criterion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.draw.criterion import pull_chart
+from jaxvib.draw.style import panels
+
+_RPM = 30.0 / np.pi
+
+
+@app.command("criterion")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--check", is_flag=True, help="Add the exact boundaries, from Floquet multipliers of the full equations.")
+@shared
+def criterion(scene: Path, check: bool, output: Output) -> None:
+    """Where collected loads of SCENE stay together and where they spread and balance the rotor, by the empirical criterion."""
+    loaded = jv.load_scene(scene)
+    judged = jv.criterion(loaded)
+    document = jv.criterion_table(judged)
+    top = 1.5 * max([*document["resonances"], *document["damped_resonances"], float(loaded.drive.speed)])
+    exact = None
+    if check:
+        exact = jv.balanced_intervals(loaded, 0.05 * min(w for w in document["resonances"] if w > 0.0), top)
+        document["exact_balancing"] = exact
+        document["exact_up_to"] = top
+    picture = output.file("criterion.png")
+    if picture is not None:
+        crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
+        speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
+        pull = jax.vmap(lambda w: jv.criterion_functional(loaded, w))(jnp.asarray(speeds))
+        figure, (axis,) = panels(1, size=(9.0, 4.0))
+        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
+        figure.savefig(picture)
+
+    def text() -> str:
+        rows = [[label, f"{w:.6g}", f"{_RPM * w:.5g}"] for label, w in judged.speeds.labelled()]
+        damped = [[label, f"{w:.6g}", f"{_RPM * w:.5g}"] for label, w in judged.speeds.labelled(damped=True)]
+        kinds = [("balancing", "loads spread and balance"), ("gathering", "loads stay together")]
+        spans = [[words, *_ends(span)] for name, words in kinds for span in document[name]]
+        spans += [["balancing, exactly", *_ends(span)] for span in exact or []]
+        lines = [
+            document["status"],
+            table("characteristic speeds, no damping", ["", "rad/s", "rpm"], rows),
+            table("sign changes with this damping", ["", "rad/s", "rpm"], damped),
+            table("rotor speeds", ["", "from, rad/s", "to, rad/s"], spans),
+        ]
+        if check:
+            lines.append(f"exact stability was looked for up to {top:.5g} rad/s")
+        return "\n".join(lines)
+
+    output.done(document, text, "criterion")
+
+
+def _ends(span: list[float | None]) -> list[str]:
+    return ["no end" if end is None else f"{end:.6g}" for end in span]
