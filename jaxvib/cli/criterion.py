@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -60,5 +61,5 @@ def criterion(scene: Path, check: bool, output: Output) -> None:
     output.done(document, text, "criterion")
 
 
-def _ends(span: list[float | None]) -> list[str]:
+def _ends(span: Sequence[float | None]) -> list[str]:
     return ["no end" if end is None else f"{end:.6g}" for end in span]

@@ -60,7 +60,7 @@ def pull_chart(
     ax.set_yscale("symlog", linthresh=np.median(size[size > 0.0]) if np.any(size > 0.0) else 1.0)
     ax.axhline(0.0, color="grey", linewidth=0.5)
     for start, end in balancing:
-        ax.axvspan(start, speed[-1] if end is None else min(end, speed[-1]), color=_KINDS[1][1], alpha=0.5, linewidth=0)
+        ax.axvspan(start or 0.0, speed[-1] if end is None else min(end, speed[-1]), color=_KINDS[1][1], alpha=0.5, linewidth=0)
     for start, end in exact or []:
         ax.axvspan(start, end, ymax=0.03, color="black", linewidth=0)
     legend = [Patch(color=_KINDS[1][1], alpha=0.5, label="balancing, by the criterion")]

@@ -347,7 +347,7 @@ def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
     scene = _at_constant_speed(scene)
     field = vector_field(scene)
     speed = scene.drive.speed
-    radius = jnp.mean(scene.loads.radius)
+    radius = jnp.mean(circular_loads(scene).radius)
     scale = (radius, radius * speed, jnp.ones_like(speed), speed)
     nd, n = field.stiffness.shape[0], angles.shape[0]
     sizes = jnp.concatenate([jnp.full((k,), 1.0) * v for k, v in zip((nd, nd, n, n), scale, strict=True)])

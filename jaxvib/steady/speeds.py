@@ -10,6 +10,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import traced
 from jaxvib.steady.jam import bracketed_root
 from jaxvib.steady.response import (
     dynamic_stiffness,
@@ -160,7 +161,7 @@ def _require_port_that_moves(scene: Scene) -> None:
     """Input checks, for concrete numbers only."""
     carrier = scene.machine.carrier()
     parts = (carrier.port, carrier.stiffness, loaded_mass(scene))
-    if any(isinstance(part, jax.core.Tracer) for part in parts):
+    if any(traced(part) for part in parts):
         return
     port, stiffness, mass = (np.asarray(part) for part in parts)
     if not np.any(port):

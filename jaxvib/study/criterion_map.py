@@ -14,6 +14,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.balance import balanced_growth, stability_changes
 from jaxvib.steady.criterion import criterion
+from jaxvib.steady.response import circular_loads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -100,8 +101,10 @@ def criterion_map(
             raise InputError(name, "must be a list of numbers greater than 0, ascending")
     grid, mass_factor, drag_factor = values.values()
 
+    given = circular_loads(scene)
+
     def loaded(m: jax.Array, d: float = 1.0) -> Scene:
-        loads = eqx.tree_at(lambda x: (x.mass, x.drag), scene.loads, (scene.loads.mass * m, scene.loads.drag * d))
+        loads = eqx.tree_at(lambda x: (x.mass, x.drag), given, (given.mass * m, given.drag * d))
         return eqx.tree_at(lambda s: s.loads, scene, loads)
 
     results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]
