@@ -15,7 +15,19 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.jam import jam_rotor_speed
 from jaxvib.steady.response import circular_loads, loaded_mass, small_solve
 
-__all__ = ["Body", "Grid", "Motion", "body", "circle", "grid_of", "has_half_turn", "load_torque", "periodic_motion", "receptance"]
+__all__ = [
+    "Body",
+    "Grid",
+    "Harmonics",
+    "Motion",
+    "body",
+    "circle",
+    "grid_of",
+    "harmonics_of",
+    "has_half_turn",
+    "load_torque",
+    "periodic_motion",
+]
 
 _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
@@ -269,3 +281,30 @@ def periodic_motion(
     left_over, (_, found) = balance(y[:-1], y[-1], value)
     omega, speed = (value, y[-1]) if given == "omega" else (y[-1], value)
     return Motion(y[:-1], omega, speed, jnp.max(jnp.abs(left_over)) / found.scale)
+
+
+class Harmonics(NamedTuple):
+    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (J,) rad; `displacement` (nd, K) m of the
+    carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+
+    lag: Array
+    displacement: Array
+    acceleration: Array
+    force: Array
+
+
+def harmonics_of(scene: Scene, grid: Grid, motion: Motion) -> Harmonics:
+    """The harmonics of psi and of everything that the carrier does."""
+    carrier = scene.machine.carrier()
+    m = grid.theta.shape[0]
+    orders = jnp.asarray(grid.orders, dtype=motion.omega.dtype)
+    point, _ = circle(scene, grid.theta + motion.lag)
+    point_k = (grid.weight / m * point) @ np.exp(-1j * grid.theta[:, None] * grid.orders)
+    displacement = jnp.einsum("kdp,pk->dk", receptance(scene, motion.omega, grid.orders), point_k)
+    w = orders * motion.omega
+    return Harmonics(
+        (grid.lag_weights[:, None] / m * np.exp(-1j * grid.lag_orders[:, None] * grid.theta)) @ motion.lag,
+        displacement,
+        -(carrier.port @ displacement) * w[None] ** 2,
+        carrier.bed_stiffness @ displacement + 1j * (carrier.bed_damping @ displacement) * w[None],
+    )
