@@ -16,10 +16,14 @@ from jaxvib.steady.response import loaded_mass, natural_frequencies
 
 __all__ = ["Floquet", "floquet", "steps_for"]
 
-_PHASE = 0.4
+_PHASE = 0.7
 """What the fastest part of the carrier turns through in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
 
+# The tableau's last stage is the step itself, there to be evaluated for the next one.
 _TABLEAU = diffrax.Dopri8.tableau
+_NODES = np.concatenate([[0.0], _TABLEAU.c[:-1]])
+_ROWS = np.stack([np.pad(row, (0, len(_NODES) - len(row))) for row in [np.zeros(0), *_TABLEAU.a_lower[:-1]]])
+_WEIGHTS = _TABLEAU.b_sol[:-1]
 
 
 class Floquet(NamedTuple):
@@ -47,7 +51,7 @@ def steps_for(scene: Scene, omega: Array) -> Array:
 
 
 class _Coefficients(NamedTuple):
-    """What of the orbit enters the linear equations at one angle; (np, P) and (1, 1, P)."""
+    """What of the orbit enters the linear equations at one angle; (np, P) and (P,)."""
 
     moving: Array
     moving1: Array
@@ -87,17 +91,16 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
 
     def coefficients(theta: Array) -> _Coefficients:
         lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
-        phi, rate = theta + lag, 1.0 + lag1
+        phi, rate = theta[:, None] + lag, 1.0 + lag1
         point, moving = circle(scene, phi)
         acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        torque = jax.vmap(lambda p, r, w, n: load_torque(scene, p, w * r, n), in_axes=-1, out_axes=-1)
         ones = jnp.ones_like(phi)
-        each = jax.vmap(lambda p, r, w, n: load_torque(scene, p[None], w * r[None], n)[0])
-        by_angle = jax.jvp(lambda p: each(p, rate, omega, speed), (phi,), (ones,))[1]
-        by_rate = jax.jvp(lambda r: each(phi, r, omega, speed), (rate,), (ones,))[1]
+        by_angle = jax.jvp(lambda p: torque(p, rate, omega, speed), (phi,), (ones,))[1]
+        by_rate = jax.jvp(lambda r: torque(phi, r, omega, speed), (rate,), (ones,))[1]
         stiff = by_angle + whole.unbalance * jnp.sum(point * acceleration, axis=0)
-        rate, lag2 = rate[None], lag2[None]
-        moving2 = -point * lag2 - moving * rate**2
-        return _Coefficients(moving, -point * rate, moving2, (stiff / omega**2)[None, None], (by_rate / omega**2)[None, None])
+        moving2 = -point * lag2[None] - moving * rate[None] ** 2
+        return _Coefficients(moving, -point * rate[None], moving2, stiff / omega[None] ** 2, by_rate / omega[None] ** 2)
 
     def full(c: _Coefficients, x: Array) -> Array:
         q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[None, 2 * nd], x[None, 2 * nd + 1]
@@ -107,12 +110,11 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
         q2 = -_times(damping, below1) / w - _times(stiffness, below) / w**2
         pushed = _times(port, q2) - _times(mobility, 2.0 * t1 * d1 + t2 * d)
         inertia = whole.inertia - whole.unbalance * jnp.sum(t * _times(mobility, t), axis=0, keepdims=True)
-        torque = c.by_rate * d1 + c.by_angle * d - whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
+        torque = c.by_rate[None, None] * d1 + c.by_angle[None, None] * d - whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
         return jnp.concatenate([q1, q2, d1, torque / inertia])
 
     def apart(c: _Coefficients, x: Array) -> Array:
-        d, d1 = x[None, 0], x[None, 1]
-        return jnp.concatenate([d1, (c.by_rate * d1 + c.by_angle * d) / whole.inertia])
+        return jnp.stack([x[1], (c.by_rate[None] * x[1] + c.by_angle[None] * x[0]) / whole.inertia])
 
     def start(n: int) -> Array:
         return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
@@ -121,45 +123,49 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     begin = tuple(start(n) for n in (2 * nd + 2, 2)[: len(fields)])
 
     def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        rates: list[list[Array]] = [[] for _ in fields]
-        nodes = [0.0, *_TABLEAU.c]
-        rows = [(), *_TABLEAU.a_lower]
-        # The last row of the tableau is the step itself, evaluated again for the next one only.
-        for node, row in list(zip(nodes, rows, strict=True))[:-1]:
-            c = coefficients((k + node) * h)
-            for field, x, made in zip(fields, state, rates, strict=True):
-                moved = x + h * sum(a * r for a, r in zip(row, made, strict=True) if a != 0.0) if made else x
-                made.append(field(c, moved))
-        return tuple(
-            x + h * sum(b * r for b, r in zip(_TABLEAU.b_sol, made, strict=False) if b != 0.0)
-            for x, made in zip(state, rates, strict=True)
-        )
+        at = coefficients((k + _NODES) * h)
 
+        # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
+        def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
+            c = _Coefficients(at.moving[:, i], at.moving1[:, i], at.moving2[:, i], at.by_angle[i], at.by_rate[i])
+            return tuple(
+                rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
+                for field, x, rate in zip(fields, state, rates, strict=True)
+            )
+
+        rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
+        rates = jax.lax.fori_loop(0, len(_NODES), stage, rates)
+        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+
+    rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
     end = jax.lax.fori_loop(0, steps, step, begin)
     flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), [1.0, 1.0]])
     monodromy = flip[:, None, None] * end[0]
 
     # A shift in time: q' and phi' along the orbit itself.
-    at = [_signal(grid.orders, harmonics.displacement, 0.0, k) / length for k in range(2)]
-    lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, 0.0, k) for k in (1, 2))
-    _, moving = circle(scene, _signal(grid.lag_orders, harmonics.lag, 0.0, 0))
+    zero = jnp.zeros((1,), dtype=omega.dtype)
+    at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
+    lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, zero, k) for k in range(3))
+    _, moving = circle(scene, lag)
     along = jnp.concatenate([
-        at[1] + _times(shift, (moving * (1.0 + lag1)[None])[:, None])[:, 0],
-        (-_times(damping, at[1][:, None]) / w - _times(stiffness, at[0][:, None]) / w**2)[:, 0],
-        (1.0 + lag1)[None],
+        at1 + _times(shift, moving * (1.0 + lag1)[None]),
+        -_times(damping, at1) / w - _times(stiffness, at) / w**2,
+        1.0 + lag1[None],
         lag2[None],
-    ])  # fmt: skip
+    ])[:, 0]  # fmt: skip
     trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
     roots = jnp.linalg.eigvals(rest).T
     inner = jnp.linalg.eigvals(jnp.moveaxis(end[1], -1, 0)).T if len(end) > 1 else None
     return Floquet(roots, inner, trivial)
 
 
-def _signal(orders: np.ndarray, harmonics: Array, theta: Array | float, derivative: int) -> Array:
-    """A derivative of Re sum_k c_k exp(i k theta) at one angle; c (..., K, P)."""
-    k = jnp.asarray(orders, dtype=harmonics.real.dtype)
-    wave = (1j * k) ** derivative * jnp.exp(1j * k * theta)
-    return jnp.tensordot(wave.real, harmonics.real, (0, -2)) - jnp.tensordot(wave.imag, harmonics.imag, (0, -2))
+def _signal(orders: np.ndarray, harmonics: Array, theta: Array, derivative: int) -> Array:
+    """A derivative of Re sum_k c_k exp(i k theta) at the angles theta (n,); c (..., K, P) gives (..., n, P)."""
+    k = jnp.asarray(orders, dtype=theta.dtype)
+    wave = (1j * k[None]) ** derivative * jnp.exp(1j * theta[:, None] * k[None])
+    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum(
+        "nk,...kp->...np", wave.imag, harmonics.imag
+    )
 
 
 def _times(matrix: Array, vectors: Array) -> Array:
