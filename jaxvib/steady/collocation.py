@@ -11,15 +11,17 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
+from jaxvib.machine.effects import Effect
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.jam import jam_rotor_speed
 from jaxvib.steady.response import circular_loads, loaded_mass, small_solve
 
 __all__ = [
+    "Along",
     "Body",
     "Grid",
     "Harmonics",
     "Motion",
+    "along",
     "body",
     "circle",
     "grid_of",
@@ -39,19 +41,19 @@ class Grid(NamedTuple):
     With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period says everything: psi
     has even harmonics only and the point e of the loads odd ones.
 
-    **Attributes** (M points): `theta` (M,); `first`, `second` (M, M) d/dtheta and d^2/dtheta^2 of psi; `lag_orders` (J,) and
-    `orders` (K,), the harmonics of psi and of e; `lag_weights` (J,), `weight`: a signal s with values s_l has the harmonics
-    weight / M sum_l s_l exp(-i k theta_l); `cosine`, `sine` (2M - 1, K): weight / M times cos and sin of k times the
-    distance of two points; `pairs` (M, M): which distance belongs to which two points.
+    **Attributes** (M points): `symmetric` whether it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
+    d^2/dtheta^2 of psi; `lag_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `lag_weights` (J,): psi has the
+    harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times cos
+    and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points.
     """
 
+    symmetric: bool
     theta: np.ndarray
     first: np.ndarray
     second: np.ndarray
     lag_orders: np.ndarray
     lag_weights: np.ndarray
     orders: np.ndarray
-    weight: float
     cosine: np.ndarray
     sine: np.ndarray
     pairs: np.ndarray
@@ -79,7 +81,7 @@ def grid_of(points: int, symmetric: bool) -> Grid:
     distance = orders * (turn / m * np.arange(1 - m, m))[:, None]
     index = np.arange(m)
     return Grid(
-        theta, first, second, lag_orders, weights, orders, 2.0,
+        symmetric, theta, first, second, lag_orders, weights, orders,
         2.0 / m * np.cos(distance), 2.0 / m * np.sin(distance), index[:, None] - index[None, :] + m - 1,
     )  # fmt: skip
 
@@ -104,13 +106,16 @@ def has_half_turn(scene: Scene) -> bool:
     return not scene.effects
 
 
-def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array) -> Array:
-    """What turns the loads besides the vibration, N m: resistance and effects, summed over loads that are all at `phi` (M,)."""
-    loads = scene.loads
+def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+    """What turns the loads besides the vibration, N m: resistance and effects, summed over loads that are all at `phi` (M,).
+
+    `effects` are the scene's unless others are named; () leaves what the rotor gives.
+    """
+    loads, acting = scene.loads, scene.effects if effects is None else effects
 
     def each(angle: Array, angle_rate: Array) -> Array:
         torque = loads.resistance((angle,), (angle_rate,), speed)[0]
-        return sum((effect.load_force(loads, (angle,))[0] for effect in scene.effects), torque)
+        return sum((effect.load_force(loads, (angle,))[0] for effect in acting), torque)
 
     if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(loads)):
         return loads.count * each(phi, rate)
@@ -168,11 +173,12 @@ def _balance(scene: Scene, grid: Grid, feedback: Array, lag: Array, omega: Array
     acceleration = jnp.einsum("abij,bj->ai", feedback, point)
     vibration = whole.unbalance * jnp.sum(moving * acceleration, axis=0)
     torque = load_torque(scene, phi, rate, speed)
-    left_over = whole.inertia * omega**2 * (grid.second @ lag) - torque + vibration
+    inertia = whole.inertia * omega**2 * (grid.second @ lag)
     unit = whole.drag * omega
+    largest = jnp.max(jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration))
     return _Balance(
-        left_over / unit,
-        1.0 + jnp.abs(speed / omega) + jnp.max(jnp.abs(vibration)) / unit,
+        (inertia - torque + vibration) / unit,
+        1.0 + jnp.abs(speed / omega) + largest / unit,
         moving,
         -whole.unbalance * jnp.sum(point * acceleration, axis=0) / unit,
     )
@@ -198,9 +204,7 @@ def _jacobian(scene: Scene, grid: Grid, feedback: Array, balance: _Balance, lag:
 
 class Motion(NamedTuple):
     """A periodic motion on its grid: `lag` psi (M,) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
-    balance at the points, relative to the torques in it; `slope` dn/dOmega along the branch; `error` an estimate of the
-    relative error of the rotor speed (of omega, where the rotor speed is given) that the number of points leaves.
-    """
+    balance at the points, relative to the torques in it."""
 
     lag: Array
     omega: Array
@@ -245,9 +249,8 @@ def periodic_motion(
                 lambda z: balance(lag, z, value), (x,), (jnp.ones_like(x),), has_aux=True
             )
             omega, speed = (value, x) if given == "omega" else (x, value)
-            top = jnp.concatenate([_jacobian(scene, grid, feedback, now, lag, omega, speed), by_x[:, None]], axis=1)
-            pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
-            change = jnp.linalg.solve(jnp.concatenate([top, pin[None, :]]), -jnp.append(left_over, jnp.mean(lag)))
+            matrix = _pinned(_jacobian(scene, grid, feedback, now, lag, omega, speed), by_x)
+            change = -jnp.linalg.solve(matrix, jnp.append(left_over, jnp.mean(lag)))
             # A lag changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
             most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
             if given == "rotor_speed":
@@ -283,6 +286,60 @@ def periodic_motion(
     return Motion(y[:-1], omega, speed, jnp.max(jnp.abs(left_over)) / found.scale)
 
 
+class Along(NamedTuple):
+    """`slope` dn/dOmega of the branch; `speed_error`, relative, of the rotor speed at this load speed and `lag_error`, rad: an
+    estimate of what the number of points leaves."""
+
+    slope: Array
+    speed_error: Array
+    lag_error: Array
+
+
+def along(scene: Scene, grid: Grid, motion: Motion) -> Along:
+    """How the branch goes on from a periodic motion, and how good the motion is.
+
+    The error is what one Newton step would change that sees the residual at twice as many points, with the highest
+    harmonic of psi for the lag.
+    """
+    lag, omega, speed = motion.lag, motion.omega, motion.rotor_speed
+
+    def left_over(w: Array, n: Array) -> tuple[Array, tuple[Array, _Balance]]:
+        feedback = _feedback(scene, grid, w)
+        found = _balance(scene, grid, feedback, lag, w, n)
+        return found.left_over, (feedback, found)
+
+    one, zero = jnp.ones_like(omega), jnp.zeros_like(omega)
+    _, by_omega, (feedback, found) = jax.jvp(left_over, (omega, speed), (one, zero), has_aux=True)
+    by_speed = jax.jvp(lambda n: _balance(scene, grid, feedback, lag, omega, n).left_over, (speed,), (one,))[1]
+    matrix = _pinned(_jacobian(scene, grid, feedback, found, lag, omega, speed), by_speed)
+
+    fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
+    lag_k = _lag_harmonics(grid, lag)
+    there = (jnp.exp(1j * fine.theta[:, None] * grid.lag_orders) @ lag_k).real
+    between = _balance(scene, fine, _feedback(scene, fine, omega), there, omega, speed).left_over
+    low = _lag_harmonics(fine, between)[: grid.lag_orders.shape[0]]
+    seen = (jnp.exp(1j * grid.theta[:, None] * grid.lag_orders) @ low).real
+    right = jnp.stack([-jnp.append(by_omega, 0.0), jnp.append(jax.lax.stop_gradient(seen), 0.0)], axis=1)
+    answer = jnp.linalg.solve(matrix, right)
+    return Along(
+        answer[-1, 0],
+        jnp.abs(answer[-1, 1] / speed),
+        jnp.maximum(jnp.max(jnp.abs(answer[:-1, 1])), jnp.sqrt(lag_k[-1].real ** 2 + lag_k[-1].imag ** 2)),
+    )
+
+
+def _pinned(by_lag: Array, by_unknown: Array) -> Array:
+    """The whole Jacobian: the equations' derivative by psi (M, M) and by the last unknown (M,), and the row mean psi = 0."""
+    m = by_lag.shape[0]
+    pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
+    return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
+
+
+def _lag_harmonics(grid: Grid, values: Array) -> Array:
+    m = grid.theta.shape[0]
+    return (grid.lag_weights[:, None] / m * np.exp(-1j * grid.lag_orders[:, None] * grid.theta)) @ values
+
+
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (J,) rad; `displacement` (nd, K) m of the
     carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
@@ -299,11 +356,11 @@ def harmonics_of(scene: Scene, grid: Grid, motion: Motion) -> Harmonics:
     m = grid.theta.shape[0]
     orders = jnp.asarray(grid.orders, dtype=motion.omega.dtype)
     point, _ = circle(scene, grid.theta + motion.lag)
-    point_k = (grid.weight / m * point) @ np.exp(-1j * grid.theta[:, None] * grid.orders)
+    point_k = (2.0 / m * point) @ np.exp(-1j * grid.theta[:, None] * grid.orders)
     displacement = jnp.einsum("kdp,pk->dk", receptance(scene, motion.omega, grid.orders), point_k)
     w = orders * motion.omega
     return Harmonics(
-        (grid.lag_weights[:, None] / m * np.exp(-1j * grid.lag_orders[:, None] * grid.theta)) @ motion.lag,
+        _lag_harmonics(grid, motion.lag),
         displacement,
         -(carrier.port @ displacement) * w[None] ** 2,
         carrier.bed_stiffness @ displacement + 1j * (carrier.bed_damping @ displacement) * w[None],
