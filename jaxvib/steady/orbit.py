@@ -26,7 +26,7 @@ from jaxvib.steady.collocation import (
 )
 from jaxvib.steady.jam import jam_modes, jam_rotor_speed
 from jaxvib.steady.response import circular_loads
-from jaxvib.steady.stability import floquet, steps_for
+from jaxvib.steady.stability import Floquet, floquet, steps_for
 
 __all__ = ["Orbit", "OrbitStatus", "jam_orbit", "orbits"]
 
@@ -210,7 +210,7 @@ def jam_orbit(
 def _orbit(
     scene: Scene, value: Array, start: Array, exists: Array, given: str, points: int, steps: int, accuracy: float
 ) -> Orbit:
-    lanes = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
+    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     absent = OrbitStatus.where(exists, orbit.status, OrbitStatus.absent)
     return eqx.tree_at(lambda o: o.status, orbit, absent)
@@ -224,10 +224,10 @@ def orbits(
     points: int,
     steps: int | Array,
     accuracy: float,
-) -> Orbit:
+) -> tuple[Orbit, Floquet]:
     """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from.
 
-    **Returns** `Orbit` with a leading axis P on each of its arrays. `steps` as in `floquet`.
+    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
     grid = grid_of(points, has_half_turn(scene))
 
@@ -258,7 +258,7 @@ def orbits(
     def or_nan(values: Array) -> Array:
         return jnp.moveaxis(jnp.where(met, values, jnp.nan), -1, 0)
 
-    return Orbit(
+    orbit = Orbit(
         status=jax.vmap(status)(met, flat, error <= accuracy),
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
@@ -279,6 +279,7 @@ def orbits(
         orders=tuple(map(int, grid.orders)),
         count=scene.loads.count,
     )
+    return orbit, growth
 
 
 def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
