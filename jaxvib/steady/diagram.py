@@ -23,7 +23,7 @@ __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 _LANES = 100
 """Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
 
-_POINTS = (8, 12, 16, 24, 32, 64)
+_POINTS = (8, 16, 32, 64)
 
 
 class SpecialPoint(NamedTuple):
@@ -121,8 +121,8 @@ class _Values(NamedTuple):
 class _Solver:
     """Exact jams at given load speeds, in batches, with as many harmonics as each asks for."""
 
-    def __init__(self, scene: Scene, accuracy: float, lanes: int = _LANES):
-        self.scene, self.accuracy, self.lanes = scene, accuracy, lanes
+    def __init__(self, scene: Scene, accuracy: float):
+        self.scene, self.accuracy = scene, accuracy
 
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds (ascending, so that neighbours in a batch ask for as many steps)."""
@@ -137,7 +137,7 @@ class _Solver:
         return found
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
-        padded = np.concatenate([omega, np.full(-omega.size % self.lanes, omega[-1])]).reshape(-1, self.lanes)
+        padded = np.concatenate([omega, np.full(-omega.size % _LANES, omega[-1])]).reshape(-1, _LANES)
         # All batches are sent off before the first one is waited for.
         parts = [_values(self.scene, jnp.asarray(part), many, self.accuracy) for part in padded]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: omega.size], *parts)
@@ -184,7 +184,7 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     row, which = np.nonzero(tests[:-1] * tests[1:] < 0.0)
     if row.size == 0:
         return ()
-    solve = _Solver(scene, accuracy, lanes=16)
+    solve = _Solver(scene, accuracy)
     pick = np.arange(row.size)
     low, high = grid.omega[row].copy(), grid.omega[row + 1].copy()
     f_low, f_high = tests[row, which], tests[row + 1, which]

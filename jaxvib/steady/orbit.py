@@ -174,8 +174,9 @@ def jam_orbit(
     if not isinstance(drag, jax.core.Tracer) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
-    exists = jnp.asarray(True)
+    exists, rises = jnp.asarray(True), None
     if mode is not None:
+        rises = mode % 2 == 1
         jam = jam_modes(frozen).select(mode, throw=throw)
         exists = jnp.isfinite(jam.omega)
         start = jnp.where(exists, jam.omega, frozen.drive.speed)
@@ -194,11 +195,11 @@ def jam_orbit(
     speed = jax.lax.stop_gradient(value) if which == "omega" else start
     steps = 2 ** int(np.ceil(np.log2(float(steps_for(frozen, speed))))) if concrete else 64
     for many in tried:
-        found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, which, many, steps, accuracy)
+        found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, rises, which, many, steps, accuracy)
         if many == tried[-1] or float(found.error) <= accuracy or not bool(exists):
             break
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, value))):
-        found = _orbit(scene, value, start, exists, which, many, steps, accuracy)
+        found = _orbit(scene, value, start, exists, rises, which, many, steps, accuracy)
     elif throw:
         for status in ("absent", "not_converged"):
             if bool(found.status == getattr(OrbitStatus, status)):
@@ -208,12 +209,23 @@ def jam_orbit(
 
 @eqx.filter_jit
 def _orbit(
-    scene: Scene, value: Array, start: Array, exists: Array, given: str, points: int, steps: int, accuracy: float
+    scene: Scene,
+    value: Array,
+    start: Array,
+    exists: Array,
+    rises: bool | None,
+    given: str,
+    points: int,
+    steps: int,
+    accuracy: float,
 ) -> Orbit:
     lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
-    absent = OrbitStatus.where(exists, orbit.status, OrbitStatus.absent)
-    return eqx.tree_at(lambda o: o.status, orbit, absent)
+    # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
+    there = exists if rises is None else exists & ~((orbit.slope < 0.0) if rises else (orbit.slope > 0.0))
+    orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
+    status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
+    return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))
 
 
 def orbits(
@@ -288,12 +300,13 @@ def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) ->
     rate = motion.omega * (1.0 + grid.first @ motion.lag)
     drive = load_torque(scene, grid.theta + motion.lag, rate, motion.rotor_speed, effects=())
     # Directions of the force on the bed are put together as those of a vector.
-    force = jnp.sqrt(jnp.sum(_swing(grid.orders, harmonics.force) ** 2))
-    return (*branch, _swing(grid.orders, harmonics.displacement), force, motion.rotor_speed * jnp.mean(drive))
+    force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
+    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * jnp.mean(drive))
 
 
-def _swing(orders: np.ndarray, harmonics: Array) -> Array:
+def _swing(grid: Grid, harmonics: Array) -> Array:
     """(max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
+    orders = grid.orders
     samples = 2.0 * np.pi * np.arange(max(64, 4 * int(orders[-1]))) / max(64, 4 * int(orders[-1]))
     spacing = samples[1]
     signal = (harmonics @ np.exp(1j * orders[:, None] * samples)).real
@@ -308,10 +321,11 @@ def _swing(orders: np.ndarray, harmonics: Array) -> Array:
         still = jax.lax.stop_gradient(c)
         theta = jnp.asarray(samples, dtype=values.dtype)[jnp.argmax(sign * values)]
         # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-        theta = jax.lax.fori_loop(0, 5, newton, theta)
+        theta = jax.lax.fori_loop(0, 3, newton, theta)
         return jnp.sum(c * jnp.exp(1j * orders * theta)).real
 
     def swing(c: Array, values: Array) -> Array:
-        return (extremum(c, values, 1.0) - extremum(c, values, -1.0)) / 2.0
+        highest = extremum(c, values, 1.0)
+        return highest if grid.symmetric else (highest - extremum(c, values, -1.0)) / 2.0
 
     return jax.vmap(swing)(harmonics, signal)
