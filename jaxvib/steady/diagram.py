@@ -81,9 +81,9 @@ def exact_branches(
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=0.05, beta=1.0, speed=1.5)
-    >>> diagram = jv.exact_branches(form.scene(), points=200)
+    >>> diagram = jv.exact_branches(form.scene(), points=200, least=0.3)
     >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
-    [...]
+    [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2)
     crowded, resonances = _fold_grid(scene)

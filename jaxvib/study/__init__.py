@@ -1,0 +1,1 @@
+"""Many runs: what a question costs, what an effect is worth, where an approximation holds."""
