@@ -110,7 +110,15 @@ def test_three_mass_is_the_papers_equation_mended():
     n, h, nl, hl = (0.3, 0.4, 0.5), (0.01, 0.02, 0.03), (0.7, 0.6, 0.8), (0.01, 0.02, 0.04)
     rho1, rho3, eps, beta, speed = 1.3, 0.7, 0.05, 0.8, 3.0
     paper = jv.Dimensionless(
-        "criterion", natural=n, damping=h, link_natural=nl, link_damping=hl, rho=(rho1, rho3), eps=eps, beta=beta, speed=speed
+        "criterion",
+        natural=n,
+        damping=h,
+        link_natural=nl,
+        link_damping=hl,
+        rho=(rho1, rho3),
+        eps=eps,
+        beta=beta,
+        speed=speed,
     )
     rng = np.random.default_rng(2)
     v, dv, phi, dphi = rng.normal(size=3), rng.normal(size=3), rng.normal(size=1), rng.normal(size=1)
@@ -148,7 +156,17 @@ def test_time_loop_holds_no_library_call():
     s = scene("network", "pendulums", effects=(jv.Gravity(),))
     field = jv.vector_field(s)
     names = {e.primitive.name for e in jax.make_jaxpr(field)(0.0, random_state(s)).jaxpr.eqns}
-    banned = {"lu", "cholesky", "eigh", "triangular_solve", "sort", "scatter", "scatter-add", "pure_callback", "dot_general"}
+    banned = {
+        "lu",
+        "cholesky",
+        "eigh",
+        "triangular_solve",
+        "sort",
+        "scatter",
+        "scatter-add",
+        "pure_callback",
+        "dot_general",
+    }
     assert not names & banned
 
 
@@ -156,3 +174,61 @@ def test_published_numbers_build_the_published_machine():
     machine = published().scene().machine
     np.testing.assert_allclose(machine.stiffness, 1 / 9, rtol=1e-15)
     np.testing.assert_allclose(machine.link_stiffness, 4 / 9, rtol=1e-15)
+
+
+class Planar(jv.Machine):
+    """A body that moves across and up and also tilts, its port away from the tilt's axis: two-directional, gyroscopic."""
+
+    matrices: tuple
+    kind: str = eqx.field(static=True)
+
+    def carrier(self):
+        mass, damping, stiffness, gyroscopic, port = self.matrices
+        none = jnp.zeros((1, 3))
+        return jv.Carrier(mass, damping, stiffness, gyroscopic, port, none, none, axes=(0, 1), coordinates=("x", "y", "tilt"))
+
+
+@pytest.mark.parametrize("load", loads())
+def test_two_directional_port_is_euler_lagrange(load):
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(3, 3))
+    skew = rng.normal(size=(3, 3))
+    mass, damping, stiffness = root @ root.T + 3.0 * np.eye(3), np.diag([3.0, 4.0, 5.0]), root.T @ root * 1e3
+    port = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, -0.2]])
+    matrices = tuple(jnp.asarray(a) for a in (mass, damping, stiffness, skew - skew.T, port))
+    s = jv.Scene(Planar(matrices=matrices, kind="planar"), loads()[load], jv.ConstantSpeed(40.0), (jv.Gravity(),))
+    state = random_state(s)
+    n, m, r = s.loads.count, s.loads.mass, s.loads.radius
+
+    def kinetic(x, v):
+        def point(x):
+            return jnp.stack([r * jnp.cos(x[3:]), r * jnp.sin(x[3:])])
+
+        own = jax.jvp(point, (x,), (v,))[1]
+        whole = own + (matrices[4] @ v[:3])[:, None]
+        weight = jnp.broadcast_to(m, (n,))[None, :]
+        rolling = (jnp.broadcast_to(s.loads.inertia_factor(), (n,)) - 1.0)[None, :]
+        return 0.5 * v[:3] @ matrices[0] @ v[:3] + 0.5 * jnp.sum(weight * (whole**2 + rolling * own**2))
+
+    def potential(x):
+        return 0.5 * x[:3] @ matrices[2] @ x[:3] + jnp.sum(m * 9.81 * r * jnp.sin(x[3:]))
+
+    x = jnp.concatenate([state.displacement, state.angle[0]])
+    v = jnp.concatenate([state.velocity, state.rate[0]])
+    resistance = jnp.concatenate(
+        [
+            -(matrices[1] + 40.0 * matrices[3]) @ v[:3],
+            jnp.broadcast_to(s.loads.drag * r**2, (n,)) * (40.0 - v[3:]),
+        ]
+    )
+
+    @jax.jit
+    def accelerations(x, v):
+        along = jax.jvp(lambda y: jax.grad(kinetic, 1)(y, v), (x,), (v,))[1]
+        return jnp.linalg.solve(
+            jax.hessian(kinetic, 1)(x, v), jax.grad(kinetic)(x, v) - jax.grad(potential)(x) + resistance - along
+        )
+
+    field = evaluate(s, state)
+    found = jnp.concatenate([field.velocity, field.rate[0]])
+    np.testing.assert_allclose(found, accelerations(x, v), rtol=1e-11)

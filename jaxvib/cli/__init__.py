@@ -1,1 +1,30 @@
+"""The command line."""
 
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """The command `jaxvib`; exit code 0 done, 1 the computation failed, 2 bad input."""
+    prepare()
+    from jaxvib.cli.app import run
+
+    sys.exit(run(sys.argv[1:]))
+
+
+def prepare() -> None:
+    """Float64, and compiled programs kept on disk so that the second call of a command answers at once."""
+    # Equinox turns runtime checks into host callbacks, which keep a program out of the cache; results carry a status instead.
+    os.environ.setdefault("EQX_ON_ERROR", "nan")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxvib"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -159,7 +159,9 @@ class Dimensionless(eqx.Module):
         )
         return Scene(machine, loads, ConstantSpeed(self.speed * w))
 
-    def read(self, *, omega: Array | None = None, amplitude: Array | None = None, force: Array | None = None) -> dict[str, Array]:
+    def read(
+        self, *, omega: Array | None = None, amplitude: Array | None = None, force: Array | None = None
+    ) -> dict[str, Array]:
         """Results in SI as the paper's numbers; any of them may be given.
 
         **Arguments**: `omega` rad/s, any shape; `amplitude` m, last axis over the platforms; `force` N, any shape.
@@ -169,7 +171,3 @@ class Dimensionless(eqx.Module):
         units = {"omega": self.frequency_scale, "amplitude": self.lengths, "force": self.force}
         given = {"omega": omega, "amplitude": amplitude, "force": force}
         return {name: value / units[name] for name, value in given.items() if value is not None}
-
-
-
-

@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.units import Number, count, number, numbers
+from jaxvib.machine.units import Number, count, numbers
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 
@@ -85,6 +85,8 @@ def _platforms(
         raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
 
     def links_of(value: Number, unit: str, field: str) -> Array:
+        if not joined and np.size(value) > 0:
+            raise InputError(field, f"has {np.size(value)} values; the machine has no links, leave it out or give links")
         return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.zeros((0,), dtype=float)
 
     return Platforms(
@@ -100,6 +102,8 @@ def _platforms(
 
 
 def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...]:
+    if not isinstance(links, (list, tuple)):
+        raise InputError("machine.links", f"is {links!r}; it must be a list of pairs of platforms such as [[1, 2]]")
     joined = []
     for index, link in enumerate(links):
         field = f"machine.links[{index}]"
@@ -125,18 +129,7 @@ def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
 
     Source: Filimonikhin et al. 2022, equation (9).
     """
-    one = {"low": 0.0}
-    return _platforms(
-        "one_mass",
-        1,
-        number(mass, "kg", "machine.mass", low=0.0, open_low=True),
-        number(stiffness, "N/m", "machine.stiffness", **one),
-        number(damping, "N s/m", "machine.damping", **one),
-        (),
-        (),
-        (),
-        1,
-    )
+    return _platforms("one_mass", 1, mass, stiffness, damping, (), (), (), 1)
 
 
 def two_mass(

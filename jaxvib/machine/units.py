@@ -10,13 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from jaxvib.errors import InputError
 
-__all__ = ["Number", "count", "number", "numbers", "to_float"]
+__all__ = ["Number", "count", "number", "numbers", "to_float", "traced"]
 
 Number = Any
 """What the edges accept as a number: a float, an array, a traced value, a string with a unit, a pint quantity."""
+
+
+def traced(value: Any) -> bool:
+    """Whether JAX is transforming the computation this value is part of, so that it has no number to look at.
+
+    >>> traced(1.0)
+    False
+    """
+    return isinstance(value, Tracer)
 
 
 def _unit_name(unit: str) -> str:
@@ -67,7 +77,7 @@ def to_float(value: Number, unit: str, field: str) -> Any:
 
 def _checked(value: Any, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
     """Value checks, for concrete numbers only: a traced value has none to look at."""
-    if isinstance(value, jax.core.Tracer):
+    if traced(value):
         return
     flat = np.atleast_1d(np.asarray(value))
     for index, entry in enumerate(flat):

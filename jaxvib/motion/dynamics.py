@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -79,14 +80,15 @@ class Dynamics(eqx.Module):
         answers = [solve(tuple(m * column[axis] for column in columns)) for axis in axes]
         weight = [
             [
-                _total(m * (1.0 if i == k else 0.0) - m * sum(x[a] * y for x, y in zip(columns, answers[k], strict=True)), loads)
+                _total(
+                    m * (1.0 if i == k else 0.0) - m * sum(x[a] * y for x, y in zip(columns, answers[k], strict=True)),
+                    loads,
+                )
                 for k in range(len(axes))
             ]
             for i, a in enumerate(axes)
         ]
-        reaction = [
-            _total(m * (sum(x[a] * f for x, f in zip(columns, free, strict=True)) + curvature[a]), loads) for a in axes
-        ]
+        reaction = [_total(m * (sum(x[a] * f for x, f in zip(columns, free, strict=True)) + curvature[a]), loads) for a in axes]
 
         unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
         if self.gyroscopic is not None:
@@ -94,10 +96,7 @@ class Dynamics(eqx.Module):
         port_free = _times(self.port, unforced)
         n = len(axes)
         matrix = [
-            [
-                (1.0 if i == k else 0.0) + sum(self.mobility[i, j] * weight[j][k] for j in range(n))
-                for k in range(n)
-            ]
+            [(1.0 if i == k else 0.0) + sum(self.mobility[i, j] * weight[j][k] for j in range(n)) for k in range(n)]
             for i in range(n)
         ]
         right = [port_free[i] - sum(self.mobility[i, j] * reaction[j] for j in range(n)) for i in range(n)]
@@ -173,7 +172,7 @@ def _times(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
-def _small_inverse(a: list[list[Array]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
+def _small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
     """x of a x = b for 1 or 2 equations, written out; the entries may be arrays of many such systems."""
     if len(a) == 1:
         return lambda b: (b[0] / a[0][0],)

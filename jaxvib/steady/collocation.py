@@ -217,7 +217,8 @@ def periodic_motion(
 ) -> Motion:
     """The periodic motion psi(theta) of the collected loads, phi = theta + psi, theta = Omega t, with mean psi 0.
 
-        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a,     a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T S k^2 Omega^2 e_k
+        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a
+        a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T S k^2 Omega^2 e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w C
 
     at the M points of `grid`, with the a_k and e_k the harmonics of the port's acceleration and of the loads' point. The
     unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter starts from,

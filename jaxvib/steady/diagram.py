@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
 from jaxvib.steady.collocation import has_half_turn
-from jaxvib.steady.jam import _fold_grid, jam_rotor_speed
+from jaxvib.steady.jam import fold_points, jam_rotor_speed
 from jaxvib.steady.orbit import OrbitStatus, orbits
 from jaxvib.steady.stability import Floquet, steps_for
 
@@ -86,7 +87,7 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2)
-    crowded, resonances = _fold_grid(scene)
+    crowded, resonances = fold_points(scene, 64)
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
     low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)
     high = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
@@ -125,12 +126,12 @@ class _Solver:
         self.scene, self.accuracy = scene, accuracy
 
     def __call__(self, omega: np.ndarray) -> _Values:
-        """The jams at these load speeds (ascending, so that neighbours in a batch ask for as many steps)."""
+        """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
         half = has_half_turn(self.scene)
         todo, found = np.arange(omega.size), None
         for many in _POINTS if half else [2 * p + 1 for p in _POINTS]:
             made = self._batches(omega[todo], many)
-            found = made if found is None else jax.tree.map(lambda old, new: _put(old, todo, new), found, made)  # noqa: B023
+            found = made if found is None else jax.tree.map(functools.partial(_put, todo), found, made)
             todo = todo[~(made.error <= self.accuracy)]
             if todo.size == 0:
                 break
@@ -143,7 +144,7 @@ class _Solver:
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: omega.size], *parts)
 
 
-def _put(old: np.ndarray, where: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     old = old.copy()
     old[where] = new
     return old
@@ -193,8 +194,7 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     for turn in range(40):
         aim = (low * f_high - high * f_low) / (f_high - f_low)
         middle = np.where((turn % 3 == 2) | ~((aim > low) & (aim < high)), (low + high) / 2.0, aim)
-        order = np.argsort(middle)
-        values = jax.tree.map(lambda leaf, back=np.argsort(order): leaf[back], solve(middle[order]))
+        values = solve(middle)
         f = read(values)[pick, which]
         left = f * f_low > 0.0
         f_high = np.where(left, f_high / 2.0, f)

@@ -13,12 +13,21 @@ from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.response import _modes, circular_loads, magnitude, natural_frequencies, steady_displacement, turning
+from jaxvib.machine.units import traced
+from jaxvib.steady.response import (
+    _modes,
+    circular_loads,
+    loaded_mass,
+    magnitude,
+    natural_frequencies,
+    steady_displacement,
+    turning,
+)
 
 __all__ = ["Folds", "Jam", "JamModes", "JamStatus", "jam_modes", "jam_rotor_speed"]
 
 _POINTS = 64
-"""Grid points on each side of each resonance, where folds are looked for."""
+"""Grid points on each side of each pole, where folds are looked for."""
 
 
 class JamStatus(eqx.Enumeration):
@@ -27,6 +36,7 @@ class JamStatus(eqx.Enumeration):
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
+    unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
 
 
 class Folds(eqx.Module):
@@ -63,7 +73,8 @@ class Jam(eqx.Module):
 class JamModes(Jam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
 
-    A mode that does not exist holds NaN and the status `absent`. Adds `resonances` (nd,) rad/s and the `folds` of the branch.
+    A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`.
+    Adds `resonances` (nd,) rad/s and the `folds` of the branch.
     """
 
     resonances: Array
@@ -85,11 +96,11 @@ class JamModes(Jam):
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
         most = self.mode.shape[0]
-        if not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
         jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
-        if throw and not isinstance(self.omega, jax.core.Tracer) and not bool(self.exists[mode - 1]):
+        if throw and not traced(self.omega) and not bool(self.exists[mode - 1]):
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",
@@ -141,6 +152,7 @@ def jam_modes(scene: Scene) -> JamModes:
     the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls
     from it, 2 nd + 1 is beyond the last; so mode 3 is the jam just below the second resonance even where the first one is
     damped so much that modes 1 and 2 have vanished. Rising pieces (odd modes) are stable by slope, falling ones are not.
+    Where the branch has more peaks than resonances, the lowest ripples, each over a narrow range of rotor speeds, are left out.
 
     **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
@@ -157,7 +169,7 @@ def jam_modes(scene: Scene) -> JamModes:
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
     drag = circular_loads(scene).drag_sum()
-    if not isinstance(drag, jax.core.Tracer) and not float(drag) > 0.0:
+    if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
     return _jam_modes(scene)
 
@@ -168,37 +180,72 @@ def _jam_modes(scene: Scene) -> JamModes:
     pieces = _pieces(scene)
     omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(scene, lo, hi))(pieces.low, pieces.high)
 
-    nd = pieces.resonances.shape[0]
-    numbers = jnp.arange(1, 2 * nd + 2)
+    numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
     hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
-    chosen = jnp.argmax(hits, axis=1)
     there = jnp.any(hits, axis=1)
+    chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    def jam(number: Array, w: Array, is_there: Array) -> Jam:
-        displacement = steady_displacement(scene, w)
-        slope = jax.jvp(lambda x: jam_rotor_speed(scene, x), (w,), (jnp.ones_like(w),))[1]
-        flat = jnp.abs(slope) < jnp.sqrt(jnp.finfo(slope.dtype).eps)
-        known = JamStatus.where(flat, JamStatus.at_fold, JamStatus.found)
+    # Closer to a fold than this, its rotor speed cannot be told from the scene's, and a derivative has no digits left.
+    speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
+    close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
+    close = (close | jnp.roll(close, -1))[chosen]
 
-        def or_nan(value: Array) -> Array:
-            return jnp.where(is_there, value, jnp.nan)
-
-        return Jam(
-            mode=number,
-            status=JamStatus.where(is_there, known, JamStatus.absent),
-            omega=or_nan(w),
-            rotor_speed=n,
-            stable=is_there & (slope > 0.0),
-            slope=or_nan(slope),
-            displacement=or_nan(displacement),
-            amplitude=or_nan(magnitude(displacement)),
-            foundation_force=or_nan(_bed_force(scene, w, displacement)),
+    def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
+        found = _jam_at(scene, number, w, n, flat)
+        values = jax.tree.map(
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
+            found,
+        )
+        return eqx.tree_at(
+            lambda j: (j.status, j.stable, j.rotor_speed),
+            values,
+            (JamStatus.where(is_there, found.status, JamStatus.absent), is_there & found.stable, n),
         )
 
-    jams = jax.vmap(jam)(numbers, omega, there)
+    jams = jax.vmap(jam)(numbers, omega, there, close)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return JamModes(**fields, resonances=natural_frequencies(scene), folds=pieces.folds)
+
+
+def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+    displacement = steady_displacement(scene, omega)
+    # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
+    throw = circular_loads(scene).unbalance() / jnp.min(jnp.diagonal(loaded_mass(scene)))
+    bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(throw.dtype).eps < throw)
+    displacement = jnp.where(bounded, displacement, jnp.nan)
+    slope = jnp.where(bounded, _slope(scene, omega), jnp.nan)
+    status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
+    return Jam(
+        mode=number,
+        status=JamStatus.where(bounded, status, JamStatus.unbounded),
+        omega=omega,
+        rotor_speed=rotor_speed,
+        stable=slope > 0.0,
+        slope=slope,
+        displacement=displacement,
+        amplitude=magnitude(displacement),
+        foundation_force=_bed_force(scene, omega, displacement),
+    )
+
+
+def branch_points(scene: Scene, omega: Array) -> tuple[Jam, Folds]:
+    """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
+    pieces = _pieces(scene)
+    cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
+    numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
+
+    def jam(number: Array, w: Array) -> Jam:
+        flat = jnp.abs(_slope(scene, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
+        return _jam_at(scene, number, w, jam_rotor_speed(scene, w), flat)
+
+    jams = jax.vmap(jam)(numbers, omega)
+    return jams, pieces.folds
+
+
+def _slope(scene: Scene, omega: Array) -> Array:
+    """dn/dOmega along the branch."""
+    return jax.jvp(lambda w: jam_rotor_speed(scene, w), (omega,), (jnp.ones_like(omega),))[1]
 
 
 def _bed_force(scene: Scene, omega: Array, displacement: Array) -> Array:
@@ -218,32 +265,34 @@ class _Pieces(NamedTuple):
 def _pieces(scene: Scene) -> _Pieces:
     """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(scene)
-    grid, resonances = _fold_grid(frozen)
+    grid, resonances = fold_points(frozen, _POINTS)
     nd = resonances.shape[0]
-
-    def slope(s: Scene, w: Array) -> Array:
-        return jax.jvp(lambda x: jam_rotor_speed(s, x), (w,), (jnp.ones_like(w),))[1]
-
-    falling = jax.vmap(lambda w: slope(frozen, w))(grid) < 0.0
-    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=2 * nd, fill_value=grid.shape[0] - 1)
+    grid = _with_close_folds(lambda w: _slope(frozen, w), grid, 2 * nd)
+    falling = jax.vmap(lambda w: _slope(frozen, w))(grid) < 0.0
+    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
-    omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: slope(scene, w), lo, hi))(grid[change], grid[change + 1])
+    omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: _slope(scene, w), lo, hi))(grid[change], grid[change + 1])
+    speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
+    main = _without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
+    omega, speeds, found = omega[main], speeds[main], found[main]
     end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
-        rotor_speed=jnp.where(found, jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega), jnp.nan),
+        rotor_speed=jnp.where(found, speeds, jnp.nan),
         exists=found,
     )
     cuts = jax.lax.stop_gradient(jnp.where(found, omega, end))
     low = jnp.concatenate([jnp.zeros_like(cuts[:1]), cuts])
     high = jnp.concatenate([cuts, jnp.reshape(end, (1,))])
 
-    # Each peak belongs to the resonance it is nearest to; two peaks never share one.
+    # Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
     owners: list[Array] = []
+    later = jnp.sum(found) // 2 - 1
     for k, peak in enumerate(cuts[0::2]):
         nearest = 1 + jnp.argmin(jnp.abs(resonances - peak))
-        owners.append(jnp.clip(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), k + 1, nd))
+        free = jnp.clip(nd - (later - k), 1, nd)
+        owners.append(jnp.minimum(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), free))
     mode = []
     for k, owner in enumerate(owners):
         last = 2 * nd + 1
@@ -251,20 +300,77 @@ def _pieces(scene: Scene) -> _Pieces:
     return _Pieces(low, high, jnp.stack([*mode, jnp.asarray(2 * nd + 1)]), resonances, folds)
 
 
-def _fold_grid(scene: Scene) -> tuple[Array, Array]:
-    """Load speeds that crowd about every resonance as closely as its width asks; folds lie between some of them."""
-    resonances, shapes = _modes(scene)
+def _without_ripples(speeds: Array, count: Array, most: int) -> Array:
+    """Indices of the `most` folds that matter, of twice as many with rotor speeds `speeds`, of which the first `count` exist.
+
+    A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
+    """
+    index = jnp.arange(2 * most)
+    keep = index
+    for _ in range(most // 2):
+        known = speeds[keep]
+        span = jnp.abs(jnp.log(known[1:] / known[:-1]))
+        least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
+        skip = (count > most) & (index >= least)
+        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * most - 1), index)]
+        count = jnp.where(count > most, count - 2, count)
+    return keep[:most]
+
+
+def fold_points(scene: Scene, per_side: int) -> tuple[Array, Array]:
+    """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances.
+
+    Folds lie between some of these points. They crowd about the poles s of det(K + s^2 M + s C) = 0, not about undamped
+    resonances: a strong damper between two platforms locks them into one, whose sharp peak is at neither's resonance.
+    """
+    resonances, _ = _modes(scene)
     carrier = scene.machine.carrier()
-    width = jnp.einsum("ar,ab,br->r", shapes, carrier.damping, shapes) / 2.0
-    top = jnp.max(resonances)
+    poles = _poles(loaded_mass(scene), carrier.damping, carrier.stiffness)
+    top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
-    width = jnp.maximum(width, tiny * top)
-    reach = 5.0 * top
-    s = jnp.linspace(0.0, 1.0, _POINTS)[None, :]
-    offset = width[:, None] * jnp.sinh(s * jnp.arcsinh(reach / width)[:, None])
-    grid = jnp.concatenate([resonances[:, None] - offset, resonances[:, None] + offset]).ravel()
+    width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
     low = 1e-3 * jnp.min(jnp.where(resonances > 0.0, resonances, top))
-    return jnp.sort(jnp.clip(grid, low, top + reach)), resonances
+    s = jnp.linspace(0.0, 1.0, per_side)[None, :]
+
+    def crowded(reach: Array) -> Array:
+        return width * jnp.sinh(s * jnp.arcsinh(reach / width))
+
+    # Of a pair of poles one has the points above, the other one those below; a pole that is real has nothing below.
+    centre = jnp.abs(poles.imag)[:, None]
+    below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, 5.0 * top))
+    points = jnp.where(poles.imag[:, None] >= 0.0, above, below)
+    return jnp.sort(jnp.maximum(points.ravel(), low)), resonances
+
+
+def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
+    """The 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    n = mass.shape[0]
+    solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
+    return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
+
+
+def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> Array:
+    """The grid with points added where the slope comes closest to 0 and turns back: two folds may hide in one interval."""
+    value = jax.vmap(slope)(grid)
+    sign, size = jnp.sign(value), jnp.abs(value)
+    same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
+    dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
+    (at,) = jnp.nonzero(dips, size=most, fill_value=0)
+    step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
+
+    def lowest(low: Array, high: Array, side: Array) -> Array:
+        def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            a, b = bracket
+            x, y = b - step * (b - a), a + step * (b - a)
+            at_x, at_y = jax.vmap(slope)(jnp.stack([x, y]))
+            left = side * at_x < side * at_y
+            return jnp.where(left, a, x), jnp.where(left, y, b)
+
+        a, b = jax.lax.fori_loop(0, 16, narrow, (low, high))
+        return (a + b) / 2.0
+
+    return jnp.sort(jnp.concatenate([grid, jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])]))
 
 
 def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
@@ -279,34 +385,40 @@ def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array
 
 
 def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
-    """The root of `f` between `low` and `high` (scalars), where f changes sign once.
+    """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digits.
 
-    Newton steps that stay inside the bracket, halving otherwise. Derivatives by the implicit function theorem.
+    Inverse quadratic interpolation where it is safe, halving elsewhere (Chandrupatla, Adv. Eng. Software 28, 1997).
+    Derivatives of any order by the implicit function theorem.
     """
 
     def solve(g: Callable[[Array], Array], _: Array) -> Array:
-        rises = g(high) > 0.0
+        tolerance = 2.0 * jnp.finfo(low.dtype).eps
 
-        def step(_: int, bracket: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            a, b, x = bracket
-            value, slope = jax.jvp(g, (x,), (jnp.ones_like(x),))
-            above = (value > 0.0) == rises
-            a, b = jnp.where(above, a, x), jnp.where(above, x, b)
-            newton = x - value / jnp.where(slope == 0.0, 1.0, slope)
-            good = (slope != 0.0) & (newton > a) & (newton < b)
-            return a, b, jnp.where(good, newton, (a + b) / 2.0)
+        def open_(carry: tuple[Array, ...]) -> Array:
+            steps, a, fa, b, fb, *_ = carry
+            width = tolerance * jnp.maximum(jnp.abs(a), jnp.abs(b))
+            return (steps < 2 * jnp.finfo(low.dtype).bits) & (jnp.abs(b - a) > width) & (fa != 0.0) & (fb != 0.0)
 
-        # A Newton step can crawl along one side of the bracket; halving first makes sure that it does not.
-        halvings = 3 * jnp.finfo(low.dtype).nmant // 4
+        def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+            steps, a, fa, b, fb, share = carry
+            x = a + share * (b - a)
+            fx = g(x)
+            same = (fx > 0.0) == (fa > 0.0)
+            c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
+            b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
+            a, fa = x, fx
+            # Between a (newest) and b lies the root; c was there before.
+            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+            safe = (1.0 - jnp.sqrt(1.0 - xi) < phi) & (phi < jnp.sqrt(xi))
+            guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+            edge = jnp.minimum(0.5 * tolerance * jnp.abs(a) / jnp.abs(b - a), 0.5)
+            share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
+            return steps + 1, a, fa, b, fb, share
 
-        def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-            a, b = bracket
-            middle = (a + b) / 2.0
-            above = (g(middle) > 0.0) == rises
-            return jnp.where(above, a, middle), jnp.where(above, middle, b)
-
-        a, b = jax.lax.fori_loop(0, halvings, halve, (low, high))
-        return jax.lax.fori_loop(0, 6, step, (a, b, (a + b) / 2.0))[2]
+        f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
+        start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5))
+        _, a, fa, b, fb, _ = jax.lax.while_loop(open_, step, start)
+        return jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
 
     low, high = jax.lax.stop_gradient((low, high))
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))

@@ -44,9 +44,10 @@ def _modes(scene: Scene) -> tuple[Array, Array]:
     factor = jnp.linalg.cholesky(loaded_mass(scene))
     half = jax.scipy.linalg.solve_triangular(factor, scene.machine.carrier().stiffness, lower=True)
     square, vectors = jnp.linalg.eigh(jax.scipy.linalg.solve_triangular(factor, half.T, lower=True))
-    safe = jnp.where(square > 0.0, square, 1.0)
     shapes = jax.scipy.linalg.solve_triangular(factor.T, vectors, lower=False)
-    return jnp.where(square > 0.0, jnp.sqrt(safe), 0.0), shapes
+    # What rounding leaves of a 0 is no frequency.
+    moves = square > 4.0 * square.shape[0] * jnp.finfo(square.dtype).eps * jnp.max(square)
+    return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0), shapes
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
@@ -81,7 +82,8 @@ def steady_displacement(scene: Scene, omega: Array) -> Array:
 def magnitude(value: Array) -> Array:
     """|value| of complex numbers, with derivative 0 in place of NaN where the value is exactly 0."""
     square = value.real**2 + value.imag**2
-    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+    zero = square == 0.0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
 
 
 def small_solve(a: Array, b: Array) -> Array:

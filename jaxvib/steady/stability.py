@@ -110,7 +110,8 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
         q2 = -_times(damping, below1) / w - _times(stiffness, below) / w**2
         pushed = _times(port, q2) - _times(mobility, 2.0 * t1 * d1 + t2 * d)
         inertia = whole.inertia - whole.unbalance * jnp.sum(t * _times(mobility, t), axis=0, keepdims=True)
-        torque = c.by_rate[None, None] * d1 + c.by_angle[None, None] * d - whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
+        vibration = whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
+        torque = c.by_rate[None, None] * d1 + c.by_angle[None, None] * d - vibration
         return jnp.concatenate([q1, q2, d1, torque / inertia])
 
     def apart(c: _Coefficients, x: Array) -> Array:
@@ -163,9 +164,7 @@ def _signal(orders: np.ndarray, harmonics: Array, theta: Array, derivative: int)
     """A derivative of Re sum_k c_k exp(i k theta) at the angles theta (n,); c (..., K, P) gives (..., n, P)."""
     k = jnp.asarray(orders, dtype=theta.dtype)
     wave = (1j * k[None]) ** derivative * jnp.exp(1j * theta[:, None] * k[None])
-    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum(
-        "nk,...kp->...np", wave.imag, harmonics.imag
-    )
+    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum("nk,...kp->...np", wave.imag, harmonics.imag)
 
 
 def _times(matrix: Array, vectors: Array) -> Array:

@@ -39,7 +39,7 @@ class Tiers(NamedTuple):
     exact: Tier
 
     def plot(self) -> Figure:
-        """Relative difference of load speed, amplitudes and foundation force over the load's mass; exact unstable ones hollow."""
+        """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable."""
         differences = {
             "load speed": np.abs(self.leading.omega / self.exact.omega - 1.0),
             "amplitude": np.max(np.abs(self.leading.amplitude / self.exact.amplitude - 1.0), axis=1),

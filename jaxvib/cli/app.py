@@ -1,0 +1,134 @@
+"""The commands, and what they have in common: JSON, files, exit codes."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from jaxvib.errors import ComputationError, InputError
+
+__all__ = ["Output", "app", "run", "shared", "table"]
+
+
+class Output:
+    """Where a command's results go: a JSON document or text on stdout, and files in a folder."""
+
+    def __init__(self, as_json: bool, folder: Path | None):
+        self.as_json = as_json
+        self.folder = folder
+        self.files: list[str] = []
+
+    def file(self, name: str) -> Path | None:
+        """The path of a result file, its folder made; None where no folder was asked for."""
+        if self.folder is None:
+            return None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError("--out", f"is {str(self.folder)!r}, which cannot be made a folder ({error.strerror})") from error
+        self.files.append(str(self.folder / name))
+        return self.folder / name
+
+    def done(self, document: dict[str, Any], text: Callable[[], str], name: str) -> None:
+        """Prints the document or the text, and writes the document to NAME.json in the folder."""
+        path = self.file(f"{name}.json")
+        body = json.dumps(_plain(document), indent=2, allow_nan=False)
+        if path is not None:
+            path.write_text(body + "\n", encoding="utf-8")
+        if self.as_json:
+            click.echo(body)
+            return
+        click.echo(text())
+        for written in self.files:
+            click.echo(f"wrote {written}")
+
+
+def _plain(value: Any) -> Any:
+    """The value for JSON; a number that is not finite becomes null, which a reader cannot mistake for one."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
+    """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right."""
+    drawn = Table(title=title, title_justify="left")
+    for k, name in enumerate(columns):
+        drawn.add_column(name, justify="left" if k == 0 else "right")
+    for row in rows:
+        drawn.add_row(*row)
+    console = Console(width=118)
+    with console.capture() as capture:
+        console.print(drawn)
+    return capture.get().rstrip()
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
+@click.version_option(package_name="jaxvib")
+def app() -> None:
+    """Simulate and design vibration machines that work on the Sommerfeld effect.
+
+    Begin with: jaxvib new two-mass > machine.toml
+    """
+
+
+def shared(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds --json and --out to a command; it gets them as one `Output`."""
+
+    @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
+    @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write pictures and data into this folder.")
+    def wrapped(as_json: bool, out: Path | None, **rest: Any) -> None:
+        command(output=Output(as_json, out), **rest)
+
+    wrapped.__name__ = command.__name__
+    wrapped.__doc__ = command.__doc__
+    # click keeps a command's own options on the function itself
+    wrapped.__click_params__ = getattr(command, "__click_params__", []) + wrapped.__click_params__  # pyright: ignore
+    return wrapped
+
+
+def run(arguments: list[str]) -> int:
+    """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
+    from jaxvib.cli import commands, modes  # noqa: F401 - registers the commands
+
+    wants_json = "--json" in arguments
+    try:
+        app.main(args=arguments, prog_name="jaxvib", standalone_mode=False)
+        return 0
+    except InputError as error:
+        return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": str(error)})
+    except ComputationError as error:
+        return _failed(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return 0
+    except click.UsageError as error:
+        field = error.ctx.command.name if error.ctx else "jaxvib"
+        hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
+        return _failed(wants_json, 2, {"kind": "input", "field": field, "message": error.format_message() + hint})
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _failed(wants_json: bool, code: int, error: dict[str, Any]) -> int:
+    click.echo(f"jaxvib: {error['message']}", err=True)
+    if wants_json:
+        click.echo(json.dumps({"error": error}, indent=2))
+    return code

@@ -1,0 +1,167 @@
+"""jaxvib new, simulate, optimize."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.errors import InputError
+from jaxvib.machine.files import TEMPLATES
+from optimize import Outcome, Synthesis, load_design, synthesize
+from optimize.files import TEMPLATE
+
+
+@app.command("new")
+@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design"]))
+@shared
+def new(kind: str, output: Output) -> None:
+    """Print a commented scene file of that KIND of machine, or a design file."""
+    text = TEMPLATE if kind == "design" else TEMPLATES[kind.replace("-", "_")]
+    path = output.file("design.toml" if kind == "design" else "machine.toml")
+    if path is None:
+        output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
+        return
+    if path.exists():
+        raise InputError("--out", f"has a file {path.name} already, which is left as it is; name another folder")
+    path.write_text(text, encoding="utf-8")
+    output.done({"kind": kind, "toml": text}, lambda: f"a commented file for {kind}", "new")
+
+
+@app.command("simulate")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--until", required=True, help="End time, such as 20s or '0.5 min'.")
+@click.option(
+    "--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state."
+)
+@click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
+@click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
+@click.option("--tolerance", type=float, default=1e-8, show_default=True, help="Error a step may make.")
+@click.option("--max-steps", type=int, help="Fail after so many steps.")
+@click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
+@shared
+def simulate(
+    scene: Path,
+    until: str,
+    start: Any,
+    mode: int | None,
+    spin_up: str | None,
+    tolerance: float,
+    max_steps: int | None,
+    window: bool,
+    output: Output,
+) -> None:
+    """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    run = jv.simulate(
+        jv.load_scene(scene),
+        until,
+        start=start,
+        mode=mode,
+        spin_up=spin_up,
+        tolerance=tolerance,
+        max_steps=max_steps,
+        save="window" if window else "all",
+        progress=sys.stderr.isatty(),
+    )
+    picture, data = output.file("history.png"), output.file("run.npz")
+    if picture is not None and data is not None:
+        run.plot().savefig(picture)
+        run.save(data)
+    document = {
+        "status": "done",
+        "message": run.message,
+        "time": float(run.window.time[-1]),
+        "rotor_speed": float(run.window.rotor_speed[-1]),
+        "omega": float(run.omega),
+        "load_speed": run.load_speed.tolist(),
+        "amplitude": run.amplitude.tolist(),
+        "foundation_force": float(run.foundation_force),
+        "drift": float(run.drift),
+        "settled": bool(run.settled),
+        "steps": int(run.steps),
+        "rejected": int(run.rejected),
+    }
+    output.done(document, run.summary, "simulate")
+
+
+@app.command("optimize")
+@click.argument("design", type=click.Path(path_type=Path))
+@click.option("--starts", type=int, help="Random starts, in place of the design file's.")
+@click.option("--seed", type=int, help="Which random starts, in place of the design file's.")
+@click.option("--no-verify", is_flag=True, help="Do not check the best machine by time integration.")
+@shared
+def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool, output: Output) -> None:
+    """Search the machine that DESIGN asks for; --out keeps its scene file, the pictures and the motion it was checked by."""
+    loaded = load_design(design)
+    given = {"starts": starts, "seed": seed}
+    options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        best = synthesize(
+            loaded.space,
+            loaded.objective,
+            verify=not no_verify,
+            progress=lambda what, share: bar.update(task, description=what, completed=share),
+            **options,
+        )
+    for name, save in (
+        ("machine.toml", lambda path: jv.save_scene(best.scene, path)),
+        ("before_after.png", lambda path: best.plot().savefig(path)),
+        ("convergence.png", lambda path: best.plot_convergence().savefig(path)),
+    ):
+        path = output.file(name)
+        if path is not None:
+            save(path)
+    if best.run is not None:
+        picture, data = output.file("history.png"), output.file("run.npz")
+        if picture is not None and data is not None:
+            best.run.plot().savefig(picture)
+            best.run.save(data)
+    document = {
+        "objective": best.objective,
+        "before": best.before.as_dict(),
+        "after": best.after.as_dict(),
+        "verified": None if best.verified is None else best.verified.as_dict(),
+        "starts": best.starts,
+        "drawn": best.drawn,
+        "converged": best.converged,
+        "same": best.same,
+    }
+    output.done(document, lambda: _outcomes(best), "optimize")
+
+
+def _outcomes(best: Synthesis) -> str:
+    columns: list[tuple[str, Outcome]] = [("before", best.before), ("after", best.after)]
+    if best.verified is not None:
+        columns.append(("verified", best.verified))
+    rows: list[list[str]] = []
+
+    def row(name: str, read: Any) -> None:
+        rows.append([name, *(f"{read(outcome):.5g}" for _, outcome in columns)])
+
+    for name, value in best.after.parameters.items():
+        if isinstance(value, list):
+            for k in range(len(value)):
+                row(f"{name}[{k}]", lambda o, name=name, k=k: o.parameters[name][k])
+        else:
+            row(name, lambda o, name=name: o.parameters[name])
+    row("jam frequency, rad/s", lambda o: o.omega)
+    for k in range(len(best.after.amplitude)):
+        row(f"amplitude of platform {k + 1}, mm", lambda o, k=k: 1e3 * o.amplitude[k])
+    row("foundation force, N", lambda o: o.foundation_force)
+    row("force per amplitude, N/m", lambda o: o.force_per_amplitude)
+    counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
+    checked = "" if best.verified is None else "\nverified: measured on the full equations, integrated until they settled"
+    return counted + "\n" + table(f"least {best.objective}", ["", *(name for name, _ in columns)], rows) + checked

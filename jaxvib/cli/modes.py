@@ -1,0 +1,74 @@
+"""jaxvib modes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+
+_RPM = 30.0 / np.pi
+
+
+@app.command("modes")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
+@click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
+@shared
+def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
+    """Every jam mode of SCENE at its rotor speed, by the equations for light loads; --out adds the branch diagram."""
+    loaded = jv.load_scene(scene)
+    if speed is not None:
+        loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
+    found = jv.jam_modes(loaded)
+    picture = output.file("branches.png")
+    if picture is not None:
+        jv.branches(loaded).plot(unit=unit).savefig(picture)
+    jams = [found.select(k) for k in found.mode_numbers()]
+    folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
+    document = {
+        "rotor_speed": float(loaded.drive.speed),
+        "resonances": found.resonances.tolist(),
+        "modes": [
+            {
+                "mode": int(jam.mode),
+                "omega": float(jam.omega),
+                "stable": bool(jam.stable),
+                "amplitude": jam.amplitude.tolist(),
+                "foundation_force": float(jam.foundation_force),
+            }
+            for jam in jams
+        ],
+        "folds": [{"omega": float(found.folds.omega[k]), "rotor_speed": float(found.folds.rotor_speed[k])} for k in folds],
+    }
+
+    def text() -> str:
+        names = loaded.machine.carrier().coordinates
+        rows = [
+            [
+                f"{int(jam.mode)}",
+                f"{float(jam.omega):.5g}",
+                f"{_RPM * float(jam.omega):.5g}",
+                "stable" if jam.stable else "unstable",
+                *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
+                f"{float(jam.foundation_force):.4g}",
+            ]
+            for jam in jams
+        ]
+        speed = float(loaded.drive.speed)
+        resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
+        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in names), "force on bed, N"]
+        lines = [
+            f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
+            table("jam modes of light loads; amplitudes and force zero to peak", head, rows),
+        ]
+        if folds:
+            pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
+            lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
+        return "\n".join(lines)
+
+    output.done(document, text, "modes")

@@ -1,0 +1,132 @@
+"""Charts of plain arrays: time histories, branch diagrams, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxvib.draw.style import COLORS, panels
+
+__all__ = ["before_after", "branch_diagram", "convergence", "time_histories"]
+
+
+def time_histories(
+    time: np.ndarray,
+    displacement: np.ndarray,
+    rate: np.ndarray,
+    force: np.ndarray,
+    rotor_speed: np.ndarray,
+    *,
+    names: Sequence[str],
+) -> Figure:
+    """Three panels over time (s): displacements (nt, nd) mm, speeds of the loads (nt, count) and of the
+    rotor (nt,) rad/s, force on the bed (nt, nb) N."""
+    figure, (top, middle, bottom) = panels(3, size=(8.0, 2.4), share_x=True)
+    for k, name in enumerate(names):
+        top.plot(time, 1e3 * displacement[:, k], color=COLORS[k % len(COLORS)], label=name, lw=0.7)
+    top.set_ylabel("displacement, mm")
+    top.legend(ncols=min(len(names), 6), loc="upper right")
+    for k in range(rate.shape[1]):
+        middle.plot(time, rate[:, k], color=COLORS[k % len(COLORS)], lw=0.9)
+    middle.plot(time, rotor_speed, color="black", ls="--", lw=1.0, label="rotor")
+    middle.set_ylabel("speed of loads, rad/s")
+    middle.legend(loc="lower right")
+    for k in range(force.shape[1]):
+        bottom.plot(time, force[:, k], color=COLORS[k % len(COLORS)], lw=0.7)
+    bottom.set_ylabel("force on the bed, N")
+    bottom.set_xlabel("time, s")
+    return figure
+
+
+def branch_diagram(
+    rotor_speed: np.ndarray,
+    omega: np.ndarray,
+    stable: np.ndarray,
+    *,
+    amplitude: np.ndarray,
+    force: np.ndarray,
+    resonances: np.ndarray,
+    marks: Sequence[tuple[str, np.ndarray, np.ndarray]] = (),
+    names: Sequence[str],
+    at: float | None = None,
+    unit: str = "rad/s",
+) -> Figure:
+    """Three panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N.
+
+    Stable parts are solid, unstable ones dashed. `resonances` are drawn as level lines, `marks` as points (label, rotor
+    speed, load speed), `at` as an upright line; speeds are given in rad/s and drawn in `unit` ("rad/s" or "rpm").
+    """
+    scale = 30.0 / np.pi if unit == "rpm" else 1.0
+    figure, axes = panels(1, 3, size=(5.2, 4.2), share_x=True)
+    n = scale * rotor_speed
+    view = scale * rotor_speed[np.isfinite(rotor_speed)]
+    series: list[tuple[Axes, np.ndarray, str, str]] = [(axes[0], scale * omega, COLORS[0], "loads")]
+    series += [(axes[1], 1e3 * amplitude[:, k], COLORS[k % len(COLORS)], name) for k, name in enumerate(names)]
+    series += [(axes[2], force, COLORS[0], "force")]
+    for axis, values, color, label in series:
+        _solid_and_dashed(axis, n, values, stable, color, label)
+    for k, w in enumerate(resonances):
+        axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
+    low, high = 0.0, float(np.max(view))
+    axes[0].plot([low, high], [low, high], color="#bbbbbb", lw=0.8, label="rotor")
+    for label, x, y in marks:
+        axes[0].plot(scale * x, scale * y, "o", ms=4.5, mfc="white", mec="black", label=label)
+    for axis, label in zip(axes, ("speed of loads, " + unit, "amplitude, mm", "foundation force, N"), strict=True):
+        axis.set_xlabel("rotor speed, " + unit)
+        axis.set_ylabel(label)
+        axis.set_xlim(low, high)
+        if at is not None:
+            axis.axvline(scale * at, color="#c8501e", lw=0.9, ls="-.")
+    axes[0].set_ylim(0.0, None)
+    axes[0].legend(loc="upper left")
+    axes[1].legend(loc="best")
+    for axis, values in zip(axes[1:], (1e3 * amplitude, force[:, None]), strict=True):
+        shown = values[np.isfinite(rotor_speed)]
+        axis.set_yscale("log")
+        axis.set_ylim(1e-5 * np.max(shown), 2.0 * np.max(shown))
+    return figure
+
+
+def _solid_and_dashed(axis: Axes, x: np.ndarray, y: np.ndarray, stable: np.ndarray, color: str, label: str) -> None:
+    """One line for each unbroken stretch; neighbouring stretches share a point so that no gap shows."""
+    cuts = np.flatnonzero(stable[1:] != stable[:-1]) + 1
+    labelled = False
+    for start, stop in zip([0, *cuts], [*(cuts + 1), len(x)], strict=True):
+        solid = bool(stable[start])
+        name = label if solid and not labelled else None
+        labelled = labelled or solid
+        axis.plot(x[start:stop], y[start:stop], color=color, ls="-" if solid else (0, (3, 2)), label=name)
+
+
+def before_after(before: Mapping[str, float], after: Mapping[str, float], *, title: str = "") -> Figure:
+    """Bars of every quantity after the search, as a multiple of what it was before; the values stand beside them."""
+    shared = [name for name in after if name in before and np.isfinite(before[name]) and before[name] != 0.0]
+    figure, (axis,) = panels(1, size=(8.0, 0.55 * len(shared) + 1.4))
+    ratios = [after[name] / before[name] for name in shared]
+    places = np.arange(len(shared))[::-1]
+    axis.barh(places, ratios, color=COLORS[0], height=0.6)
+    axis.axvline(1.0, color="black", lw=0.9)
+    for place, name, ratio in zip(places, shared, ratios, strict=True):
+        axis.text(max(ratio, 1.0), place, f"   {before[name]:.4g} → {after[name]:.4g}", va="center", fontsize=9)
+    axis.set_yticks(places, shared)
+    axis.set_xlim(0.0, 1.45 * max([1.0, *ratios]))
+    axis.set_xlabel("after / before")
+    axis.set_title(title)
+    axis.grid(False)
+    return figure
+
+
+def convergence(history: np.ndarray, *, label: str) -> Figure:
+    """The objective of every start (iterations, starts) over the iterations, the best one bold."""
+    figure, (axis,) = panels(1, size=(7.0, 3.6))
+    axis.plot(history, color=COLORS[0], lw=0.5, alpha=0.25)
+    best = int(np.nanargmin(history[-1]))
+    axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
+    axis.set_yscale("log" if np.nanmin(history) > 0.0 else "linear")
+    axis.set_xlabel("iteration")
+    axis.set_ylabel(label)
+    axis.legend()
+    return figure

@@ -1,0 +1,46 @@
+"""One style for every figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+__all__ = ["COLORS", "panels"]
+
+COLORS = ("#1f5aa6", "#c8501e", "#2d8a4e", "#7a4fa3", "#b8860b", "#555555", "#0f8b8d", "#a8324a")
+"""Colours told apart by every reader; further series start over."""
+
+_STYLE: Any = {
+    "font.size": 10.0,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 150,
+}
+
+
+def panels(
+    rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure with `rows` x `columns` axes in the house's style, `size` inches each. **Returns** the figure and its axes.
+
+    >>> figure, axes = panels(2)
+    >>> len(axes)
+    2
+    """
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(size[0] * columns, size[1] * rows))
+        FigureCanvasAgg(figure)
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=share_x)
+    return figure, list(grid.ravel())

@@ -1,0 +1,251 @@
+"""Scene files: TOML in and out."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drive import ConstantSpeed, SpinUp
+from jaxvib.machine.effects import Gravity
+from jaxvib.machine.loads import balls, pendulums, rollers
+from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.scene import Scene
+
+__all__ = [
+    "TEMPLATES",
+    "called",
+    "closest",
+    "load_scene",
+    "read_toml",
+    "save_scene",
+    "scene_from_toml",
+    "scene_to_toml",
+]
+
+_MACHINES = {"one_mass": one_mass, "two_mass": two_mass, "three_mass": three_mass, "network": network}
+_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}
+_DRIVES = {"constant_speed": ConstantSpeed, "spin_up": SpinUp}
+_EFFECTS = {"gravity": Gravity}
+_SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": _DRIVES}
+
+
+def closest(name: str, allowed: list[str]) -> str:
+    """The end of an error message about a name: what was probably meant, and what is allowed."""
+    near = difflib.get_close_matches(name, allowed, n=1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return f"{meant}allowed: {', '.join(allowed)}"
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file. **Raises** `InputError` for a file that is missing or no TOML."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a scene file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), f"is no TOML file: {error}") from error
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Reads a scene file, see `scene_from_toml`.
+
+    **Raises** `InputError` for a file that cannot be read, and for everything that is wrong in it, field named.
+    """
+    return scene_from_tables(read_toml(path))
+
+
+def save_scene(scene: Scene, path: str | Path) -> Path:
+    """Writes a scene file that `load_scene` reads back bit for bit. **Returns** its path."""
+    path = Path(path)
+    path.write_text(scene_to_toml(scene), encoding="utf-8")
+    return path
+
+
+def scene_from_toml(text: str) -> Scene:
+    """A scene from the text of a scene file.
+
+    Tables `[machine]`, `[loads]`, `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit;
+    `[effects]` names only what the scene calls for, `gravity = true` or a table of the effect's arguments.
+
+    **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not allowed.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.scene_from_toml('''
+    ... [machine]
+    ... kind = "one_mass"
+    ... mass = 50.0
+    ... stiffness = "40 N/mm"
+    ... damping = 30.0
+    ... [loads]
+    ... kind = "ball"
+    ... count = 2
+    ... mass = 0.5
+    ... radius = 0.1
+    ... drag = 1.0
+    ... [drive]
+    ... kind = "constant_speed"
+    ... speed = "1500 rpm"
+    ... ''')
+    >>> float(scene.machine.stiffness[0])
+    40000.0
+    """
+    try:
+        return scene_from_tables(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("scene", f"is no TOML: {error}") from error
+
+
+def scene_from_tables(tables: Mapping[str, Any]) -> Scene:
+    """A scene from the tables of a scene file, see `scene_from_toml`."""
+    for name in tables:
+        if name not in (*_SECTIONS, "effects"):
+            raise InputError(name, f"is no table of a scene file; {closest(name, [*_SECTIONS, 'effects'])}")
+    parts = {}
+    for name, kinds in _SECTIONS.items():
+        if name not in tables:
+            raise InputError(name, f"is missing; a scene file needs the table [{name}]")
+        parts[name] = _built(tables[name], name, kinds)
+    effects = []
+    chosen = tables.get("effects", {})
+    if not isinstance(chosen, Mapping):
+        raise InputError("effects", "is not a table; write [effects] and below it, for example, gravity = true")
+    for name, value in chosen.items():
+        if name not in _EFFECTS:
+            raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(_EFFECTS))}")
+        if isinstance(value, Mapping):
+            effects.append(called(_EFFECTS[name], value, f"effects.{name}"))
+        elif value is True:
+            effects.append(_EFFECTS[name]())
+        elif value is not False:
+            raise InputError(f"effects.{name}", f"is {value!r}; write true, false or a table of its arguments")
+    return Scene(**parts, effects=tuple(effects))
+
+
+def _built(table: Any, section: str, kinds: Mapping[str, Callable[..., Any]]) -> Any:
+    if not isinstance(table, Mapping):
+        raise InputError(section, f"is {table!r}; it must be a table, write [{section}]")
+    if "kind" not in table:
+        raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
+    kind = table["kind"]
+    if not isinstance(kind, str) or kind not in kinds:
+        raise InputError(f"{section}.kind", f"is {kind!r}; {closest(str(kind), list(kinds))}")
+    return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
+
+
+def called(build: Callable[..., Any], values: Mapping[str, Any], section: str) -> Any:
+    """`build(**values)`, with every unknown or missing name said as a field of `section`. **Raises** `InputError`."""
+    parameters = inspect.signature(build).parameters
+    for name in values:
+        if name not in parameters:
+            raise InputError(f"{section}.{name}", f"is no field here; {closest(name, list(parameters))}")
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and name not in values:
+            raise InputError(f"{section}.{name}", f"is missing; needed here: {', '.join(_needed(parameters))}")
+    return build(**values)
+
+
+def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
+    return [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
+
+
+def scene_to_toml(scene: Scene) -> str:
+    """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit."""
+    tables: dict[str, Any] = {}
+    for name, kinds in _SECTIONS.items():
+        part = getattr(scene, name)
+        tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
+    tables["effects"] = {effect.kind: _fields(effect, _EFFECTS[effect.kind]) for effect in scene.effects}
+    return tomli_w.dumps(tables)
+
+
+def _fields(part: Any, build: Callable[..., Any]) -> dict[str, Any]:
+    fields = {}
+    for name in inspect.signature(build).parameters:
+        value = getattr(part, name)
+        if isinstance(value, tuple):
+            fields[name] = [list(pair) for pair in value]
+        elif isinstance(value, int):
+            fields[name] = value
+        else:
+            array = np.asarray(value, dtype=float)
+            # A machine's single value is written as a number; one load's own value stays a list, apart from a shared one.
+            single = array.ndim == 0 or (array.size == 1 and isinstance(part, Machine))
+            fields[name] = array.item() if single else array.tolist()
+    return fields
+
+
+_REST = """
+[loads]
+kind = "ball"               # ball, roller, pendulum
+count = 3
+mass = "800 g"              # of one load
+radius = "120 mm"           # of the circle of the loads' centres
+drag = "1.5 N s/m"          # viscous resistance of one load against the rotor, at that radius
+# inertia = 0.0             # kg m^2 about the mass centre, pendulums only
+
+[drive]
+kind = "constant_speed"     # constant_speed, spin_up (with duration)
+speed = "{speed}"
+
+[effects]                   # only what the scene calls for; an empty table is the usual case
+# gravity = true            # gravity on the loads
+"""
+
+TEMPLATES: dict[str, str] = {
+    "one_mass": """# A platform on a support; the auto-balancer's loads shake it.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "one_mass"
+mass = 120.0                # kg, auto-balancer's body included, loads not counted
+stiffness = "50 N/mm"       # of the support
+damping = 40.0              # N s/m
+"""
+    + _REST.format(speed="600 rpm"),
+    "two_mass": """# Two platforms on supports, joined by a link; platform 2 carries the auto-balancer.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "two_mass"
+mass = [120.0, 117.6]       # kg; of platform 2 with the auto-balancer's body, loads not counted
+stiffness = [5.0e4, 5.0e4]  # N/m, of the supports to the bed
+damping = [40.0, 40.0]      # N s/m
+link_stiffness = 2.0e5      # N/m, between the platforms
+link_damping = 60.0         # N s/m
+# exciter = 2               # the platform with the auto-balancer
+"""
+    + _REST.format(speed="1500 rpm"),
+    "three_mass": """# Three platforms; the links are those between 1-2, 1-3 and 2-3 (0 where there is none).
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "three_mass"
+mass = [60.0, 80.0, 57.6]   # kg; of the exciter's platform with the auto-balancer's body, loads not counted
+stiffness = [0.0, 5.0e4, 0.0]
+damping = [0.0, 40.0, 0.0]
+link_stiffness = [1.0e5, 0.0, 1.0e5]
+link_damping = [20.0, 0.0, 20.0]
+exciter = 3                 # the platform with the auto-balancer
+"""
+    + _REST.format(speed="1500 rpm"),
+    "network": """# Any number of platforms, supports and links.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "network"
+mass = [40.0, 40.0, 40.0, 37.6]       # kg; of the exciter's platform with the auto-balancer's body, loads not counted
+stiffness = [2.0e4, 0.0, 0.0, 2.0e4]  # N/m, 0 where a platform has no support
+damping = [20.0, 0.0, 0.0, 20.0]      # N s/m
+links = [[1, 2], [2, 3], [3, 4]]      # pairs of platforms
+link_stiffness = [1.0e5, 1.0e5, 1.0e5]
+link_damping = [20.0, 20.0, 20.0]
+exciter = 4                           # the platform with the auto-balancer
+"""
+    + _REST.format(speed="1500 rpm"),
+}
+"""A commented scene file for every kind of machine."""

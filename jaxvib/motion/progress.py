@@ -1,0 +1,51 @@
+"""A progress bar for one time integration, on the error stream."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import Array
+from rich.console import Console
+from rich.progress import Progress
+
+__all__ = ["ProgressBar"]
+
+_open: list[Progress] = []
+
+
+def _show(fraction: Array) -> None:
+    if not _open:
+        bar = Progress(console=Console(stderr=True), transient=True)
+        bar.add_task("simulating", total=1.0)
+        bar.start()
+        _open.append(bar)
+    _open[0].update(_open[0].task_ids[0], completed=float(fraction))
+    if float(fraction) >= 1.0:
+        _close()
+
+
+def _close() -> None:
+    while _open:
+        _open.pop().stop()
+
+
+class ProgressBar(diffrax.AbstractProgressMeter):
+    """Shows how much of the run's time span is done, in steps of one per cent."""
+
+    def init(self) -> Array:
+        """The progress shown last."""
+        return jnp.array(0.0)
+
+    def step(self, state: Array, progress: Any) -> Array:
+        """Shows `progress` where it is a per cent further."""
+        progress = jnp.asarray(progress, dtype=state.dtype)
+        further = (progress - state > 0.01) | (progress >= 1.0)
+        jax.lax.cond(further, lambda p: jax.debug.callback(_show, p), lambda p: None, progress)
+        return jnp.where(further, progress, state)
+
+    def close(self, state: Array) -> None:
+        """Takes the bar away."""
+        jax.debug.callback(_close)

@@ -1,0 +1,158 @@
+"""The result of a time integration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.draw.charts import time_histories
+from jaxvib.errors import InputError
+from jaxvib.machine.files import scene_from_toml, scene_to_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.dynamics import State
+from jaxvib.motion.observables import Measured, Trajectory
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+__all__ = ["Run", "RunStatus"]
+
+
+class RunStatus(eqx.Enumeration):
+    """How a run ended; the members are the sentences a user reads."""
+
+    done = "the run reached its end"
+    max_steps_reached = "the run did not reach its end in the steps it was allowed"
+    not_finite = "the motion grew beyond all bounds"
+    no_start = "the state to start from does not exist or is not finite"
+
+
+class Run(Measured):
+    """A run of a scene: what was measured over its last turns (see `Measured`), and the motion itself.
+
+    **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
+    was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
+    were `rejected`; `scene` that ran.
+    """
+
+    status: RunStatus
+    trajectory: Trajectory | None
+    window: Trajectory
+    steps: Array
+    rejected: Array
+    scene: Scene
+
+    @property
+    def message(self) -> str:
+        """How the run ended, a sentence."""
+        return RunStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
+    def summary(self) -> str:
+        """What happened, for a person to read; amplitudes zero to peak."""
+        names = self.scene.machine.carrier().coordinates
+        amplitude = ", ".join(f"{n} {float(a):.4g} m" for n, a in zip(names, self.amplitude, strict=True))
+        speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
+        state = "settled" if bool(self.settled) else "not settled"
+        return "\n".join(
+            [
+                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
+                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
+                f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
+                f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
+            ]
+        )
+
+    def _kept(self) -> Trajectory:
+        return self.window if self.trajectory is None else self.trajectory
+
+    def plot(self) -> Figure:
+        """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.
+
+        **Returns** a matplotlib figure.
+        """
+        kept = self._kept()
+        return time_histories(
+            np.asarray(kept.time),
+            np.asarray(kept.state.displacement),
+            np.asarray(kept.state.rate[0]),
+            np.asarray(kept.foundation_force),
+            np.asarray(kept.rotor_speed),
+            names=self.scene.machine.carrier().coordinates,
+        )
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The kept motion as a labelled dataset, with units as attributes (needs the extra `jaxvib[xarray]`)."""
+        try:
+            import xarray as xr
+        except ImportError as error:
+            raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
+        kept = self._kept()
+        names = list(self.scene.machine.carrier().coordinates)
+        loads = range(1, self.scene.loads.count + 1)
+
+        def column(value: Array, dimension: str, unit: str) -> tuple[tuple[str, str], np.ndarray, dict[str, str]]:
+            return ("time", dimension), np.asarray(value), {"units": unit}
+
+        return xr.Dataset(
+            {
+                "displacement": column(kept.state.displacement, "coordinate", "m"),
+                "velocity": column(kept.state.velocity, "coordinate", "m/s"),
+                "angle": column(kept.state.angle[0], "load", "rad"),
+                "rate": column(kept.state.rate[0], "load", "rad/s"),
+                "foundation_force": column(kept.foundation_force, "direction", "N"),
+                "rotor_speed": ("time", np.asarray(kept.rotor_speed), {"units": "rad/s"}),
+            },
+            coords={
+                "time": ("time", np.asarray(kept.time), {"units": "s"}),
+                "coordinate": names,
+                "load": list(loads),
+                "direction": list(range(1, kept.foundation_force.shape[1] + 1)),
+            },
+            attrs={
+                "status": self.message,
+                "omega": float(self.omega),
+                "amplitude": np.asarray(self.amplitude).tolist(),
+                "foundation_force_amplitude": float(self.foundation_force),
+                "steps": int(self.steps),
+            },
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the run, scene included, to a NumPy archive (".npz"); `Run.load` reads it back bit for bit.
+
+        **Returns** the path written to.
+        """
+        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(eqx.filter(self, eqx.is_array)))}
+        path = Path(path).with_suffix(".npz")
+        arrays |= {"scene": np.asarray(scene_to_toml(self.scene)), "kept_all": np.asarray(self.trajectory is not None)}
+        np.savez(path, allow_pickle=False, **arrays)
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Run:
+        """Reads a run written by `save`.
+
+        **Raises** `InputError` for a file that is missing or was not written by `save`.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                scene = scene_from_toml(str(archive["scene"]))
+                kept_all = bool(archive["kept_all"])
+                leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
+        except FileNotFoundError as error:
+            raise InputError("path", f"is {str(path)!r}; there is no such file") from error
+        except (KeyError, ValueError, OSError) as error:
+            raise InputError("path", f"is {str(path)!r}; it is no run written by Run.save") from error
+        zero = jnp.zeros(())
+        motion = Trajectory(zero, State(zero, zero, (zero,), (zero,)), zero, zero)
+        shape = cls(zero, zero, zero, zero, zero, RunStatus.done, motion if kept_all else None, motion, zero, zero, scene)
+        dynamic, static = eqx.partition(shape, eqx.is_array)
+        return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)

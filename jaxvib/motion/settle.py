@@ -1,0 +1,73 @@
+"""Time integration until the motion repeats itself."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import count
+from jaxvib.motion.dynamics import State
+from jaxvib.motion.run import Run
+from jaxvib.motion.simulate import simulate
+from jaxvib.motion.start import Start, initial_state
+from jaxvib.steady.response import natural_frequencies
+
+__all__ = ["settle"]
+
+
+def settle(
+    scene: Scene,
+    *,
+    start: Start | State = "jam",
+    mode: int | None = None,
+    drift: float = 1e-6,
+    periods: int = 100,
+    stretches: int = 200,
+    tolerance: float = 1e-9,
+    throw: bool = True,
+) -> Run:
+    """Simulates a stretch after a stretch until amplitudes and speed no longer change.
+
+    **Arguments**: `start`, `mode`, `tolerance` as `simulate`; `drift` the change that counts as none, see `Measured`;
+    `periods` of the lowest natural frequency a stretch is long; at most so many `stretches`; `throw` raise if the motion has
+    not settled by then, otherwise the last run says so by its `drift`.
+
+    **Returns** the `Run` of the last stretch, without a trajectory.
+
+    **Raises** `ComputationError` (status "not_settled"), `InputError` for a drive whose speed changes; as `simulate` besides.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
+    True
+    """
+    if not isinstance(scene.drive, ConstantSpeed):
+        raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed only")
+    count(periods, "periods")
+    frequencies = natural_frequencies(scene)
+    slowest = float(jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
+    state = start if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    stretch = 2.0 * math.pi * periods / slowest
+    run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance)
+    for _ in range(count(stretches, "stretches") - 1):
+        if float(run.drift) < drift:
+            break
+        state = jax.tree.map(lambda leaf: leaf[-1], run.window.state)
+        # Only where the loads are within a turn matters; kept small, an angle keeps its digits.
+        turns = jnp.floor(state.angle[0] / (2.0 * jnp.pi))
+        state = State(state.displacement, state.velocity, (state.angle[0] - 2.0 * jnp.pi * turns,), state.rate)
+        run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance)
+    if throw and not float(run.drift) < drift:
+        raise ComputationError(
+            "not_settled",
+            f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
+            "it may have no steady state here, otherwise allow more stretches",
+        )
+    return run

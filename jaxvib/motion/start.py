@@ -1,0 +1,61 @@
+"""Initial states by name."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import Number, numbers
+from jaxvib.motion.dynamics import State
+from jaxvib.steady.jam import jam_modes
+
+__all__ = ["Start", "initial_state"]
+
+Start = Literal["rest", "jam", "spin_up"]
+"""Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
+
+
+def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Number | None = None) -> State:
+    """A state to start from.
+
+    **Arguments**
+
+    - `start`: "rest" (platforms in equilibrium, loads at rest, together at the bottom of their track), "spin_up" (the same
+      state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
+    - `mode`: number of the jam mode, for "jam"
+    - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam)
+
+    **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that
+    does not exist at the scene's rotor speed.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> jv.initial_state(scene, "rest", angles=[0.0, 0.1]).angle[0].tolist()
+    [0.0, 0.1]
+    """
+    if start not in ("rest", "jam", "spin_up"):
+        raise InputError("start", f"is {start!r}; it must be 'rest', 'jam' or 'spin_up'")
+    if start != "jam" and mode is not None:
+        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out or start in a jam")
+    n = scene.loads.count
+    zero = jnp.zeros_like(scene.machine.carrier().mass[0])
+
+    def phases(value: float) -> Array:
+        return numbers(value if angles is None else angles, "rad", "angles", n)
+
+    if start != "jam":
+        return State(zero, zero, (phases(-jnp.pi / 2),), (jnp.zeros((n,), zero.dtype),))
+    if mode is None:
+        raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
+    jam = jam_modes(scene).select(mode)
+    return State(
+        jam.displacement.real,
+        -jam.omega * jam.displacement.imag,
+        (phases(0.0),),
+        (jnp.full((n,), jam.omega),),
+    )

@@ -1,0 +1,100 @@
+"""The whole diagram: at which rotor speeds the loads jam at which speed."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.draw.charts import branch_diagram
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import Number, count, number
+from jaxvib.steady.jam import Folds, Jam, branch_points, fold_points
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Branches", "branches"]
+
+
+class Branches(Jam):
+    """The branch diagram: the arrays of `Jam` along the load speed Omega, ascending, with a leading axis over the points.
+
+    Adds `resonances` (nd,) rad/s, the `folds`, and the `scene`.
+    """
+
+    resonances: Array
+    folds: Folds
+    scene: Scene
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
+        """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
+
+        **Arguments**: `unit` of the speeds on the axes; `most` the greatest rotor speed shown, rad/s (a third above the
+        scene's unless said otherwise).
+
+        **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+        """
+        if unit not in ("rad/s", "rpm"):
+            raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
+        at = float(self.scene.drive.speed)
+        shown = np.asarray(self.rotor_speed) <= (4.0 / 3.0 * at if most is None else most)
+        inside = np.asarray(self.folds.exists) & (np.asarray(self.folds.rotor_speed) <= (4 / 3 * at if most is None else most))
+        there = np.where(shown, 1.0, np.nan)
+        return branch_diagram(
+            np.asarray(self.rotor_speed) * there,
+            np.asarray(self.omega),
+            np.asarray(self.stable),
+            amplitude=np.asarray(self.amplitude),
+            force=np.asarray(self.foundation_force),
+            resonances=np.asarray(self.resonances),
+            marks=[("fold", np.asarray(self.folds.rotor_speed)[inside], np.asarray(self.folds.omega)[inside])],
+            names=self.scene.machine.carrier().coordinates,
+            at=at,
+            unit=unit,
+        )
+
+
+def branches(scene: Scene, *, points: int = 2000, most: Number | None = None) -> Branches:
+    """The branch n(Omega) of jams of light, collected loads, through all its folds.
+
+    n(Omega) is explicit (`jam_rotor_speed`), so every point is computed for itself: nothing is followed, nothing missed.
+
+    **Arguments**: `points` along Omega, crowded about the resonances; `most` the greatest load speed, rad/s or text (a third
+    above the scene's rotor speed unless said otherwise).
+
+    **Returns** `Branches`. **Raises** `InputError` for fewer than 2 points or a speed that is not positive.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> diagram = jv.branches(form.scene())
+    >>> [round(float(w), 4) for w in diagram.folds.omega]
+    [0.3339, 0.3806, 1.0015, 1.2154]
+    >>> [round(float(n), 4) for n in diagram.folds.rotor_speed]
+    [0.7978, 0.4141, 5.1829, 1.3932]
+
+    Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
+    """
+    count(points, "points", low=2)
+    top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
+    per_side = max(2, math.ceil(points / (2 * scene.machine.carrier().mass.shape[0])))
+    return _branches(scene, top, points, per_side)
+
+
+@eqx.filter_jit
+def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
+    crowded, resonances = fold_points(jax.lax.stop_gradient(scene), per_side)
+    # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
+    inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
+    share = jnp.linspace(0.0, 1.0, points)
+    omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))
+    jams, folds = branch_points(scene, omega)
+    fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
+    return Branches(**fields, resonances=resonances, folds=folds, scene=scene)

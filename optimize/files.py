@@ -1,0 +1,126 @@
+"""Design files: what may change, what is held, what is wanted, in TOML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import called, closest, load_scene, read_toml
+from jaxvib.machine.units import count
+from optimize.quantities import (
+    Quantity,
+    amplitude,
+    force_per_amplitude,
+    foundation_force,
+    jam_frequency,
+    negative,
+    support_frequency_squared,
+    total,
+)
+from optimize.space import DesignSpace, hold
+
+__all__ = ["TEMPLATE", "Design", "load_design"]
+
+_QUANTITIES = {
+    "amplitude": amplitude,
+    "foundation_force": foundation_force,
+    "force_per_amplitude": force_per_amplitude,
+    "jam_frequency": jam_frequency,
+    "support_frequency_squared": support_frequency_squared,
+    "total": total,
+}
+_SECTIONS = ["scene", "free", "hold", "objective", "search"]
+
+
+@dataclass(frozen=True)
+class Design:
+    """A design file: the `space`, the `objective`, and the arguments of `synthesize` in `search`."""
+
+    space: DesignSpace
+    objective: Quantity
+    search: dict[str, int] = field(default_factory=dict)
+
+
+def load_design(path: str | Path) -> Design:
+    """Reads a design file.
+
+    `scene` names the scene file, relative to the design file; `[free]` gives bounds for each number that may change;
+    every `[[hold]]` a quantity and, unless it shall stay as it is, its value; `[objective]` the quantity to make small, or
+    large with `maximize = true`; `[search]` the number of starts, the seed and the iterations.
+
+    **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field named.
+    """
+    tables = read_toml(path)
+    for name in tables:
+        if name not in _SECTIONS:
+            raise InputError(name, f"is no part of a design file; {closest(name, _SECTIONS)}")
+    for name in ("scene", "free", "objective"):
+        if name not in tables:
+            raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
+    if not isinstance(tables["scene"], str):
+        raise InputError("scene", f"is {tables['scene']!r}; give the path of a scene file, in quotes")
+    for name in ("free", "objective", "search"):
+        if not isinstance(tables.get(name, {}), Mapping):
+            raise InputError(name, f"is not a table; write [{name}]")
+    held = tables.get("hold", [])
+    if not isinstance(held, list):
+        raise InputError("hold", "is not a list of tables; write [[hold]] for each quantity")
+    scene = load_scene(Path(path).parent / tables["scene"])
+    values = [_quantity(table, f"hold[{k}]", ("value",)) for k, table in enumerate(held)]
+    space = DesignSpace(scene, dict(tables["free"]), [hold(q, more.get("value")) for q, more in values])
+    objective, more = _quantity(tables["objective"], "objective", ("maximize",))
+    if more.get("maximize", False):
+        objective = negative(objective)
+    search = dict(tables.get("search", {}))
+    allowed = ["starts", "seed", "iterations", "polishing"]
+    for name, value in search.items():
+        if name not in allowed:
+            raise InputError(f"search.{name}", f"is no field here; {closest(name, allowed)}")
+        count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
+    return Design(space, objective, search)
+
+
+def _quantity(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity, dict[str, Any]]:
+    if not isinstance(table, Mapping):
+        raise InputError(section, f"is {table!r}; it must be a table with a quantity")
+    name = table.get("quantity")
+    if name not in _QUANTITIES:
+        problem = "is missing" if name is None else f"is {name!r}"
+        raise InputError(f"{section}.quantity", f"{problem}; {closest(str(name), list(_QUANTITIES))}")
+    values = {k: v for k, v in table.items() if k not in ("quantity", *more)}
+    if isinstance(values.get("of"), list):
+        values["of"] = tuple(values["of"])
+    if "mode" in values:
+        count(values["mode"], f"{section}.mode")
+    return called(_QUANTITIES[name], values, section), {k: table[k] for k in more if k in table}
+
+
+TEMPLATE = """# A design: which numbers of the scene may change, what keeps its value, what is wanted.
+scene = "machine.toml"            # path of the scene file, from here
+
+[free]                            # bounds, SI or with units; machine.stiffness[0] frees one entry only
+"machine.stiffness" = ["10 N/mm", "200 N/mm"]
+"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]
+
+[[hold]]                          # keeps its value during the search
+quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
+mode = 3
+value = "570 rpm"                 # left out: what it is in the scene
+
+[[hold]]
+quantity = "support_frequency_squared"   # the sum of k/M over the supports: how soft the machine may stand
+
+[objective]
+quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
+mode = 3
+of = [1, 2]                       # amplitude of platform 1 relative to platform 2; a number: that platform's own
+# maximize = true
+
+[search]
+starts = 256
+seed = 0
+"""
+"""A commented design file."""

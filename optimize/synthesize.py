@@ -1,0 +1,267 @@
+"""From a design space and a wish to a machine, checked by time integration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.draw.charts import before_after, convergence
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import count
+from jaxvib.motion.observables import relative_amplitude
+from jaxvib.motion.run import Run
+from jaxvib.motion.settle import settle
+from jaxvib.steady.jam import JamStatus, jam_modes
+from optimize.quantities import Pair, Quantity, between, force_per_amplitude
+from optimize.search import Search, descend, draw_starts, polish
+from optimize.space import DesignSpace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Outcome", "Synthesis", "synthesize"]
+
+_CONVERGED = 1e-6
+"""By how much, in relation to its value, the objective may still be above its least value nearby."""
+
+_SAME = 1e-3
+"""How near two designs must be, relative to the ranges of the free numbers, to count as the same machine."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A machine in numbers, in one jam mode.
+
+    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m
+    and `foundation_force` N, zero to peak; `force_per_amplitude` N/m; `objective` what the search made small. NaN
+    where the mode does not exist.
+    """
+
+    parameters: dict[str, float | list[float]]
+    exists: bool
+    omega: float
+    amplitude: tuple[float, ...]
+    foundation_force: float
+    force_per_amplitude: float
+    objective: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same for JSON: freed numbers beside the quantities, None where there is no number."""
+
+        def plain(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        return {
+            **self.parameters,
+            "omega": plain(self.omega),
+            "amplitude": [plain(a) for a in self.amplitude],
+            "foundation_force": plain(self.foundation_force),
+            "force_per_amplitude": plain(self.force_per_amplitude),
+        }
+
+
+@dataclass(frozen=True)
+class Synthesis:
+    """What a search found.
+
+    **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
+    integration of the full equations (None if not asked for), from `run`; `starts` searches made, from `drawn` random designs;
+    `converged` how many of them ended where no free number can improve; `same` how many ended at the best design; `designs`
+    (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history` (iterations,
+    starts) of the objective; `objective` and `unit` its name and unit.
+    """
+
+    scene: Scene
+    before: Outcome
+    after: Outcome
+    verified: Outcome | None
+    run: Run | None
+    starts: int
+    drawn: int
+    converged: int
+    same: int
+    designs: np.ndarray
+    values: np.ndarray
+    done: np.ndarray
+    history: np.ndarray
+    objective: str
+    unit: str
+
+    def summary(self) -> str:
+        """Before, after and verified, for a person to read."""
+        rows = [("before", self.before), ("after", self.after)] + ([("verified", self.verified)] if self.verified else [])
+        lines = [f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"]
+        for name, outcome in rows:
+            numbers = ", ".join(f"{key} {_show(value)}" for key, value in outcome.parameters.items())
+            lines.append(f"  {name}: {numbers}")
+            if outcome.exists:
+                lines.append(
+                    f"    Omega {outcome.omega:.6g} rad/s, amplitude {_show(list(outcome.amplitude))} m, foundation force "
+                    f"{outcome.foundation_force:.4g} N, force per amplitude {outcome.force_per_amplitude:.4g} N/m"
+                )
+            else:
+                lines.append("    this jam mode does not exist")
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Every quantity after the search against before. **Returns** a matplotlib figure."""
+        return before_after(_flat(self.before), _flat(self.after), title=f"search for least {self.objective}")
+
+    def plot_convergence(self) -> Figure:
+        """The objective of every start over the iterations. **Returns** a matplotlib figure."""
+        return convergence(self.history, label=f"{self.objective}, {self.unit}".rstrip(", "))
+
+
+def _show(value: float | list[float]) -> str:
+    return ", ".join(f"{v:.5g}" for v in value) if isinstance(value, list) else f"{value:.5g}"
+
+
+def _flat(outcome: Outcome) -> dict[str, float]:
+    flat: dict[str, float] = {}
+    for name, value in outcome.parameters.items():
+        if isinstance(value, list):
+            flat.update({f"{name}[{k}]": v for k, v in enumerate(value)} if len(value) > 1 else {name: value[0]})
+        else:
+            flat[name] = value
+    flat["jam frequency, rad/s"] = outcome.omega
+    flat.update({f"amplitude of platform {k + 1}, m": a for k, a in enumerate(outcome.amplitude)})
+    flat["foundation force, N"] = outcome.foundation_force
+    flat["force per amplitude, N/m"] = outcome.force_per_amplitude
+    return flat
+
+
+def synthesize(
+    space: DesignSpace,
+    objective: Quantity,
+    *,
+    starts: int = 256,
+    seed: int = 0,
+    iterations: int = 150,
+    polishing: int = 16,
+    rate: float = 0.05,
+    verify: bool = True,
+    progress: Callable[[str, float], None] | None = None,
+) -> Synthesis:
+    """Searches a design space from many random starts at once for the least value of a quantity.
+
+    Starts are drawn evenly from the bounds and moved onto what is held; Adam (optax) descends from all of them at once, each
+    step along what is held; Newton's method with a line search polishes. Gradients are those of the jam's equations.
+
+    **Arguments**
+
+    - `space`: a `DesignSpace`; `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`
+    - `starts`, `seed`: how many random starts, and which; `iterations` of the descent with first step `rate` (in parts of a
+      free number's range), then `polishing` steps of Newton's method
+    - `verify`: integrate the full equations of the best design, from its jam until it has settled, and measure
+    - `progress`: called with what is being done and how much of it is (0 to 1)
+
+    **Returns** `Synthesis`. **Raises** `InputError` for values that are not allowed, `ComputationError` (status
+    "no_feasible_start") if no design in the bounds has the objective and keeps what is held.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from optimize import DesignSpace, force_per_amplitude, hold, jam_frequency, support_frequency_squared, synthesize
+    >>> form = jv.Dimensionless("antiphase", natural=(0.2, 0.4), damping=(1e-3, 1e-3), link_natural=2/3, link_damping=1e-3,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> space = DesignSpace(form.scene(), free={"machine.stiffness": (0.02, 0.3), "machine.link_stiffness": (0.2, 0.8)},
+    ...                     hold=[hold(jam_frequency(mode=3), 1.0), hold(support_frequency_squared(), 2/9)])
+    >>> best = synthesize(space, force_per_amplitude(mode=3), starts=8, verify=False)
+    >>> best.same, [round(k, 2) for k in best.after.parameters["machine.stiffness"]]     # n2 = n1 came out
+    (8, [0.11, 0.11])
+
+    Source: the antiphase paper, section 5.1, found there by algebra.
+    """
+    count(starts, "starts")
+    count(iterations, "iterations")
+    count(polishing, "polishing", low=0)
+    if not 0.0 < rate < 1.0:
+        raise InputError("rate", f"is {rate!r}; it must be greater than 0 and less than 1")
+    if not isinstance(objective, Quantity):
+        raise InputError("objective", f"is {objective!r}; it must be a Quantity, for example force_per_amplitude(mode=3)")
+    between(space.scene, objective.of)
+    if objective.mode is not None:
+        jam_modes(space.scene).select(objective.mode, throw=False)  # says which numbers there are
+    tell = progress or (lambda _what, _share: None)
+    search = Search(space, objective)
+
+    tell("drawing starts", 0.0)
+    drawn = draw_starts(search, starts, seed)
+    if len(drawn.z) == 0:
+        raise ComputationError(
+            "no_feasible_start",
+            f"of {drawn.drawn} random designs in the bounds none has {objective.name} and keeps what is held; "
+            "widen the bounds, hold other values or ask for another mode",
+        )
+    z, descent = descend(search, drawn.z, iterations, rate, lambda share: tell("descending", 0.1 + 0.4 * share))
+    ends = polish(search, z, polishing, lambda share: tell("polishing", 0.5 + 0.4 * share))
+    values = np.where(ends.good, ends.history[-1], np.inf)
+    done = ends.good & (ends.left < _CONVERGED)
+    if not np.any(np.isfinite(values)):
+        raise ComputationError("diverged", f"no search from {starts} starts ended at a possible design; give a smaller rate")
+    best = int(np.argmin(values))
+    scene = space.at(jnp.asarray(ends.z[best]))
+    tell("checking by time integration", 0.9)
+    run = settle(scene, mode=objective.mode) if verify and objective.mode is not None else None
+    tell("done", 1.0)
+    return Synthesis(
+        scene=scene,
+        before=_by_algebra(space, space.scene, objective),
+        after=_by_algebra(space, scene, objective),
+        verified=None if run is None else _by_run(space, run, objective),
+        run=run,
+        starts=len(drawn.z),
+        drawn=drawn.drawn,
+        converged=int(np.sum(done)),
+        same=int(np.sum(np.max(np.abs(ends.z - ends.z[best]), axis=1) < _SAME)),
+        designs=ends.z,
+        values=values,
+        done=done,
+        history=np.concatenate([descent, ends.history]),
+        objective=objective.name,
+        unit=objective.unit,
+    )
+
+
+def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcome:
+    mode = objective.mode
+    parameters = space.parameters(scene)
+    if mode is None:
+        nothing = tuple(math.nan for _ in scene.machine.carrier().coordinates)
+        return Outcome(parameters, False, math.nan, nothing, math.nan, math.nan, float(objective(scene)))
+    jam = jam_modes(scene).select(mode, throw=False)
+    return Outcome(
+        parameters=parameters,
+        exists=not bool(jam.status == JamStatus.absent),
+        omega=float(jam.omega),
+        amplitude=tuple(float(a) for a in jam.amplitude),
+        foundation_force=float(jam.foundation_force),
+        force_per_amplitude=float(force_per_amplitude(mode=mode, of=objective.of)(scene)),
+        objective=float(objective(scene)),
+    )
+
+
+def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
+    of: Pair = between(run.scene, objective.of)
+    force = float(run.foundation_force)
+    whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.scene, run.window, *of))
+    read = {
+        "amplitude": whose,
+        "foundation_force": force,
+        "force_per_amplitude": force / whose,
+        "jam_frequency": float(run.omega),
+    }
+    return Outcome(
+        parameters=space.parameters(run.scene),
+        exists=True,
+        omega=float(run.omega),
+        amplitude=tuple(float(a) for a in run.amplitude),
+        foundation_force=force,
+        force_per_amplitude=force / whose,
+        objective=read.get(objective.name, math.nan),
+    )

@@ -1,0 +1,190 @@
+"""The commands as a user types them."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.cli.app import run
+from jaxvib.machine.files import TEMPLATES
+
+
+@pytest.fixture
+def typed(capsys, tmp_path, monkeypatch):
+    """Runs a command line in an empty folder that holds machine.toml; gives exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    jv.save_scene(scene("two_mass", speed=150.0), tmp_path / "machine.toml")
+
+    def type_(*words):
+        code = run(list(words))
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return type_
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_new_prints_a_scene_file_that_loads(typed, kind):
+    code, out, _ = typed("new", kind.replace("_", "-"))
+    assert code == 0
+    assert jv.scene_from_toml(out).machine.kind == kind
+    assert "#" in out and "kg" in out
+
+
+def test_modes_json_has_the_promised_keys(typed):
+    code, out, err = typed("modes", "machine.toml", "--json")
+    document = json.loads(out)
+    assert code == 0 and err == ""
+    assert set(document) == {"rotor_speed", "resonances", "modes", "folds"}
+    assert set(document["modes"][0]) == {"mode", "omega", "stable", "amplitude", "foundation_force"}
+    assert set(document["folds"][0]) == {"omega", "rotor_speed"}
+    modes = jv.jam_modes(scene("two_mass", speed=150.0))
+    assert [m["mode"] for m in document["modes"]] == modes.mode_numbers()
+    for m in document["modes"]:
+        np.testing.assert_allclose(m["amplitude"], modes.select(m["mode"]).amplitude, rtol=1e-12)
+
+
+def test_modes_writes_table_and_picture(typed, tmp_path):
+    code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
+    assert code == 0 and "mode" in out and "stable" in out and "wrote" in out
+    assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
+
+
+def test_modes_speed_option_replaces_the_scene_s(typed):
+    _, out, _ = typed("modes", "machine.toml", "--json", "--speed", "600 rpm")
+    np.testing.assert_allclose(json.loads(out)["rotor_speed"], 20 * np.pi, rtol=1e-15)
+
+
+def test_simulate_json_and_files(typed, tmp_path):
+    code, out, _ = typed("simulate", "machine.toml", "--until", "4s", "--start", "jam", "--mode", "3", "--json", "--out", "o")
+    document = json.loads(out)
+    assert code == 0 and document["status"] == "done" and document["time"] == 4.0
+    assert abs(document["omega"] - float(jv.jam_modes(scene(speed=150.0)).select(3).omega)) < 0.5
+    assert float(jv.Run.load(tmp_path / "o" / "run.npz").omega) == document["omega"]
+    assert (tmp_path / "o" / "history.png").stat().st_size > 10_000
+
+
+def test_optimize_json_has_the_promised_keys(typed, tmp_path):
+    (tmp_path / "design.toml").write_text(
+        """
+        scene = "machine.toml"
+        [free]
+        "machine.stiffness" = [1e4, 1e5]
+        [objective]
+        quantity = "force_per_amplitude"
+        mode = 3
+        [search]
+        starts = 4
+        iterations = 20
+        """
+    )
+    code, out, err = typed("optimize", "design.toml", "--json", "--out", "o")
+    document = json.loads(out)
+    assert code == 0 and err == ""
+    assert {"before", "after", "verified", "starts", "converged"} <= set(document)
+    for name in ("before", "after", "verified"):
+        keys = {"machine.stiffness", "omega", "amplitude", "foundation_force", "force_per_amplitude"}
+        assert set(document[name]) == keys
+    assert document["after"]["force_per_amplitude"] < document["before"]["force_per_amplitude"]
+    np.testing.assert_allclose(document["verified"]["omega"], document["after"]["omega"], rtol=1e-2)
+    found = jv.load_scene(tmp_path / "o" / "machine.toml")
+    np.testing.assert_array_equal(found.machine.stiffness, document["after"]["machine.stiffness"])
+    for picture in ("before_after.png", "convergence.png", "history.png"):
+        assert (tmp_path / "o" / picture).stat().st_size > 5_000
+
+
+WRONG = [
+    (("mass = [", "masses = ["), "machine.masses is no field here; did you mean 'mass'"),
+    (("drag = 1.5\n", ""), "loads.drag is missing"),
+    (("120.0", "-120.0"), "machine.mass[0] is -120 kg; it must be greater than 0"),
+    (("50000.0", '"5 kg"'), "machine.stiffness[0] is '5 kg', which is not in N/m"),
+    (("50000.0", "nan"), "machine.stiffness[0] is nan N/m; a finite number is needed"),
+    (("count = 3", "count = 0"), "loads.count is 0; it must be a whole number, at least 1"),
+    (("speed = 150.0", "speed = -1"), "drive.speed is -1 rad/s; it must be greater than 0"),
+    (('kind = "two_mass"', 'kind = "two-mass"'), "machine.kind is 'two-mass'; did you mean 'two_mass'"),
+    (("[machine]", "[machin]"), "machin is no table of a scene file; did you mean 'machine'"),
+    (("[machine]", "[machine"), "is no TOML file"),
+]
+
+
+@pytest.mark.parametrize(("change", "says"), WRONG)
+def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, says):
+    text = (tmp_path / "machine.toml").read_text()
+    assert change[0] in text
+    (tmp_path / "machine.toml").write_text(text.replace(*change, 1))
+    code, out, err = typed("modes", "machine.toml")
+    assert code == 2 and out == ""
+    assert says in err and err.count("\n") == 1 and "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (("modes", "nothing.toml"), 2, "cannot be read"),
+        (("modes", "machine.toml", "--speed", "5 kg"), 2, "is not in rad/s"),
+        (("modes",), 2, "Missing argument 'SCENE'"),
+        (("mode", "machine.toml"), 2, "No such command"),
+        (("simulate", "machine.toml"), 2, "--until"),
+        (("simulate", "machine.toml", "--until", "5 kg"), 2, "until is '5 kg', which is not in s"),
+        (("simulate", "machine.toml", "--until", "-1"), 2, "until is -1 s; it must be greater than 0"),
+        (("simulate", "machine.toml", "--until", "1s", "--start", "jam"), 2, "mode is missing"),
+        (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "9"), 2, "numbered 1 to 5"),
+        (
+            ("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"),
+            1,
+            "does not exist at rotor speed",
+        ),
+        (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
+        (("simulate", "machine.toml", "--until", "1s", "--tolerance", "1e-30"), 2, "tolerance is 1e-30"),
+        (("optimize", "machine.toml"), 2, "is no part of a design file"),
+        (("new", "four-mass"), 2, "four-mass"),
+    ],
+)
+def test_failures_have_their_exit_code_and_one_sentence(typed, words, code, says):
+    got, out, err = typed(*words)
+    assert (got, out) == (code, "")
+    assert says in err and err.count("\n") == 1
+
+
+def test_failure_with_json_is_one_document(typed):
+    code, out, _ = typed("simulate", "machine.toml", "--until", "9s", "--max-steps", "50", "--json")
+    error = json.loads(out)["error"]
+    assert code == 1 and error["kind"] == "computation" and error["status"] == "max_steps_reached"
+    code, out, _ = typed("modes", "machine.toml", "--speed", "0", "--json")
+    assert code == 2 and json.loads(out)["error"]["field"] == "drive.speed"
+
+
+def test_new_never_overwrites(typed):
+    assert typed("new", "two-mass", "--out", "here")[0] == 0
+    code, _, err = typed("new", "two-mass", "--out", "here")
+    assert code == 2 and "left as it is" in err
+
+
+def test_installed_command_prints_json_alone(tmp_path):
+    jv.save_scene(scene("one_mass", "rollers", speed=60.0), tmp_path / "machine.toml")
+    words = [
+        sys.executable,
+        "-c",
+        "from jaxvib.cli import main; main()",
+        "modes",
+        str(tmp_path / "machine.toml"),
+        "--json",
+    ]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["rotor_speed"] == 60.0
+    assert done.stderr == ""
+
+
+def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
+    code = (
+        "import sys, jax; before = dict(jax.config.values); import jaxvib, optimize; "
+        "assert dict(jax.config.values) == before; "
+        "assert not any(m.startswith(('jaxvib.cli', 'click', 'pint')) for m in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -1,0 +1,213 @@
+"""Gradients by independent routes: implicit, forward and reverse through time, finite differences."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, scene
+
+import jaxvib as jv
+
+NAMES = ("mass", "stiffness", "damping", "link_stiffness", "link_damping", "load_mass", "drag", "speed")
+
+
+def numbers(s):
+    m = s.machine
+    return {
+        **{name: getattr(m, name) for name in NAMES[:5]},
+        "load_mass": s.loads.mass,
+        "drag": s.loads.drag,
+        "speed": s.drive.speed,
+    }
+
+
+def with_numbers(s, values):
+    def where(x):
+        return [*(getattr(x.machine, name) for name in NAMES[:5]), x.loads.mass, x.loads.drag, x.drive.speed]
+
+    return eqx.tree_at(where, s, [values[name] for name in NAMES])
+
+
+def flat(values):
+    return jnp.concatenate([jnp.ravel(values[name]) for name in NAMES])
+
+
+def unflat(vector, like):
+    out, at = {}, 0
+    for name in NAMES:
+        size = like[name].size
+        out[name] = vector[at : at + size].reshape(like[name].shape)
+        at += size
+    return out
+
+
+def jam_outputs(s, mode=3):
+    """(parameters as multiples of their own value) -> amplitudes and foundation force; relative parameters scale all alike."""
+    base = numbers(s)
+    x0 = flat(base)
+
+    def outputs(factors):
+        jam = jv.jam_modes(with_numbers(s, unflat(x0 * factors, base))).select(mode, throw=False)
+        return jnp.append(jam.amplitude, jam.foundation_force)
+
+    return outputs, jnp.ones_like(x0)
+
+
+def central(f, x, h):
+    """Central differences. Noise floor: eps |f| / h; truncation: h^2 f'''/6, narrow peaks making f''' large."""
+    columns = []
+    for i in range(x.size):
+        step = jnp.zeros_like(x).at[i].set(h)
+        columns.append((f(x + step) - f(x - step)) / (2.0 * h))
+    return jnp.stack(columns, axis=-1)
+
+
+@pytest.fixture(scope="module", params=["published", "three_mass"])
+def case(request):
+    s = published(natural=(0.3, 0.36)).scene() if request.param == "published" else scene("three_mass", "balls", 35.0)
+    mode = 3 if request.param == "published" else jv.jam_modes(s).mode_numbers()[0]
+    outputs, x = jam_outputs(s, mode)
+    return outputs, x
+
+
+def test_implicit_gradient_is_the_finite_difference(case):
+    """Forward, reverse, jitted: all numbers of the machine, loads and drive; the step 1e-5 leaves an error of 1e-6."""
+    outputs, x = case
+    forward, reverse = jax.jit(jax.jacfwd(outputs))(x), jax.jit(jax.jacrev(outputs))(x)
+    scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
+    np.testing.assert_allclose(forward / scale, reverse / scale, atol=1e-12)
+    difference = central(jax.jit(outputs), x, 1e-5)
+    np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-6)
+    assert np.isfinite(forward).all() and (np.abs(forward).max(axis=0) > 0.0).all()
+
+
+def test_gradient_of_a_batch_is_the_batch_of_gradients():
+    outputs, x = jam_outputs(published(natural=(0.3, 0.36)).scene())
+    force = jax.jit(jax.grad(lambda v: outputs(v)[-1]))
+    batch = x[None, :] * jnp.asarray([0.99, 1.0, 1.01])[:, None]
+    np.testing.assert_allclose(jax.vmap(force)(batch), jnp.stack([force(v) for v in batch]), rtol=1e-9)
+
+
+def test_hessian_is_the_finite_difference_of_the_gradient():
+    s = published(natural=(0.3, 0.36)).scene()
+
+    def force(k):
+        moved = eqx.tree_at(lambda x: (x.machine.stiffness, x.machine.link_stiffness), s, (k[:2], k[2:]))
+        return jv.jam_modes(moved).select(3, throw=False).foundation_force
+
+    k = jnp.concatenate([s.machine.stiffness, s.machine.link_stiffness])
+    exact = jax.jit(jax.hessian(force))(k)
+    np.testing.assert_allclose(exact, exact.T, rtol=1e-9)
+    difference = central(jax.jit(jax.grad(force)), k, 1e-6)
+    np.testing.assert_allclose(exact, difference, rtol=1e-5, atol=1e-6 * float(jnp.max(jnp.abs(exact))))
+
+
+@eqx.filter_jit
+def everything(values, s, mode):
+    moved = with_numbers(s, values)
+    modes = jv.jam_modes(moved)
+    frequencies = jnp.sum(jv.natural_frequencies(moved))
+    return jnp.sum(modes.amplitude[mode - 1]) + modes.foundation_force[mode - 1] + frequencies
+
+
+gradient_of_everything = eqx.filter_jit(eqx.filter_grad(everything))
+
+
+def test_gradient_is_finite_where_machines_degenerate():
+    """Equal natural frequencies, n1 = n2, one support undamped, no supports: a sum over equal frequencies is smooth."""
+    s = published().scene()
+    mode3, mode5 = jnp.asarray(3), jnp.asarray(5)
+    decoupled = eqx.tree_at(lambda x: (x.machine.link_stiffness, x.machine.link_damping), s, (jnp.zeros(1), jnp.zeros(1)))
+    undamped = eqx.tree_at(lambda x: x.machine.damping, s, jnp.asarray([0.0, 0.02]))
+    floating = eqx.tree_at(lambda x: x.machine.stiffness, s, jnp.zeros(2))
+    for machine, mode in ((decoupled, mode5), (s, mode3), (undamped, mode3), (floating, mode3)):
+        base = numbers(machine)
+        gradient = gradient_of_everything(base, machine, mode)
+        assert all(np.isfinite(g).all() for g in gradient.values())
+        if machine is floating:  # a frequency starts from 0 as a root: it is counted as if it stayed there
+            continue
+        h = 1e-6
+        up, down = (everything({**base, "stiffness": base["stiffness"].at[0].add(d)}, machine, mode) for d in (h, -h))
+        np.testing.assert_allclose(gradient["stiffness"][0], (up - down) / (2 * h), rtol=1e-5)
+
+
+# Through the time integration: light loads, caught in mode 3
+
+EPS = 2e-3
+
+
+def damped():
+    return published(speed=1.5, eps=EPS, damping=0.05).scene()
+
+
+def moved(s, x):
+    """The scene with its stiffnesses and dampings, of supports and link, multiplied by x (6,)."""
+    m = s.machine
+    return eqx.tree_at(
+        lambda y: (y.machine.stiffness, y.machine.damping, y.machine.link_stiffness, y.machine.link_damping),
+        s,
+        (m.stiffness * x[:2], m.damping * x[2:4], m.link_stiffness * x[4:5], m.link_damping * x[5:]),
+    )
+
+
+def through_time(adjoint, until):
+    """The start is held: what the numbers change reaches the jam through the motion alone."""
+    s = damped()
+    start = jv.initial_state(s, "jam", mode=3)
+
+    def outputs(x):
+        run = jv.simulate(
+            moved(s, x),
+            until,
+            start=start,
+            save="window",
+            turns=4,
+            tolerance=1e-9,
+            adjoint=adjoint,
+            max_steps=2**15,
+            throw=False,
+        )
+        return jnp.append(run.amplitude, run.foundation_force)
+
+    return outputs
+
+
+def from_algebra(x):
+    jam = jv.jam_modes(moved(damped(), x)).select(3, throw=False)
+    return jnp.append(jam.amplitude, jam.foundation_force)
+
+
+def relative(gradient):
+    return gradient / jnp.max(jnp.abs(gradient), axis=1, keepdims=True)
+
+
+def test_forward_gradient_through_time_is_the_implicit_one():
+    """The jam is reached; the two differ by the order of the loads' share of the mass, eps = 2e-3."""
+    run, x = through_time(diffrax.ForwardMode(), 1000.0), jnp.ones(6)
+    gradient = jax.jit(jax.jacfwd(run))(x)
+    np.testing.assert_allclose(relative(gradient), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)
+    # The difference of two runs: steps that come out otherwise leave 1e-9 tolerance / 1e-3 step = 1e-6 of noise or more.
+    value = jax.jit(run)
+    ahead = (value(x.at[4].add(1e-3)) - value(x.at[4].add(-1e-3))) / 2e-3
+    np.testing.assert_allclose(gradient[:, 4], ahead, atol=1e-4 * float(jnp.max(jnp.abs(gradient))))
+
+
+def test_reverse_gradient_through_time_is_the_forward_one():
+    x = jnp.ones(6)
+    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 60.0)))(x)
+    reverse = jax.jit(jax.jacrev(through_time(None, 60.0)))(x)
+    np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_every_gradient_through_time_is_the_finite_difference():
+    x = jnp.ones(6)
+    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 1000.0)))(x)
+    reverse = jax.jit(jax.jacrev(through_time(None, 1000.0)))(x)
+    difference = central(jax.jit(through_time(diffrax.ForwardMode(), 1000.0)), x, 1e-3)
+    scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
+    np.testing.assert_allclose(reverse / scale, forward / scale, atol=1e-8)
+    np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-3)
+    np.testing.assert_allclose(relative(forward), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)

@@ -1,0 +1,256 @@
+"""The design layer: what may change, what is held, what is found."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, scene
+
+import jaxvib as jv
+from optimize import (
+    DesignSpace,
+    Quantity,
+    amplitude,
+    force_per_amplitude,
+    foundation_force,
+    hold,
+    jam_frequency,
+    load_design,
+    negative,
+    support_frequency_squared,
+    synthesize,
+    total,
+)
+from optimize.files import TEMPLATE
+
+FREE = {"machine.stiffness": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)}
+
+
+def antiphase_space(damping, **more):
+    """A machine far from the antiphase one; jam frequency 1 and n1^2 + n2^2 = 2/9 are held."""
+    start = published(damping=damping, natural=(0.2, 0.4), **more).scene()
+    return DesignSpace(start, FREE, [hold(jam_frequency(mode=3), 1.0), hold(support_frequency_squared(), 2 / 9)])
+
+
+def ratios(space, found):
+    """n2/n1 of the machine where each search ended; with rho = 1 that is the root of the stiffnesses' ratio."""
+    stiffness = jax.vmap(lambda z: space.at(z).machine.stiffness)(jnp.asarray(found.designs))
+    return np.sqrt(np.asarray(stiffness[:, 1] / stiffness[:, 0]))
+
+
+@pytest.fixture(scope="module")
+def light():
+    """200 random starts at dimensionless damping 1e-4, on mode 3 at rotor speed 3."""
+    space = antiphase_space(1e-4)
+    return space, synthesize(space, force_per_amplitude(mode=3), starts=200, verify=False)
+
+
+def test_random_starts_find_the_antiphase_machine(light):
+    space, found = light
+    assert found.starts == 200
+    assert found.same >= 190
+    assert np.mean(np.abs(ratios(space, found) - 1.0) < 0.02) >= 0.95
+    assert found.converged >= 190
+
+
+def test_what_is_held_is_kept(light):
+    space, found = light
+    for z in found.designs[::40]:
+        s = space.at(jnp.asarray(z))
+        assert abs(float(jam_frequency(mode=3)(s)) - 1.0) < 1e-7
+        assert abs(float(support_frequency_squared()(s)) * 4.5 - 1.0) < 1e-7
+    assert np.all((found.designs >= 0.0) & (found.designs <= 1.0))
+
+
+def test_the_winner_is_the_least_on_a_dense_scan(light):
+    """Two quantities held leave a curve of machines; the search's winner is its lowest point."""
+    _, found = light
+
+    def on_curve(angle):
+        """n1, n2 from the angle; the link is what brings the jam to frequency 1, found by halving."""
+        n1, n2 = np.sqrt(2 / 9) * np.cos(angle), np.sqrt(2 / 9) * np.sin(angle)
+
+        def build(link):
+            return published(damping=1e-4, natural=(n1, n2), link_natural=link).scene()
+
+        low, high = 0.55, 0.8
+        for _ in range(50):
+            middle = (low + high) / 2.0
+            low, high = (middle, high) if float(jam_frequency(mode=3)(build(middle))) < 1.0 else (low, middle)
+        return float(force_per_amplitude(mode=3)(build((low + high) / 2.0)))
+
+    best = np.arctan2(*np.sqrt(found.after.parameters["machine.stiffness"])[::-1])
+    scan = [on_curve(a) for a in best + np.array([-0.2, -0.01, -1e-4, 0.0, 1e-4, 0.01, 0.2])]
+    assert np.argmin(scan) == 3
+    np.testing.assert_allclose(scan[3], found.after.force_per_amplitude, rtol=1e-5)
+
+
+def test_antiphase_ratio_tends_to_one_as_damping_goes():
+    off = []
+    for damping in (1e-3, 1e-4, 1e-5):
+        space = antiphase_space(damping)
+        found = synthesize(space, force_per_amplitude(mode=3), starts=8, verify=False)
+        off.append(abs(ratios(space, found)[int(np.argmin(found.values))] - 1.0))
+    assert off[0] > 2.0 * off[1] > 4.0 * off[2]
+    assert off[2] < 5e-3
+
+
+def test_winner_holds_in_the_full_equations():
+    found = synthesize(antiphase_space(1e-2), force_per_amplitude(mode=3), starts=8)
+    assert found.verified is not None and found.run is not None
+    assert found.run.drift < 1e-6
+    np.testing.assert_allclose(found.verified.omega, found.after.omega, rtol=1e-3)
+    np.testing.assert_allclose(found.verified.amplitude, found.after.amplitude, rtol=1e-3)
+    np.testing.assert_allclose(found.verified.force_per_amplitude, found.after.force_per_amplitude, rtol=1e-2)
+    assert found.after.force_per_amplitude < found.before.force_per_amplitude / 5.0
+    assert "verified" in found.summary()
+    assert len(found.plot().axes) == 1 and len(found.plot_convergence().axes) == 1
+
+
+def test_same_seed_same_answer():
+    space = antiphase_space(1e-2)
+    one, two = (synthesize(space, force_per_amplitude(mode=3), starts=4, seed=7, verify=False) for _ in range(2))
+    np.testing.assert_array_equal(one.designs, two.designs)
+    np.testing.assert_array_equal(one.history, two.history)
+
+
+def test_without_held_quantities_the_best_may_lie_on_a_bound():
+    s = scene("two_mass")
+    space = DesignSpace(s, {"machine.stiffness[0]": (1e4, 1e5), "loads.drag": (1.0, 2.0)})
+    found = synthesize(space, negative(amplitude(mode=3, of=1)), starts=8, verify=False)
+    grid = [
+        float(amplitude(mode=3, of=1)(space.at(jnp.array([a, b])))) for a in np.linspace(0, 1, 9) for b in np.linspace(0, 1, 9)
+    ]
+    assert -found.values.min() >= max(grid) - 1e-12
+    assert found.done.any()
+
+
+def test_one_mass_amplitude_is_that_of_its_platform():
+    s = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+        jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5),
+        jv.ConstantSpeed(60.0),
+    )
+    jam = jv.jam_modes(s).select(1)
+    np.testing.assert_allclose(force_per_amplitude(mode=1)(s), jam.foundation_force / jam.amplitude[0], rtol=1e-14)
+
+
+def test_design_vector_and_scene_are_inverse():
+    s = scene("three_mass", "pendulums")
+    space = DesignSpace(
+        s,
+        {"machine.mass": (1.0, 100.0), "loads.mass[2]": (0.1, 2.0), "drive.speed": ("600 rpm", "3000 rpm")},
+    )
+    z = jnp.linspace(0.1, 0.9, space.size)
+    np.testing.assert_allclose(space.where(space.at(z)), z, rtol=1e-12)
+    np.testing.assert_allclose(space.at(space.where(s)).machine.mass, s.machine.mass, rtol=1e-12)
+    assert set(space.parameters(s)) == {"machine.mass", "loads.mass[2]", "drive.speed"}
+    assert space.at(z).loads.mass[0] == s.loads.mass[0]
+
+
+def test_gradient_of_a_quantity_is_that_of_finite_differences():
+    s = published(damping=0.01).scene()
+    for quantity in (
+        force_per_amplitude(mode=3),
+        foundation_force(mode=3),
+        jam_frequency(mode=3),
+        amplitude(mode=3, of=2),
+    ):
+
+        def value(k, quantity=quantity):
+            return quantity(eqx.tree_at(lambda s: s.machine.stiffness, s, k))
+
+        k = s.machine.stiffness
+        step = 1e-6  # halves of the digits: truncation 1e-9, rounding 1e-9 of the value
+        finite = [(value(k.at[i].add(step)) - value(k.at[i].add(-step))) / (2 * step) for i in range(2)]
+        exact = jax.grad(value)(k)
+        np.testing.assert_allclose(exact, finite, rtol=1e-6, atol=1e-7 * float(value(k)))
+
+
+def space_of(free, held=()):
+    return DesignSpace(scene("two_mass"), free, held)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: space_of({}), "free is empty"),
+        (lambda: space_of({"machine.stifness": (1, 2)}), "did you mean 'machine.stiffness'"),
+        (lambda: space_of({"machine.stiffness[5]": (1, 2)}), "machine.stiffness has 2 entries"),
+        (lambda: space_of({"loads.drag[0]": (1, 2)}), "loads.drag has 1 entries"),
+        (lambda: space_of({"machine.stiffness": (2.0, 1.0)}), "the first must be less than the second"),
+        (lambda: space_of({"machine.stiffness": (-2.0, 1.0)}), "it must be at least 0"),
+        (lambda: space_of({"machine.stiffness": ("1 kg", "2 kg")}), "is not in N/m"),
+        (lambda: space_of({"machine.stiffness": 3.0}), "give the bounds as (low, high)"),
+        (lambda: space_of({"machine.stiffness": (1, 2), "machine.stiffness[0]": (1, 2)}), "is free already"),
+        (lambda: space_of({"loads.drag": (1, 2)}, [hold(total("machine.stiffness"))]), "more must be free than held"),
+        (lambda: space_of({"machine.stiffness": (1, 2)}, [jam_frequency(mode=3)]), "wrap quantities in optimize.hold"),
+        (lambda: hold(jam_frequency(mode=3), 0.0), "other than 0"),
+        (lambda: hold(3.0), "must be a Quantity"),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), 3.0), "must be a Quantity"),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=9)), "numbered 1 to 5"),
+        (
+            lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=(1, 1))),
+            "pair of different platforms",
+        ),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=4)), "of 1 to 2"),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), starts=0), "starts is 0"),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), rate=2.0), "rate is 2.0"),
+    ],
+)
+def test_wrong_designs_are_said_in_one_sentence(make, says):
+    with pytest.raises(jv.InputError) as caught:
+        make()
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_possible_start_is_a_named_failure():
+    space = DesignSpace(published(speed=0.3).scene(), {"machine.stiffness": (0.1, 0.3)})
+    with pytest.raises(jv.ComputationError) as caught:
+        synthesize(space, foundation_force(mode=4), starts=4)
+    assert caught.value.status == "no_feasible_start"
+
+
+def test_own_quantities_can_be_sought():
+    space = DesignSpace(scene("two_mass"), {"machine.stiffness": (1e4, 1e5)})
+    wish = Quantity("distance", "N/m", lambda s, modes: jnp.sum((s.machine.stiffness - 3e4) ** 2))
+    found = synthesize(space, wish, starts=4)
+    np.testing.assert_allclose(found.after.parameters["machine.stiffness"], [3e4, 3e4], rtol=1e-3)
+    assert found.verified is None
+
+
+def test_design_file_is_read(tmp_path):
+    (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
+    (tmp_path / "design.toml").write_text(TEMPLATE)
+    design = load_design(tmp_path / "design.toml")
+    assert design.space.size == 3
+    assert design.objective.name == "force_per_amplitude" and design.objective.of == (1, 2)
+    assert [h.quantity.name for h in design.space.held] == ["jam_frequency", "support_frequency_squared"]
+    np.testing.assert_allclose(design.space.held[0].value, 570 * np.pi / 30)
+    assert design.search == {"starts": 256, "seed": 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("[free]", "[fre]"), "did you mean 'free'"),
+        (('scene = "machine.toml"', ""), "scene is missing"),
+        (('scene = "machine.toml"', 'scene = "no.toml"'), "cannot be read"),
+        (('"force_per_amplitude"', '"force"'), "objective.quantity is 'force'"),
+        (('quantity = "force_per_amplitude"', "x = 1"), "objective.quantity is missing"),
+        (("of = [1, 2]", "off = [1, 2]"), "did you mean 'of'"),
+        (('value = "570 rpm"', 'value = "570 kg"'), "is not in rad/s"),
+        (("mode = 3", 'mode = "three"'), "mode is 'three'"),
+        (("starts = 256", "start = 256"), "did you mean 'starts'"),
+        (("starts = 256", "starts = 0.5"), "must be a whole number"),
+        (("[free]", "[free"), "is no TOML file"),
+    ],
+)
+def test_wrong_design_files_are_said_in_one_sentence(tmp_path, change, says):
+    (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
+    (tmp_path / "design.toml").write_text(TEMPLATE.replace(*change))
+    with pytest.raises(jv.InputError) as caught:
+        load_design(tmp_path / "design.toml")
+    assert says in str(caught.value)
