@@ -39,7 +39,14 @@ def heavy():
     return jv.Scene(machines()["two_mass"], loads, jv.ConstantSpeed(150.0), jv.Gravity())
 
 
+def two_sizes():
+    """Loads of different mass that obey the same equation, so that they stay together."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+    return jv.Scene(machine, jv.balls(count=2, mass=[0.6, 1.2], radius=0.1, drag=[0.7, 1.4]), jv.ConstantSpeed(50.0))
+
+
 SCENES = {
+    "loads of two sizes": (two_sizes, {"omega": 27.0}),
     "published": (lambda: published(eps=0.05).scene(), {"mode": 3}),
     "gravity": (heavy, {"omega": 60.0}),
     "two directions": (shaker, {"omega": 29.0}),
@@ -231,6 +238,12 @@ def test_limits_converge_or_say_why(form, omega):
         assert np.max(np.abs(integrate(scene, orbit, 1)[-1])) < 1e-8 * max(1.0, float(orbit.multiplier))
     else:
         assert bool(orbit.status == jv.OrbitStatus.not_converged) or bool(orbit.status == jv.OrbitStatus.coarse)
+
+
+def test_loads_that_would_part_are_not_called_stable():
+    scene = eqx.tree_at(lambda s: s.loads.drag, two_sizes(), jnp.asarray([0.7, 1.5]))
+    orbit = jv.jam_orbit(scene, omega=27.0)
+    assert bool(orbit.status == jv.OrbitStatus.held) and not bool(orbit.stable)
 
 
 def test_wrong_questions_are_refused():

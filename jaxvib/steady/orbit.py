@@ -41,6 +41,7 @@ class OrbitStatus(eqx.Enumeration):
     absent = "this mode does not exist at this rotor speed"
     not_converged = "no periodic motion was found: the torque balance could not be met"
     coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
+    held = "the loads differ and would part: this is their motion as one body, which nothing holds together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
 
 
@@ -132,8 +133,9 @@ def jam_orbit(
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w C
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
-    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Equal
-    loads stay together by themselves; loads that differ are taken as one body, as if they were held together.
+    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
+    stay together by themselves where kappa R and b_W R/m of each are the same, their masses may differ; else their motion as
+    one body is returned, never `stable`, with the status `held`.
 
     **Arguments**, one of the first three
 
@@ -201,7 +203,7 @@ def jam_orbit(
         if traced and len(tried) == 1:
             break
         found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, direction, which, many, steps, accuracy)
-        if not bool(found.status == OrbitStatus.coarse):
+        if not float(found.error) > accuracy:
             break
     if traced:
         found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy)
@@ -267,9 +269,12 @@ def orbits(
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), lag_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
+    parts = _part(scene)
+
     def status(is_met: Array, is_flat: Array, is_good: Array) -> OrbitStatus:
         known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
         known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
+        known = OrbitStatus.where(parts, OrbitStatus.held, known)
         return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
 
     def or_nan(values: Array) -> Array:
@@ -280,7 +285,7 @@ def orbits(
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
-        stable=met & (largest < 1.0),
+        stable=met & (largest < 1.0) & ~parts,
         multiplier=or_nan(largest),
         multipliers=or_nan(multipliers),
         trivial=or_nan(trivial),
@@ -297,6 +302,17 @@ def orbits(
         count=scene.loads.count,
     )
     return orbit, growth
+
+
+def _part(scene: Scene) -> Array:
+    """Whether the loads' own equations differ, kappa R phi'' + (b_W R/m) (phi' - n) + e'(phi) . a = 0 of each."""
+    loads = circular_loads(scene)
+
+    def differs(value: Array) -> Array:
+        each = jnp.broadcast_to(value, (loads.count,))
+        return jnp.max(each) - jnp.min(each) > 1e3 * jnp.finfo(each.dtype).eps * jnp.max(each)
+
+    return differs(loads.inertia_factor() * loads.radius) | differs(loads.drag * loads.radius / loads.mass)
 
 
 def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
