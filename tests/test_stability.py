@@ -12,6 +12,7 @@ from scenes import machines, published
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from jaxvib.study.onset import onset
 
 
 def gravity():
@@ -112,6 +113,21 @@ def test_time_integration_on_both_sides_of_a_special_point(kind, apart):
     assert sides[0][0] != sides[1][0]
     for stable, grown, multiplier in sides:
         assert stable == (not grown) == (multiplier < 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, between, omega, eps",
+    [
+        ("torus", (0.02, 0.05), (0.34, 0.9), 0.0336),
+        ("torus", (0.05, 0.15), (1.1, 2.0), 0.0928),
+        ("symmetry", (0.2, 0.3), (0.9, 1.01), 0.273),
+    ],
+)
+def test_load_mass_from_which_on_odd_modes_are_not_stable_everywhere(kind, between, omega, eps):
+    """eps = m/(kappa M2S): self-pins, confirmed by the time integrations above on both sides at eps = 0.3."""
+    found = onset(lambda x: published(eps=x).scene(), kind, between, omega=omega)
+    np.testing.assert_allclose(found, eps, rtol=4e-3)
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def jam_orbit(
     ...                         rho=1.0, eps=0.05, beta=1.0, speed=3.0)
     >>> orbit = jv.jam_orbit(form.scene(), mode=3)
     >>> round(float(orbit.omega), 6), bool(orbit.stable)
-    (0.97218, True)
+    (0.972666, True)
 
     Source: the antiphase paper, equations (2) and (21), solved without its expansion in eps.
     """
