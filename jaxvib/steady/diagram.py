@@ -190,18 +190,20 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     low, high = grid.omega[row].copy(), grid.omega[row + 1].copy()
     f_low, f_high = tests[row, which], tests[row + 1, which]
     middle, values = low, None
-    # False position that never keeps an end twice (Illinois), with a halving every third time.
-    for turn in range(40):
-        aim = (low * f_high - high * f_low) / (f_high - f_low)
-        middle = np.where((turn % 3 == 2) | ~((aim > low) & (aim < high)), (low + high) / 2.0, aim)
+    # False position that never keeps an end twice (Illinois), with a halving now and then.
+    for turn in range(60):
+        before = middle
+        with np.errstate(all="ignore"):
+            aim = (low * f_high - high * f_low) / (f_high - f_low)
+        middle = np.where((turn % 5 == 4) | ~((aim > low) & (aim < high)), (low + high) / 2.0, aim)
         values = solve(middle)
         f = read(values)[pick, which]
+        if np.all((np.abs(middle - before) < 1e-10 * middle) | ~np.isfinite(f)):
+            break
         left = f * f_low > 0.0
         f_high = np.where(left, f_high / 2.0, f)
         f_low = np.where(left, f, f_low / 2.0)
         low, high = np.where(left, middle, low), np.where(left, high, middle)
-        if np.all((high - low < 1e-10 * high) | (f == 0.0) | ~np.isfinite(f)):
-            break
     points = []
     for k in range(row.size):
         s = values.multipliers[k]
