@@ -26,7 +26,9 @@ from jaxvib.steady.balance import (
 )
 from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
+from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
+from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
@@ -48,6 +50,7 @@ __all__ = [
     "Drive",
     "Dynamics",
     "Effect",
+    "ExactBranches",
     "Folds",
     "Gravity",
     "InputError",
@@ -57,10 +60,13 @@ __all__ = [
     "Loads",
     "Machine",
     "Measured",
+    "Orbit",
+    "OrbitStatus",
     "Platforms",
     "Run",
     "RunStatus",
     "Scene",
+    "SpecialPoint",
     "SpinUp",
     "State",
     "Trajectory",
@@ -79,6 +85,7 @@ __all__ = [
     "foundation_force",
     "initial_state",
     "jam_modes",
+    "jam_orbit",
     "jam_rotor_speed",
     "load_scene",
     "natural_frequencies",

@@ -1,0 +1,185 @@
+"""Floquet multipliers: whether a periodic jam lasts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.collocation import Grid, Harmonics, Motion, body, circle, has_half_turn, load_torque
+from jaxvib.steady.response import loaded_mass, natural_frequencies
+
+__all__ = ["Floquet", "floquet", "steps_for"]
+
+_PHASE = 0.7
+"""What the fastest part of the carrier turns through in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
+
+# The tableau's last stage is the step itself, there to be evaluated for the next one.
+_TABLEAU = diffrax.Dopri8.tableau
+_NODES = np.concatenate([[0.0], _TABLEAU.c[:-1]])
+_ROWS = np.stack([np.pad(row, (0, len(_NODES) - len(row))) for row in [np.zeros(0), *_TABLEAU.a_lower[:-1]]])
+_WEIGHTS = _TABLEAU.b_sol[:-1]
+
+
+class Floquet(NamedTuple):
+    """How small disturbances of a periodic jam grow, trailing axis over the orbits.
+
+    **Attributes**: `roots` (2 nd + 1, P) complex: growth over a turn of the grid, that is half a period followed by the
+    half-turn where the motion has that symmetry (multipliers are their squares), else a period (they are the multipliers);
+    the trivial one, a shift in time, is taken out. `inner` (2, P): the same for two loads that part while the others
+    stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
+    """
+
+    roots: Array
+    inner: Array | None
+    trivial: Array
+
+
+def steps_for(scene: Scene, omega: Array) -> Array:
+    """How many integration steps a turn of the grid asks for at the load speed `omega` (rad/s)."""
+    carrier = scene.machine.carrier()
+    half = jnp.linalg.inv(jnp.linalg.cholesky(loaded_mass(scene)))
+    decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
+    fastest = jnp.maximum(jnp.max(natural_frequencies(scene)), decay)
+    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
+
+
+class _Coefficients(NamedTuple):
+    """What of the orbit enters the linear equations at one angle; (np, P) and (P,)."""
+
+    moving: Array
+    moving1: Array
+    moving2: Array
+    by_angle: Array
+    by_rate: Array
+
+
+def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, steps: int | Array) -> Floquet:
+    """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
+
+    With Q = q + P t d, P = M^-1 B^T S, t = e'(phi), d the disturbance of the loads and ' = d/dtheta:
+
+        Q'' = - M^-1 C/Omega q' - M^-1 K/Omega^2 q,                                          q = Q - P t d
+        I Omega^2 d'' = T_rate Omega d' + (T_phi + S e.a) d - S Omega^2 t.B q''
+
+    and for loads that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last term.
+    Fixed steps of Dormand and Prince's order 8, of the same length for all orbits.
+
+    **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
+    derivatives exist) or a scalar array.
+    """
+    carrier, whole = scene.machine.carrier(), body(scene)
+    mass = loaded_mass(scene)
+    nd = mass.shape[0]
+    inverse = jnp.linalg.inv(mass)
+    stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping
+    shift = inverse @ carrier.port.T * whole.unbalance
+    length = jnp.max(jnp.abs(shift))
+    shift = shift / length
+    port = carrier.port * length
+    mobility = port @ shift
+    omega, speed = motion.omega, motion.rotor_speed
+    lanes, w = omega.shape[0], omega[None, None]
+    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    h = turn / steps
+
+    def coefficients(theta: Array) -> _Coefficients:
+        lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
+        phi, rate = theta[:, None] + lag, 1.0 + lag1
+        point, moving = circle(scene, phi)
+        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        torque = jax.vmap(lambda p, r, w, n: load_torque(scene, p, w * r, n), in_axes=-1, out_axes=-1)
+        ones = jnp.ones_like(phi)
+        by_angle = jax.jvp(lambda p: torque(p, rate, omega, speed), (phi,), (ones,))[1]
+        by_rate = jax.jvp(lambda r: torque(phi, r, omega, speed), (rate,), (ones,))[1]
+        stiff = by_angle + whole.unbalance * jnp.sum(point * acceleration, axis=0)
+        moving2 = -point * lag2[None] - moving * rate[None] ** 2
+        return _Coefficients(moving, -point * rate[None], moving2, stiff / omega[None] ** 2, by_rate / omega[None] ** 2)
+
+    def full(c: _Coefficients, x: Array) -> Array:
+        q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[None, 2 * nd], x[None, 2 * nd + 1]
+        t, t1, t2 = (v[:, None, :] for v in (c.moving, c.moving1, c.moving2))
+        below = q - _times(shift, t * d)
+        below1 = q1 - _times(shift, t * d1 + t1 * d)
+        q2 = -_times(damping, below1) / w - _times(stiffness, below) / w**2
+        pushed = _times(port, q2) - _times(mobility, 2.0 * t1 * d1 + t2 * d)
+        inertia = whole.inertia - whole.unbalance * jnp.sum(t * _times(mobility, t), axis=0, keepdims=True)
+        vibration = whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
+        torque = c.by_rate[None, None] * d1 + c.by_angle[None, None] * d - vibration
+        return jnp.concatenate([q1, q2, d1, torque / inertia])
+
+    def apart(c: _Coefficients, x: Array) -> Array:
+        return jnp.stack([x[1], (c.by_rate[None] * x[1] + c.by_angle[None] * x[0]) / whole.inertia])
+
+    def start(n: int) -> Array:
+        return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
+
+    fields = (full, apart) if scene.loads.count > 1 else (full,)
+    begin = tuple(start(n) for n in (2 * nd + 2, 2)[: len(fields)])
+
+    def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        at = coefficients((k + _NODES) * h)
+
+        # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
+        def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
+            c = _Coefficients(at.moving[:, i], at.moving1[:, i], at.moving2[:, i], at.by_angle[i], at.by_rate[i])
+            return tuple(
+                rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
+                for field, x, rate in zip(fields, state, rates, strict=True)
+            )
+
+        rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
+        rates = jax.lax.fori_loop(0, len(_NODES), stage, rates)
+        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+
+    rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
+    end = jax.lax.fori_loop(0, steps, step, begin)
+    flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), [1.0, 1.0]])
+    monodromy = flip[:, None, None] * end[0]
+
+    # A shift in time: q' and phi' along the orbit itself.
+    zero = jnp.zeros((1,), dtype=omega.dtype)
+    at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
+    lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, zero, k) for k in range(3))
+    _, moving = circle(scene, lag)
+    along = jnp.concatenate([
+        at1 + _times(shift, moving * (1.0 + lag1)[None]),
+        -_times(damping, at1) / w - _times(stiffness, at) / w**2,
+        1.0 + lag1[None],
+        lag2[None],
+    ])[:, 0]  # fmt: skip
+    trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
+    roots = jnp.linalg.eigvals(rest).T
+    inner = jnp.linalg.eigvals(jnp.moveaxis(end[1], -1, 0)).T if len(end) > 1 else None
+    return Floquet(roots, inner, trivial)
+
+
+def _signal(orders: np.ndarray, harmonics: Array, theta: Array, derivative: int) -> Array:
+    """A derivative of Re sum_k c_k exp(i k theta) at the angles theta (n,); c (..., K, P) gives (..., n, P)."""
+    k = jnp.asarray(orders, dtype=theta.dtype)
+    wave = (1j * k[None]) ** derivative * jnp.exp(1j * theta[:, None] * k[None])
+    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum("nk,...kp->...np", wave.imag, harmonics.imag)
+
+
+def _times(matrix: Array, vectors: Array) -> Array:
+    """Matrix (a, b) times (b, columns, P); written out where it is small, so that it melts into what surrounds it."""
+    a, b = matrix.shape
+    if a * b > 16:
+        return jnp.tensordot(matrix, vectors, 1)
+    return jnp.stack([sum(matrix[i, k] * vectors[k] for k in range(b)) for i in range(a)])
+
+
+def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:
+    """The eigenvalue that belongs to the eigenvector `known`, and a matrix that has the others."""
+    unit = known / jnp.linalg.norm(known)
+    mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
+    mirror = mirror / jnp.linalg.norm(mirror)
+    turned = matrix - 2.0 * jnp.outer(mirror, mirror @ matrix)
+    turned = turned - 2.0 * jnp.outer(turned @ mirror, mirror)
+    return unit @ (matrix @ unit), turned[1:, 1:]
