@@ -72,6 +72,8 @@ def load_design(path: str | Path) -> Design:
     values = [_quantity(table, f"hold[{k}]", ("value",)) for k, table in enumerate(held)]
     space = DesignSpace(scene, dict(tables["free"]), [hold(q, more.get("value")) for q, more in values])
     objective, more = _quantity(tables["objective"], "objective", ("maximize",))
+    if not isinstance(more.get("maximize", False), bool):
+        raise InputError("objective.maximize", f"is {more['maximize']!r}; write true or false, without quotes")
     if more.get("maximize", False):
         objective = negative(objective)
     search = dict(tables.get("search", {}))

@@ -12,6 +12,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import FIELD_UNITS
 from jaxvib.steady.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.response import loaded_mass, magnitude
 
@@ -155,21 +156,25 @@ def support_frequency_squared() -> Quantity:
 
 
 def total(field: str) -> Quantity:
-    """The sum of an array of the scene, such as "machine.stiffness" (N/m).
+    """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
+
+    **Raises** `InputError` for a name that no scene has.
 
     >>> from optimize import total
-    >>> total("machine.stiffness").name
-    'total machine.stiffness'
+    >>> total("machine.stiffness").unit
+    'N/m'
     """
+    part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
+    if part not in ("machine", "loads") or name not in FIELD_UNITS:
+        raise InputError("field", f"is {field!r}; it must name numbers of a scene, for example 'machine.stiffness'")
 
     def summed(scene: Scene, _: JamModes) -> Array:
-        part, name = [*field.split(".", 1), ""][:2]
-        leaf = getattr(getattr(scene, part, None), name, None)
+        leaf = getattr(getattr(scene, part), name, None)
         if not isinstance(leaf, jax.Array):
-            raise InputError("of", f"is {field!r}; it must name numbers of the scene such as machine.stiffness")
+            raise InputError("field", f"is {field!r}, which this scene does not have")
         return jnp.sum(leaf)
 
-    return Quantity(f"total {field}", "", summed)
+    return Quantity(f"total {field}", FIELD_UNITS[name], summed)
 
 
 def negative(quantity: Quantity) -> Quantity:

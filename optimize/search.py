@@ -130,22 +130,28 @@ def _restored(search: Search, z: np.ndarray, steps: int) -> Point:
 
 
 class Starts(NamedTuple):
-    """Designs to start from: `z` (starts, d), and how many had to be `drawn` to find as many that are possible."""
+    """Designs to start from: `z` (starts, d), and how many had to be `drawn` to find as many that are possible; how many of
+    those have the objective, `existing`, and by how much the `nearest` of them is off what is held."""
 
     z: np.ndarray
     drawn: int
+    existing: int
+    nearest: float
 
 
 def draw_starts(search: Search, starts: int, seed: int, rounds: int = 20) -> Starts:
     """Random designs in the bounds, moved onto what is held; those where the objective does not exist are drawn anew."""
     random = np.random.default_rng(seed)
     found = np.zeros((0, search.space.size))
-    drawn = 0
+    drawn, existing, nearest = 0, 0, np.inf
     while len(found) < starts and drawn < rounds * starts:
         point = _restored(search, random.uniform(size=(starts, search.space.size)), 6)
         found = np.concatenate([found, point.z[point.good(_FEASIBLE)]])
         drawn += starts
-    return Starts(found[:starts], drawn)
+        there = np.all(np.isfinite(point.values), axis=1)
+        existing += int(np.sum(there))
+        nearest = min([nearest, *np.max(np.abs(point.values[there, 1:]), axis=1, initial=0.0)])
+    return Starts(found[:starts], drawn, existing, nearest)
 
 
 def descend(search: Search, z: np.ndarray, steps: int, rate: float, tell: Tell) -> tuple[np.ndarray, np.ndarray]:

@@ -14,23 +14,11 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, number
+from jaxvib.machine.units import FIELD_UNITS, Number, number
 from jaxvib.steady.jam import JamModes
 from optimize.quantities import Quantity
 
 __all__ = ["DesignSpace", "Held", "hold"]
-
-_UNITS = {
-    "mass": "kg",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "link_stiffness": "N/m",
-    "link_damping": "N s/m",
-    "radius": "m",
-    "drag": "N s/m",
-    "inertia": "kg m^2",
-    "speed": "rad/s",
-}
 
 
 class Held(eqx.Module):
@@ -173,12 +161,16 @@ def _numbers_of(scene: Scene) -> dict[str, Array]:
     for part in ("machine", "loads", "drive"):
         fields = getattr(scene, part)
         for name in type(fields).__dataclass_fields__:
-            if isinstance(getattr(fields, name), jax.Array) and name in _UNITS and getattr(fields, name).size:
+            if isinstance(getattr(fields, name), jax.Array) and name in FIELD_UNITS and getattr(fields, name).size:
                 found[f"{part}.{name}"] = getattr(fields, name)
     return found
 
 
 def _freed(scene: Scene, name: str, bounds: tuple[Number, Number]) -> _Free:
+    if isinstance(bounds, Mapping):
+        raise InputError(
+            f"free.{name}", f'is a table; write the whole name in quotes, for example "{name}.{next(iter(bounds), "")}"'
+        )
     match = re.fullmatch(r"([a-z_.]+)(?:\[(\d+)\])?", name)
     there = _numbers_of(scene)
     if match is None or match[1] not in there:
@@ -190,7 +182,7 @@ def _freed(scene: Scene, name: str, bounds: tuple[Number, Number]) -> _Free:
     if not isinstance(bounds, (list, tuple)) or len(bounds) != 2:
         raise InputError(f"free.{name}", f"is {bounds!r}; give the bounds as (low, high)")
     path = tuple(match[1].split("."))
-    low, high = (float(number(b, _UNITS[path[-1]], f"free.{name}", low=0.0)) for b in bounds)
+    low, high = (float(number(b, FIELD_UNITS[path[-1]], f"free.{name}", low=0.0)) for b in bounds)
     if not low < high:
         raise InputError(f"free.{name}", f"has bounds {low:g} and {high:g}; the first must be less than the second")
     size = 1 if index is not None else leaf.size

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvib.draw.charts import before_after, convergence
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import count
 from jaxvib.motion.observables import relative_amplitude
@@ -39,8 +40,7 @@ class Outcome:
     """A machine in numbers, in one jam mode.
 
     **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m
-    and `foundation_force` N, zero to peak; `force_per_amplitude` N/m; `objective` what the search made small. NaN
-    where the mode does not exist.
+    and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not exist.
     """
 
     parameters: dict[str, float | list[float]]
@@ -49,7 +49,6 @@ class Outcome:
     amplitude: tuple[float, ...]
     foundation_force: float
     force_per_amplitude: float
-    objective: float
 
     def as_dict(self) -> dict[str, Any]:
         """The same for JSON: freed numbers beside the quantities, None where there is no number."""
@@ -71,7 +70,8 @@ class Synthesis:
     """What a search found.
 
     **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
-    integration of the full equations (None if not asked for), from `run`; `starts` searches made, from `drawn` random designs;
+    integration of the full equations from `run` (both None where that was not done or failed: `unverified` says why); `starts`
+    searches made, from `drawn` random designs;
     `converged` how many of them ended where no free number can improve; `same` how many ended at the best design; `designs`
     (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history` (iterations,
     starts) of the objective; `objective` and `unit` its name and unit.
@@ -82,6 +82,7 @@ class Synthesis:
     after: Outcome
     verified: Outcome | None
     run: Run | None
+    unverified: str
     starts: int
     drawn: int
     converged: int
@@ -107,15 +108,22 @@ class Synthesis:
                 )
             else:
                 lines.append("    this jam mode does not exist")
+        if self.unverified:
+            lines.append(f"  not verified: {self.unverified}")
         return "\n".join(lines)
 
     def plot(self) -> Figure:
         """Every quantity after the search against before. **Returns** a matplotlib figure."""
-        return before_after(_flat(self.before), _flat(self.after), title=f"search for least {self.objective}")
+        return before_after(_flat(self.before), _flat(self.after), title=f"search for {wanted(self.objective)}")
 
     def plot_convergence(self) -> Figure:
         """The objective of every start over the iterations. **Returns** a matplotlib figure."""
-        return convergence(self.history, label=f"{self.objective}, {self.unit}".rstrip(", "))
+        return convergence(self.history, best=int(np.argmin(self.values)), label=f"{self.objective}, {self.unit}".rstrip(", "))
+
+
+def wanted(objective: str) -> str:
+    """What a search is after, in words."""
+    return f"greatest {objective.removeprefix('negative ')}" if objective.startswith("negative ") else f"least {objective}"
 
 
 def _show(value: float | list[float]) -> str:
@@ -188,6 +196,13 @@ def synthesize(
     if objective.mode is not None:
         jam_modes(space.scene).select(objective.mode, throw=False)  # says which numbers there are
     tell = progress or (lambda _what, _share: None)
+    if not isinstance(space.scene.drive, ConstantSpeed):
+        raise InputError("drive", f"is {space.scene.drive.kind!r}; a design is sought at one speed, give a ConstantSpeed")
+    if space.scene.drive.speed.dtype != jnp.float64:
+        raise InputError(
+            "scene", 'is in float32; a search needs jax.config.update("jax_enable_x64", True) before the scene is built'
+        )
+    count(seed, "seed", low=0)
     search = Search(space, objective)
 
     tell("drawing starts", 0.0)
@@ -195,8 +210,9 @@ def synthesize(
     if len(drawn.z) == 0:
         raise ComputationError(
             "no_feasible_start",
-            f"of {drawn.drawn} random designs in the bounds none has {objective.name} and keeps what is held; "
-            "widen the bounds, hold other values or ask for another mode",
+            f"of {drawn.drawn} random designs in the bounds {drawn.existing} have {objective.name}, and none of those keeps "
+            f"what is held (the nearest is off by {drawn.nearest:.2g} of the value); widen the bounds, hold other values or "
+            "ask for another mode",
         )
     z, descent = descend(search, drawn.z, iterations, rate, lambda share: tell("descending", 0.1 + 0.4 * share))
     ends = polish(search, z, polishing, lambda share: tell("polishing", 0.5 + 0.4 * share))
@@ -207,7 +223,16 @@ def synthesize(
     best = int(np.argmin(values))
     scene = space.at(jnp.asarray(ends.z[best]))
     tell("checking by time integration", 0.9)
-    run = settle(scene, mode=objective.mode) if verify and objective.mode is not None else None
+    run, unverified = None, ""
+    if objective.mode is None:
+        unverified = "the objective belongs to no jam mode that could be integrated"
+    elif not verify:
+        unverified = "not asked for"
+    else:
+        try:
+            run = settle(scene, mode=objective.mode)
+        except ComputationError as error:  # the machine that was found is worth more than the check that failed
+            unverified = str(error)
     tell("done", 1.0)
     return Synthesis(
         scene=scene,
@@ -215,6 +240,7 @@ def synthesize(
         after=_by_algebra(space, scene, objective),
         verified=None if run is None else _by_run(space, run, objective),
         run=run,
+        unverified=unverified,
         starts=len(drawn.z),
         drawn=drawn.drawn,
         converged=int(np.sum(done)),
@@ -233,7 +259,7 @@ def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcom
     parameters = space.parameters(scene)
     if mode is None:
         nothing = tuple(math.nan for _ in scene.machine.carrier().coordinates)
-        return Outcome(parameters, False, math.nan, nothing, math.nan, math.nan, float(objective(scene)))
+        return Outcome(parameters, False, math.nan, nothing, math.nan, math.nan)
     jam = jam_modes(scene).select(mode, throw=False)
     return Outcome(
         parameters=parameters,
@@ -242,7 +268,6 @@ def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcom
         amplitude=tuple(float(a) for a in jam.amplitude),
         foundation_force=float(jam.foundation_force),
         force_per_amplitude=float(force_per_amplitude(mode=mode, of=objective.of)(scene)),
-        objective=float(objective(scene)),
     )
 
 
@@ -250,12 +275,6 @@ def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
     of: Pair = between(run.scene, objective.of)
     force = float(run.foundation_force)
     whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.scene, run.window, *of))
-    read = {
-        "amplitude": whose,
-        "foundation_force": force,
-        "force_per_amplitude": force / whose,
-        "jam_frequency": float(run.omega),
-    }
     return Outcome(
         parameters=space.parameters(run.scene),
         exists=True,
@@ -263,5 +282,4 @@ def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
         amplitude=tuple(float(a) for a in run.amplitude),
         foundation_force=force,
         force_per_amplitude=force / whose,
-        objective=read.get(objective.name, math.nan),
     )

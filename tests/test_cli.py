@@ -92,7 +92,7 @@ def test_optimize_json_has_the_promised_keys(typed, tmp_path):
         assert set(document[name]) == keys
     assert document["after"]["force_per_amplitude"] < document["before"]["force_per_amplitude"]
     np.testing.assert_allclose(document["verified"]["omega"], document["after"]["omega"], rtol=1e-2)
-    found = jv.load_scene(tmp_path / "o" / "machine.toml")
+    found = jv.load_scene(tmp_path / "o" / "found.toml")
     np.testing.assert_array_equal(found.machine.stiffness, document["after"]["machine.stiffness"])
     for picture in ("before_after.png", "convergence.png", "history.png"):
         assert (tmp_path / "o" / picture).stat().st_size > 5_000

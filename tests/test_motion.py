@@ -253,7 +253,7 @@ def test_a_run_that_does_not_finish_says_so():
         (dict(start="jam", mode=9), "mode is 9; this machine's jam modes are numbered 1 to 5"),
         (dict(mode=3), "mode is 3, which goes with start='jam' only"),
         (dict(tolerance=1e-17), "tolerance is 1e-17; in float64 it must be at least 2e-15 and less than 1"),
-        (dict(tolerance=2.0), "tolerance is 2; in float64"),
+        (dict(tolerance=2.0), "tolerance is 2.0; in float64"),
         (dict(spin_up=3.0), "spin_up goes with start='spin_up' only"),
         (dict(start="spin_up", spin_up=-3.0), "drive.duration is -3 s; it must be greater than 0"),
         (dict(save="none"), "save is 'none'; it must be 'all' or 'window'"),
@@ -323,3 +323,61 @@ def test_a_start_given_whole_takes_no_mode():
     s = published(eps=1e-3).scene()
     with pytest.raises(jv.InputError, match="leave it out"):
         jv.simulate(s, 1.0, start=jv.initial_state(s), mode=3)
+
+
+def test_a_soft_mount_under_a_fast_rotor_is_measured_without_aliasing():
+    """20 periods of the lowest frequency are thousands of turns of the rotor: the window has to be shorter than that."""
+    machine = jv.two_mass(
+        mass=(400.0, 40.0), stiffness=(300.0, 0.0), damping=(10.0, 0.0), link_stiffness=4e5, link_damping=50.0
+    )
+    s = jv.Scene(machine, jv.balls(count=1, mass=0.2, radius=0.05, drag=3.0), jv.ConstantSpeed("3000 rpm"))
+    run = jv.simulate(s, 40.0, start="jam", mode=5, save="window", tolerance=1e-7)
+    jam = jv.jam_modes(s).select(5)
+    np.testing.assert_allclose(run.amplitude[1], jam.amplitude[1], rtol=2e-2)
+    np.testing.assert_allclose(run.omega, jam.omega, rtol=1e-4)
+
+
+def test_settle_names_a_motion_that_left_its_mode():
+    s = scene("two_mass", speed=150.0)
+    with pytest.raises(jv.ComputationError) as caught:
+        jv.settle(s, mode=4)
+    assert caught.value.status == "left_mode"
+
+
+def test_settle_does_not_pass_a_jam_that_only_glued_loads_keep():
+    """By slope mode 5 is stable; two balls in it part, and balance the rotor."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    s = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=5.0), jv.ConstantSpeed(100.0))
+    assert bool(jv.jam_modes(s).select(3).stable)
+    with pytest.raises(jv.ComputationError) as caught:
+        jv.settle(s, mode=3)
+    assert caught.value.status in ("left_mode", "not_settled")
+
+
+def test_platforms_of_a_jam_start_with_the_loads_angle():
+    s = published(eps=1e-3).scene()
+    turned, plain = (jv.initial_state(s, "jam", mode=3, angles=a) for a in (2.0 * np.pi, 0.0))
+    np.testing.assert_allclose(turned.displacement, plain.displacement, rtol=1e-10)
+    quarter = jv.initial_state(s, "jam", mode=3, angles=np.pi / 2)
+    np.testing.assert_allclose(quarter.displacement, plain.velocity / jv.jam_modes(s).select(3).omega, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (dict(start="spin_up", spin_up=5.0), "longer than the run"),
+        (dict(tolerance="small"), "tolerance is 'small'"),
+        (dict(until=1e308), "run shorter stretches"),
+    ],
+)
+def test_runs_that_cannot_be_are_refused(change, says):
+    with pytest.raises(jv.InputError, match=says):
+        jv.simulate(published().scene(), **{"until": 1.0, **change})
+
+
+def test_a_state_of_another_machine_is_refused():
+    state = jv.initial_state(scene("one_mass", "rollers"))
+    with pytest.raises(jv.InputError, match=r"start.displacement has shape \(1,\); this scene needs \(2,\)"):
+        jv.simulate(published().scene(), 1.0, start=state)
+    with pytest.raises(jv.InputError, match=r"goes with|drive is 'spin_up'|starts at another speed"):
+        jv.initial_state(eqx.tree_at(lambda s: s.drive, published().scene(), jv.SpinUp(3.0, 1.0)), "jam", mode=3)

@@ -57,7 +57,7 @@ def test_multipliers_are_those_of_the_full_equations(make, omega):
 
 @functools.cache
 def diagram(eps):
-    return jv.exact_branches(published(eps=eps).scene(), points=400, least=0.25, most=2.0)
+    return jv.branches(published(eps=eps).scene(), exact=True, points=400, least=0.25, most=2.0)
 
 
 def test_special_points_of_light_loads_are_the_published_folds():

@@ -9,7 +9,7 @@ from scenes import loads, machines, scene
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES, scene_from_tables
-from jaxvib.machine.units import number, numbers
+from jaxvib.machine.units import number, numbers, to_float
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
@@ -82,7 +82,10 @@ WRONG = {
     "true": (lambda: machine(link_damping=True), "machine.link_damping is True, which is not a number"),
     "exciter": (lambda: machine(exciter=3), "machine.exciter is 3; the machine has platforms 1 to 2"),
     "no exciter": (lambda: machine(exciter=0), "machine.exciter is 0; it must be a whole number, at least 1"),
-    "one mass, two values": (lambda: jv.one_mass(mass=[1.0, 2.0], stiffness=1.0, damping=1.0), "machine.mass is a list of 2"),
+    "one mass, two values": (
+        lambda: jv.one_mass(mass=[1.0, 2.0], stiffness=1.0, damping=1.0),
+        "machine.mass has 2 values; 1 are needed",
+    ),
     "no platform": (lambda: jv.network(mass=[], stiffness=[], damping=[], exciter=1), "machine.mass is an empty list"),
     "a link to nowhere": (
         lambda: jv.network(
@@ -243,9 +246,31 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
     with pytest.raises(jv.InputError, match=r"broken\.toml is no TOML file"):
         jv.load_scene(tmp_path / "broken.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(jv.InputError, match=r"bytes\.toml is no TOML file"):
+    with pytest.raises(jv.InputError, match=r"bytes\.toml is not UTF-8 text"):
         jv.load_scene(tmp_path / "bytes.toml")
     with pytest.raises(jv.InputError, match="cannot be read"):
         jv.load_scene(tmp_path)
     with pytest.raises(jv.InputError, match="scene is no TOML"):
         jv.scene_from_toml("[machine")
+
+
+@pytest.mark.parametrize("text", ["1,5 N/m", "1 500 N/m", "1500 N/m 2", "N/m", "(1500 N/m", "1500/0 N/m", "1.5 N/m,", ""])
+def test_text_that_only_looks_like_a_number_is_refused(text):
+    with pytest.raises(jv.InputError, match=r"which is not in N/m; write for example '1.5 N/m'"):
+        to_float(text, "N/m", "machine.stiffness")
+
+
+def test_hertz_count_as_turns_in_every_power():
+    np.testing.assert_allclose(to_float("20 Hz^2", "rad^2/s^2", "hold"), 20 * 4 * np.pi**2)
+    assert to_float("20 Hz", "1/s", "rate") == 20.0
+
+
+def test_a_file_with_a_byte_order_mark_is_read_and_other_encodings_are_named(tmp_path):
+    text = TEMPLATES["one_mass"]
+    (tmp_path / "bom.toml").write_text(text, encoding="utf-8-sig")
+    assert jv.load_scene(tmp_path / "bom.toml").machine.kind == "one_mass"
+    (tmp_path / "wide.toml").write_text(text, encoding="utf-16")
+    with pytest.raises(jv.InputError, match="save it as UTF-8"):
+        jv.load_scene(tmp_path / "wide.toml")
+    with pytest.raises(jv.InputError, match="cannot be read"):
+        jv.load_scene(tmp_path / "bom.toml" / "below")

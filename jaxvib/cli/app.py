@@ -25,15 +25,21 @@ class Output:
         self.as_json = as_json
         self.folder = folder
         self.files: list[str] = []
+        if folder is not None:
+            self._make(folder)
+
+    @staticmethod
+    def _make(folder: Path) -> None:
+        """Before anything is computed: a result that has nowhere to go is lost."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError("--out", f"is {str(folder)!r}, which cannot be made a folder ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
-        """The path of a result file, its folder made; None where no folder was asked for."""
+        """The path of a result file; None where no folder was asked for."""
         if self.folder is None:
             return None
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError("--out", f"is {str(self.folder)!r}, which cannot be made a folder ({error.strerror})") from error
         self.files.append(str(self.folder / name))
         return self.folder / name
 
@@ -114,17 +120,22 @@ def run(arguments: list[str]) -> int:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 0
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+    except OSError as error:
+        name = str(error.filename or "a file")
+        message = f"{name} cannot be written or read ({error.strerror}); name another folder with --out"
+        return _failed(wants_json, 2, {"kind": "input", "field": name, "message": message})
     except click.UsageError as error:
         field = error.ctx.command.name if error.ctx else "jaxvib"
         hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
-        return _failed(wants_json, 2, {"kind": "input", "field": field, "message": error.format_message() + hint})
+        message = " ".join(error.format_message().split()) + hint
+        return _failed(wants_json, 2, {"kind": "input", "field": field, "message": message})
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 1
 
 
 def _failed(wants_json: bool, code: int, error: dict[str, Any]) -> int:

@@ -16,6 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
 from optimize import Outcome, Synthesis, load_design, synthesize
 from optimize.files import TEMPLATE
+from optimize.synthesize import wanted
 
 
 @app.command("new")
@@ -117,7 +118,7 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
             **options,
         )
     for name, save in (
-        ("machine.toml", lambda path: jv.save_scene(best.scene, path)),
+        ("found.toml", lambda path: jv.save_scene(best.scene, path)),
         ("before_after.png", lambda path: best.plot().savefig(path)),
         ("convergence.png", lambda path: best.plot_convergence().savefig(path)),
     ):
@@ -134,6 +135,7 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
         "before": best.before.as_dict(),
         "after": best.after.as_dict(),
         "verified": None if best.verified is None else best.verified.as_dict(),
+        "unverified": best.unverified,
         "starts": best.starts,
         "drawn": best.drawn,
         "converged": best.converged,
@@ -163,5 +165,7 @@ def _outcomes(best: Synthesis) -> str:
     row("foundation force, N", lambda o: o.foundation_force)
     row("force per amplitude, N/m", lambda o: o.force_per_amplitude)
     counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
-    checked = "" if best.verified is None else "\nverified: measured on the full equations, integrated until they settled"
-    return counted + "\n" + table(f"least {best.objective}", ["", *(name for name, _ in columns)], rows) + checked
+    checked = "verified: measured on the full equations, integrated until they settled"
+    if best.verified is None:
+        checked = f"not verified: {best.unverified}"
+    return counted + "\n" + table(wanted(best.objective), ["", *(name for name, _ in columns)], rows) + "\n" + checked

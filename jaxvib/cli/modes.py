@@ -18,12 +18,16 @@ _RPM = 30.0 / np.pi
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
 @click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
+@click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of the limit of light loads.")
 @shared
-def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
-    """Every jam mode of SCENE at its rotor speed, by the equations for light loads; --out adds the branch diagram."""
+def modes(scene: Path, speed: str | None, unit: Any, exact: bool, output: Output) -> None:
+    """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram."""
     loaded = jv.load_scene(scene)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
+    if exact:
+        _exact(loaded, unit, output)
+        return
     found = jv.jam_modes(loaded)
     picture = output.file("branches.png")
     if picture is not None:
@@ -64,11 +68,67 @@ def modes(scene: Path, speed: str | None, unit: Any, output: Output) -> None:
         head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in names), "force on bed, N"]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            table("jam modes of light loads; amplitudes and force zero to peak", head, rows),
+            table("jam modes of light loads; amplitudes and force zero to peak", head, rows) if rows else "no jam mode here",
         ]
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
+        return "\n".join(lines)
+
+    output.done(document, text, "modes")
+
+
+def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
+    """The exact jams that continue those of light loads, and the exact diagram's special points."""
+    light = jv.jam_modes(scene)
+    jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in light.mode_numbers()}
+    known = {k: jam for k, jam in jams.items() if bool(np.isfinite(jam.rotor_speed))}
+    diagram = jv.branches(scene, exact=True)
+    picture = output.file("branches.png")
+    if picture is not None:
+        diagram.plot(unit=unit).savefig(picture)
+    document = {
+        "rotor_speed": float(scene.drive.speed),
+        "resonances": light.resonances.tolist(),
+        "modes": [
+            {
+                "mode": k,
+                "omega": float(jam.omega),
+                "stable": bool(jam.stable),
+                "amplitude": jam.amplitude.tolist(),
+                "foundation_force": float(jam.foundation_force),
+                "multiplier": float(jam.multiplier),
+                "status": jam.message,
+            }
+            for k, jam in known.items()
+        ],
+        "folds": [{"omega": p.omega, "rotor_speed": p.rotor_speed, "kind": p.kind} for p in diagram.special],
+        "missing": [{"mode": k, "status": jam.message} for k, jam in jams.items() if k not in known],
+    }
+
+    def text() -> str:
+        names = scene.machine.carrier().coordinates
+        rows = [
+            [
+                f"{k}",
+                f"{float(jam.omega):.6g}",
+                f"{_RPM * float(jam.omega):.6g}",
+                "stable" if jam.stable else "unstable",
+                f"{float(jam.multiplier):.5g}",
+                *(f"{1e3 * float(a):.5g}" for a in jam.amplitude),
+                f"{float(jam.foundation_force):.5g}",
+            ]
+            for k, jam in known.items()
+        ]
+        head = ["mode", "rad/s", "rpm", "exactly", "multiplier", *(f"{name}, mm" for name in names), "force on bed, N"]
+        points = [[p.kind.replace("_", " "), f"{p.omega:.6g}", f"{p.rotor_speed:.6g}"] for p in diagram.special]
+        lines = [
+            f"rotor {float(scene.drive.speed):.5g} rad/s ({_RPM * float(scene.drive.speed):.5g} rpm)",
+            table("exact jams; amplitudes and force zero to peak", head, rows),
+            *(f"mode {k}: {jam.message}" for k, jam in jams.items() if k not in known),
+        ]
+        if points:
+            lines.append(table("where stability changes", ["", "loads, rad/s", "rotor, rad/s"], points))
         return "\n".join(lines)
 
     output.done(document, text, "modes")

@@ -119,11 +119,10 @@ def before_after(before: Mapping[str, float], after: Mapping[str, float], *, tit
     return figure
 
 
-def convergence(history: np.ndarray, *, label: str) -> Figure:
-    """The objective of every start (iterations, starts) over the iterations, the best one bold."""
+def convergence(history: np.ndarray, *, best: int, label: str) -> Figure:
+    """The objective of every start (iterations, starts) over the iterations, the one numbered `best` bold."""
     figure, (axis,) = panels(1, size=(7.0, 3.6))
     axis.plot(history, color=COLORS[0], lw=0.5, alpha=0.25)
-    best = int(np.nanargmin(history[-1]))
     axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
     axis.set_yscale("log" if np.nanmin(history) > 0.0 else "linear")
     axis.set_xlabel("iteration")

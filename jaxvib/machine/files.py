@@ -48,10 +48,14 @@ def closest(name: str, allowed: list[str]) -> str:
 def read_toml(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file. **Raises** `InputError` for a file that is missing or no TOML."""
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a scene file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a TOML file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            str(path), "is not UTF-8 text; save it as UTF-8 (or let `jaxvib new ... --out DIR` write it)"
+        ) from error
+    except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), f"is no TOML file: {error}") from error
 
 

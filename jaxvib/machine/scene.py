@@ -41,7 +41,11 @@ class Scene(eqx.Module):
         for name, part, kind, example in parts:
             if not isinstance(part, kind):
                 raise InputError(name, f"is {part!r}; it must be a {kind.__name__}, for example {example}")
-        effects = (effects,) if isinstance(effects, Effect) else tuple(effects)
+        if isinstance(effects, Effect):
+            effects = (effects,)
+        if not isinstance(effects, (tuple, list)):
+            raise InputError("effects", f"is {effects!r}; it must be a tuple of effects, for example (Gravity(),)")
+        effects = tuple(effects)
         for index, effect in enumerate(effects):
             if not isinstance(effect, Effect):
                 raise InputError(f"effects[{index}]", f"is {effect!r}; it must be an Effect, for example Gravity()")

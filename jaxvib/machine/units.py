@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,27 @@ from jax.core import Tracer
 
 from jaxvib.errors import InputError
 
-__all__ = ["Number", "count", "number", "numbers", "to_float", "traced"]
+__all__ = ["FIELD_UNITS", "Number", "count", "number", "numbers", "to_float", "traced"]
 
 Number = Any
 """What the edges accept as a number: a float, an array, a traced value, a string with a unit, a pint quantity."""
+
+
+_TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_](?:(?!\s\d)[^,;()])*)")
+"""One number with a decimal point, then one unit: everything else a unit library might make a number of is a slip."""
+
+FIELD_UNITS = {
+    "mass": "kg",
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "link_stiffness": "N/m",
+    "link_damping": "N s/m",
+    "radius": "m",
+    "drag": "N s/m",
+    "inertia": "kg m^2",
+    "speed": "rad/s",
+}
+"""The unit of each number of a scene that a design may free or hold."""
 
 
 def traced(value: Any) -> bool:
@@ -31,6 +49,10 @@ def traced(value: Any) -> bool:
 
 def _unit_name(unit: str) -> str:
     return unit or "no unit"
+
+
+def _example(unit: str) -> str:
+    return "'1500 rpm', '157.1 rad/s' or '25 Hz'" if unit == "rad/s" else f"'1.5 {unit}'" if unit else "1.5"
 
 
 def to_float(value: Number, unit: str, field: str) -> Any:
@@ -48,7 +70,7 @@ def to_float(value: Number, unit: str, field: str) -> Any:
     >>> to_float("3 kg", "N/m", "machine.stiffness")
     Traceback (most recent call last):
         ...
-    jaxvib.errors.InputError: machine.stiffness is '3 kg', which is not in N/m; write for example '1.0 N/m'
+    jaxvib.errors.InputError: machine.stiffness is '3 kg', which is not in N/m; write for example '1.5 N/m'
     """
     if isinstance(value, bool):
         raise InputError(field, f"is {value}, which is not a number; write a number in {_unit_name(unit)}")
@@ -62,14 +84,21 @@ def to_float(value: Number, unit: str, field: str) -> Any:
 
         wrong = InputError(
             field,
-            f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example '1.0 {unit}'".replace(" '1.0 '", " 1.0"),
+            f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}",
         )
         try:
-            given = pint.get_application_registry().Quantity(value) if isinstance(value, str) else value
-            turns = "hertz" in str(given.units) and unit == "rad/s"
-            return given.m_as("hertz") * 2.0 * math.pi if turns else given.m_as(unit or "dimensionless")
-        except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError, SyntaxError) as error:
+            if isinstance(value, str):
+                parts = _TEXT.fullmatch(value.strip())
+                if parts is None:
+                    raise wrong
+                given = pint.get_application_registry().Quantity(float(parts[1]), parts[2])
+            else:
+                given = value
+            magnitude = given.m_as(unit or "dimensionless")
+        except (pint.PintError, AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError) as error:
             raise wrong from error
+        hertz = sum(power for name, power in given.unit_items() if name.endswith("hertz"))
+        return magnitude * (2.0 * math.pi) ** hertz if "rad" in unit else magnitude
     if value is None or isinstance(value, (dict, set)):
         raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}")
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -131,7 +132,8 @@ class Run(Measured):
         **Returns** the path written to.
         """
         arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(eqx.filter(self, eqx.is_array)))}
-        path = Path(path).with_suffix(".npz")
+        path = Path(path)
+        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
         arrays |= {"scene": np.asarray(scene_to_toml(self.scene)), "kept_all": np.asarray(self.trajectory is not None)}
         np.savez(path, allow_pickle=False, **arrays)
         return path
@@ -147,12 +149,13 @@ class Run(Measured):
                 scene = scene_from_toml(str(archive["scene"]))
                 kept_all = bool(archive["kept_all"])
                 leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
+                zero = jnp.zeros(())
+                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,)), zero, zero)
+                kept = motion if kept_all else None
+                shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, scene)
+                dynamic, static = eqx.partition(shape, eqx.is_array)
+                return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)
         except FileNotFoundError as error:
             raise InputError("path", f"is {str(path)!r}; there is no such file") from error
-        except (KeyError, ValueError, OSError) as error:
+        except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
             raise InputError("path", f"is {str(path)!r}; it is no run written by Run.save") from error
-        zero = jnp.zeros(())
-        motion = Trajectory(zero, State(zero, zero, (zero,), (zero,)), zero, zero)
-        shape = cls(zero, zero, zero, zero, zero, RunStatus.done, motion if kept_all else None, motion, zero, zero, scene)
-        dynamic, static = eqx.partition(shape, eqx.is_array)
-        return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)

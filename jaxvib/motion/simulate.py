@@ -28,6 +28,11 @@ __all__ = ["simulate"]
 _WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
 
+_PER_TURN = 16
+"""Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
+
+_MOST_STEPS = 2**31 - 1
+
 
 class _Tolerance(diffrax.AbstractStepSizeController):
     """A step size controller that measures every part of the state in its own unit, and angles absolutely.
@@ -103,7 +108,8 @@ def simulate(
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
       over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
     - `save`: "all" keeps `samples` evenly spaced states; "window" keeps no trajectory, only what is measured
-    - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run)
+    - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
+      and 256 turns of the rotor)
     - `tolerance`: error a step may make, relative, and absolute in natural units: the throw S/M of the loads for
       displacements, that times the rotor's speed for velocities, 1 rad for angles, whose error is never relative
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; Tsit5, a PI controller to `tolerance`, and checkpointed
@@ -126,16 +132,18 @@ def simulate(
 
     Source: the antiphase paper, section 5.3; the method is an embedded Runge-Kutta pair, see diffrax.
     """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     count(samples, "samples", low=2)
     count(turns, "turns")
     precision = float(jnp.finfo(end.dtype).eps)
-    if not 10.0 * precision <= tolerance < 1.0:
+    if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
         raise InputError(
             "tolerance",
-            f"is {tolerance:g}; in {end.dtype} it must be at least {10.0 * precision:.1g} and less than 1"
+            f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and less than 1"
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )
     if spin_up is not None and start != "spin_up":
@@ -144,10 +152,12 @@ def simulate(
         if not isinstance(scene.drive, ConstantSpeed):
             raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
         drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
+        if not traced(end - drive.duration) and drive.duration > end:
+            raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
         scene = eqx.tree_at(lambda s: s.drive, scene, drive)
     if isinstance(start, State) and mode is not None:
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
-    state = start if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    state = _whole(scene, start) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
         max_steps = _enough_steps(scene, end)
     if controller is None:
@@ -161,12 +171,22 @@ def simulate(
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         samples if save == "all" else 0,
         turns,
-        count(max_steps, "max_steps"),
+        min(count(max_steps, "max_steps"), _MOST_STEPS),
         progress,
     )
     if throw and not traced(run.steps):
         _raise_if_failed(run, max_steps)
     return run
+
+
+def _whole(scene: Scene, state: State) -> State:
+    """The state, if it has the scene's numbers of coordinates and loads."""
+    nd, n = scene.machine.carrier().mass.shape[0], scene.loads.count
+    for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
+        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
+        if any(shape != (length,) for shape in shapes):
+            raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
+    return state
 
 
 def _enough_steps(scene: Scene, end: Array) -> int:
@@ -175,7 +195,10 @@ def _enough_steps(scene: Scene, end: Array) -> int:
     turns = end * fastest / (2.0 * jnp.pi)
     if traced(turns):
         return 2**20
-    return 2 ** math.ceil(math.log2(4096 + 500 * float(turns)))
+    steps = 4096 + 500 * float(turns)
+    if not steps <= _MOST_STEPS:
+        raise InputError("until", f"is {float(end):g} s, {float(turns):.2g} turns of what moves fastest; run shorter stretches")
+    return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
 
 @eqx.filter_jit
@@ -197,7 +220,8 @@ def _run(
     field = vector_field(scene)
     frequencies = natural_frequencies(jax.lax.stop_gradient(scene))
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, jax.lax.stop_gradient(scene.drive.speed)))
-    window = jnp.minimum(2.0 * jnp.pi * turns / slowest, end / 2.0)
+    longest = 2.0 * jnp.pi * _WINDOW / (_PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
+    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, _WINDOW))]
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, numbers
 from jaxvib.motion.dynamics import State
@@ -27,7 +28,8 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
     - `start`: "rest" (platforms in equilibrium, loads at rest, together at the bottom of their track), "spin_up" (the same
       state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"
-    - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam)
+    - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam, where
+      the platforms go with the mean angle)
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that
     does not exist at the scene's rotor speed.
@@ -52,10 +54,16 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
         return State(zero, zero, (phases(-jnp.pi / 2),), (jnp.zeros((n,), zero.dtype),))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
+    if not isinstance(scene.drive, ConstantSpeed):
+        raise InputError(
+            "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
+        )
     jam = jam_modes(scene).select(mode)
+    angle = phases(0.0)
+    displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
     return State(
-        jam.displacement.real,
-        -jam.omega * jam.displacement.imag,
-        (phases(0.0),),
+        displacement.real,
+        -jam.omega * displacement.imag,
+        (angle,),
         (jnp.full((n,), jam.omega),),
     )

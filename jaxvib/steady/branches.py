@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, overload
 
 import equinox as eqx
 import jax
@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.charts import branch_diagram
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
+from jaxvib.steady.diagram import ExactBranches, exact_branches
 from jaxvib.steady.jam import Folds, Jam, branch_points, fold_points
+from jaxvib.steady.picture import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,35 +42,49 @@ class Branches(Jam):
 
         **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
         """
-        if unit not in ("rad/s", "rpm"):
-            raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
-        at = float(self.scene.drive.speed)
-        shown = np.asarray(self.rotor_speed) <= (4.0 / 3.0 * at if most is None else most)
-        inside = np.asarray(self.folds.exists) & (np.asarray(self.folds.rotor_speed) <= (4 / 3 * at if most is None else most))
-        there = np.where(shown, 1.0, np.nan)
-        return branch_diagram(
-            np.asarray(self.rotor_speed) * there,
-            np.asarray(self.omega),
-            np.asarray(self.stable),
-            amplitude=np.asarray(self.amplitude),
-            force=np.asarray(self.foundation_force),
-            resonances=np.asarray(self.resonances),
-            marks=[("fold", np.asarray(self.folds.rotor_speed)[inside], np.asarray(self.folds.omega)[inside])],
-            names=self.scene.machine.carrier().coordinates,
-            at=at,
-            unit=unit,
-        )
+        folds = self.folds
+        found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
+        marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
+        return picture(self, marks, unit, most)
 
 
-def branches(scene: Scene, *, points: int = 2000, most: Number | None = None) -> Branches:
-    """The branch n(Omega) of jams of light, collected loads, through all its folds.
+@overload
+def branches(scene: Scene, *, exact: Literal[False] = False, points: int = 2000, most: Number | None = None) -> Branches: ...
 
-    n(Omega) is explicit (`jam_rotor_speed`), so every point is computed for itself: nothing is followed, nothing missed.
+
+@overload
+def branches(
+    scene: Scene,
+    *,
+    exact: Literal[True],
+    points: int = 2000,
+    most: Number | None = None,
+    least: Number | None = None,
+    accuracy: float = 1e-8,
+) -> ExactBranches: ...
+
+
+def branches(
+    scene: Scene,
+    *,
+    exact: bool = False,
+    points: int = 2000,
+    most: Number | None = None,
+    least: Number | None = None,
+    accuracy: float = 1e-8,
+) -> Branches | ExactBranches:
+    """The branch n(Omega) of jams of collected loads through all its folds: of light loads, or `exact`.
+
+    For light loads n(Omega) is explicit (`jam_rotor_speed`); either way every point is computed for itself: nothing is
+    followed, nothing missed.
 
     **Arguments**: `points` along Omega, crowded about the resonances; `most` the greatest load speed, rad/s or text (a third
-    above the scene's rotor speed unless said otherwise).
+    above the scene's rotor speed unless said otherwise); `exact` the periodic motions of the full equations in place of their
+    limit for light loads, with Floquet multipliers and all special points: then also `least` load speed (a fifth of the lowest
+    resonance) and relative `accuracy` of the rotor speeds.
 
-    **Returns** `Branches`. **Raises** `InputError` for fewer than 2 points or a speed that is not positive.
+    **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points or a speed that is
+    not positive.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -82,6 +97,10 @@ def branches(scene: Scene, *, points: int = 2000, most: Number | None = None) ->
 
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
+    if exact:
+        return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
+    if least is not None:
+        raise InputError("least", "goes with exact=True only; light loads have a branch down to speed 0")
     count(points, "points", low=2)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.carrier().mass.shape[0])))

@@ -35,6 +35,9 @@ _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
 
+Points = Array | np.ndarray
+
+
 class Grid(NamedTuple):
     """Points on a period of theta = Omega t and the matrices of trigonometric interpolation between them.
 
@@ -106,7 +109,7 @@ def has_half_turn(scene: Scene) -> bool:
     return not scene.effects
 
 
-def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
     """What turns the loads besides the vibration, N m: resistance and effects, summed over loads that are all at `phi` (M,).
 
     `effects` are the scene's unless others are named; () leaves what the rotor gives.
@@ -118,12 +121,12 @@ def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tu
         return sum((effect.load_force(loads, (angle,))[0] for effect in acting), torque)
 
     if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(loads)):
-        return loads.count * each(phi, rate)
+        return loads.count * each(jnp.asarray(phi), rate)
     spread = (loads.count,)
     return jax.vmap(lambda p, r: jnp.sum(each(jnp.broadcast_to(p, spread), jnp.broadcast_to(r, spread))))(phi, rate)
 
 
-def circle(scene: Scene, phi: Array) -> tuple[Array, Array]:
+def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
     """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
     cos, sin = jnp.cos(phi), jnp.sin(phi)
     axes = scene.machine.carrier().axes
@@ -229,7 +232,7 @@ def periodic_motion(
 
     def balance(lag: Array, x: Array, value: Array) -> tuple[Array, tuple[Array, _Balance]]:
         omega, speed = (value, x) if given == "omega" else (x, value)
-        feedback = fixed if given == "omega" else _feedback(scene, grid, omega)
+        feedback = _feedback(scene, grid, omega) if fixed is None else fixed
         found = _balance(scene, grid, feedback, lag, omega, speed)
         return found.left_over, (feedback, found)
 

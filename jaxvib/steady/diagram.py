@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,11 @@ from jaxvib.machine.units import Number, count, number
 from jaxvib.steady.collocation import has_half_turn
 from jaxvib.steady.jam import fold_points, jam_rotor_speed
 from jaxvib.steady.orbit import OrbitStatus, orbits
+from jaxvib.steady.picture import picture
 from jaxvib.steady.stability import Floquet, steps_for
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
@@ -41,7 +45,7 @@ class ExactBranches(eqx.Module):
 
     **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m and `foundation_force` (P,) N,
     zero to peak; `power` (P,) W; `stable`, `multiplier` (P,) and `multipliers` (P, ...) as in `Orbit`; `residual`, `error`
-    (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in Omega.
+    (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in Omega; `scene`.
     """
 
     status: OrbitStatus
@@ -56,7 +60,12 @@ class ExactBranches(eqx.Module):
     multipliers: Array
     residual: Array
     error: Array
+    scene: Scene
     special: tuple[SpecialPoint, ...] = eqx.field(static=True)
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
+        """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
+        return picture(self, list(self.special), unit, most)
 
 
 def exact_branches(
@@ -82,7 +91,7 @@ def exact_branches(
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=0.05, beta=1.0, speed=1.5)
-    >>> diagram = jv.exact_branches(form.scene(), points=200, least=0.3)
+    >>> diagram = jv.branches(form.scene(), exact=True, points=200, least=0.3)
     >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
@@ -97,8 +106,8 @@ def exact_branches(
     inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
     omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
     values = _Solver(scene, accuracy)(omega)
-    fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name != "special"}
-    return ExactBranches(**fields, special=_special_points(scene, accuracy, values))
+    fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene")}
+    return ExactBranches(**fields, scene=scene, special=_special_points(scene, accuracy, values))
 
 
 class _Values(NamedTuple):
@@ -116,7 +125,7 @@ class _Values(NamedTuple):
     multipliers: np.ndarray
     residual: np.ndarray
     error: np.ndarray
-    tests: np.ndarray
+    tests: Any
 
 
 class _Solver:
@@ -128,13 +137,13 @@ class _Solver:
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
         half = has_half_turn(self.scene)
-        todo, found = np.arange(omega.size), None
-        for many in _POINTS if half else [2 * p + 1 for p in _POINTS]:
-            made = self._batches(omega[todo], many)
-            found = made if found is None else jax.tree.map(functools.partial(_put, todo), found, made)
-            todo = todo[~(made.error <= self.accuracy)]
+        first, *more = _POINTS if half else [2 * p + 1 for p in _POINTS]
+        found = self._batches(omega, first)
+        for many in more:
+            todo = np.flatnonzero(~(found.error <= self.accuracy))
             if todo.size == 0:
                 break
+            found = jax.tree.map(functools.partial(_put, todo), found, self._batches(omega[todo], many))
         return found
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
@@ -189,7 +198,7 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     pick = np.arange(row.size)
     low, high = grid.omega[row].copy(), grid.omega[row + 1].copy()
     f_low, f_high = tests[row, which], tests[row + 1, which]
-    middle, values = low, None
+    middle, values = low, grid
     # False position that never keeps an end twice (Illinois), with a halving now and then.
     for turn in range(60):
         before = middle

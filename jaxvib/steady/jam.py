@@ -74,7 +74,8 @@ class JamModes(Jam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
 
     A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`.
-    Adds `resonances` (nd,) rad/s and the `folds` of the branch.
+    Adds `resonances` (nd,) rad/s and the `folds` of the branch. Derivatives of a mode that does not exist are 0, so that it
+    does not spoil those of a batch: ask the status, not the gradient.
     """
 
     resonances: Array

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, number
+from jaxvib.machine.units import Number, number, traced
 from jaxvib.steady.collocation import (
     Grid,
     Harmonics,
@@ -83,6 +83,11 @@ class Orbit(eqx.Module):
     lag_orders: tuple[int, ...] = eqx.field(static=True)
     orders: tuple[int, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)
+
+    @property
+    def message(self) -> str:
+        """What is known of this motion, a sentence."""
+        return OrbitStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
 
     @property
     def harmonics(self) -> int:
@@ -168,15 +173,15 @@ def jam_orbit(
         raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
     scene = jax.tree.map(jnp.asarray, scene)
     frozen = jax.lax.stop_gradient(scene)
-    concrete = not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((frozen, omega, near)))
+    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
     drag = circular_loads(frozen).drag_sum()
-    if not isinstance(drag, jax.core.Tracer) and not float(drag) > 0.0:
+    if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
-    exists, direction = jnp.asarray(True), jnp.asarray(0.0)
+    exists, direction, start = jnp.asarray(True), jnp.asarray(0.0), frozen.drive.speed
     if mode is not None:
         direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
         jam = jam_modes(frozen).select(mode, throw=throw)
@@ -198,14 +203,13 @@ def jam_orbit(
     # Reverse-mode derivatives ask for a number of steps that is part of the program.
     steps = steps_for(frozen, speed)
     static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((scene, value)))
-    for many in tried:
-        if traced and len(tried) == 1:
-            break
+    differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
+    many, found = tried[0], None
+    for many in tried if concrete else ():
         found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, direction, which, many, steps, accuracy)
         if not float(found.error) > accuracy:
             break
-    if traced:
+    if found is None or differentiated:
         found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy)
     elif throw:
         for status in ("absent", "not_converged"):
@@ -221,7 +225,7 @@ def _orbit(
     start: Array,
     exists: Array,
     direction: Array,
-    given: str,
+    given: Literal["omega", "rotor_speed"],
     points: int,
     steps: int | Array,
     accuracy: float,

@@ -140,6 +140,8 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 def circular_loads(scene: Scene) -> CircularLoads:
     """The scene's loads, where a formula holds for loads on a circle only."""
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if not isinstance(scene.loads, CircularLoads):
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
     return scene.loads
