@@ -14,7 +14,7 @@ demo: $(VENV)/installed
 	@echo "--- the supports that leave the foundation at rest"
 	@$(JAXVIB) optimize $(EXAMPLE)/design.toml --out $(OUT)/antiphase
 	@echo "--- the machine that was found, spun up smoothly from rest"
-	@$(JAXVIB) simulate $(OUT)/antiphase/found.toml --until 60s --start spin_up --out $(OUT)/spin_up
+	@$(JAXVIB) simulate $(OUT)/antiphase/found.toml --until 120s --spin-up 30s --start spin_up --out $(OUT)/spin_up
 	@echo "--- pictures"
 	@ls $(OUT)/*/*.png
 
