@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -25,8 +26,9 @@ def time_histories(
     """Three panels over time (s): displacements (nt, nd) mm, speeds of the loads (nt, count) and of the
     rotor (nt,) rad/s, force on the bed (nt, nb) N."""
     figure, (top, middle, bottom) = panels(3, size=(8.0, 2.4), share_x=True)
-    for k, name in enumerate(names):
-        top.plot(time, 1e3 * displacement[:, k], color=COLORS[k % len(COLORS)], label=name, lw=0.7)
+    widest_first = np.argsort(-np.ptp(displacement, axis=0))  # so that none hides another
+    for depth, k in enumerate(widest_first):
+        top.plot(time, 1e3 * displacement[:, k], color=COLORS[k % len(COLORS)], label=names[k], lw=0.7, zorder=2 + 0.1 * depth)
     top.set_ylabel("displacement, mm")
     top.legend(ncols=min(len(names), 6), loc="upper right")
     for k in range(rate.shape[1]):
@@ -72,8 +74,8 @@ def branch_diagram(
         axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
     low, high = 0.0, float(np.max(view))
     axes[0].plot([low, high], [low, high], color="#bbbbbb", lw=0.8, label="rotor")
-    for label, x, y in marks:
-        axes[0].plot(scale * x, scale * y, "o", ms=4.5, mfc="white", mec="black", label=label)
+    for (label, x, y), shape in zip(marks, itertools.cycle("os^Dv"), strict=False):
+        axes[0].plot(scale * x, scale * y, shape, ms=4.5, mfc="white", mec="black", label=label)
     for axis, label in zip(axes, ("speed of loads, " + unit, "amplitude, mm", "foundation force, N"), strict=True):
         axis.set_xlabel("rotor speed, " + unit)
         axis.set_ylabel(label)

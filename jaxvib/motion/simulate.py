@@ -90,7 +90,7 @@ def simulate(
     mode: int | None = None,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
-    samples: int = 2000,
+    samples: int | None = None,
     turns: int = 20,
     tolerance: float = 1e-8,
     solver: diffrax.AbstractSolver | None = None,
@@ -107,7 +107,8 @@ def simulate(
     - `until`: end time, s or text such as "20 s"
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
       over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
-    - `save`: "all" keeps `samples` evenly spaced states; "window" keeps no trajectory, only what is measured
+    - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16 or more for each turn of the rotor, but 2000
+      under a JAX transformation and 262144 at most); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
       and 256 turns of the rotor)
     - `tolerance`: error a step may make, relative, and absolute in natural units: the throw S/M of the loads for
@@ -137,7 +138,7 @@ def simulate(
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
-    count(samples, "samples", low=2)
+    samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
     precision = float(jnp.finfo(end.dtype).eps)
     if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
@@ -187,6 +188,12 @@ def _whole(scene: Scene, state: State) -> State:
         if any(shape != (length,) for shape in shapes):
             raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
     return state
+
+
+def _enough_samples(scene: Scene, end: Array) -> int:
+    """So many that a picture shows the vibration and no beat of it with the samples; a power of 2: few compilations."""
+    wanted = _PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
+    return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(min(max(float(wanted), 2000.0), 2.0**18)))
 
 
 def _enough_steps(scene: Scene, end: Array) -> int:
