@@ -254,3 +254,30 @@ def test_criterion_holds_better_for_lighter_loads_and_for_stronger_drag_on_light
 def test_map_refuses_what_is_no_range():
     with pytest.raises(jv.InputError, match="mass must be a list"):
         jv.criterion_map(loaded(), speeds=[20.0], mass=[1.0, -1.0], drag=[1.0])
+
+
+@pytest.mark.parametrize("speed", [24.0, 40.0])
+def test_imbalance_is_a_load_that_cannot_leave_the_rotor(speed):
+    """The third load of a balanced three, held to the rotor by a strong drag, is the rotor's imbalance to the other two."""
+    machine = machines()["two_mass"]
+    heavier = eqx.tree_at(lambda m: m.mass, machine, machine.mass.at[machine.exciter - 1].add(0.2))
+    two = jv.Scene(heavier, jv.balls(count=2, mass=0.3, radius=0.1, drag=1.0), jv.ConstantSpeed(speed))
+    off = []
+    for drag in (300.0, 3000.0):
+        held = jv.balls(count=3, mass=[0.2, 0.3, 0.3], radius=0.1, drag=[drag, 1.0, 1.0])
+        three = jv.Scene(machine, held, jv.ConstantSpeed(speed))
+        angles = jv.balanced_states(three).angles[0]
+        found = jv.balanced_stability(two, angles[1:] - angles[0], imbalance=0.2 * 0.1)
+        whole = jv.balanced_stability(three, angles, steps=3072).multipliers
+        moving = found.multipliers[np.abs(found.multipliers) > 1e-3]
+        off.append(max(np.min(np.abs(whole - multiplier)) for multiplier in moving))
+        assert found.neutral == 0
+    # What is left of the held load's freedom goes as 1/drag.
+    assert off[1] < 3e-5
+    np.testing.assert_allclose(off[0] / off[1], 10.0, rtol=0.1)
+    np.testing.assert_allclose(jv.balanced_stability(two, imbalance=0.02).growth, found.growth, rtol=1e-6)
+
+
+def test_imbalance_that_the_angles_do_not_cancel_is_refused():
+    with pytest.raises(jv.InputError, match="leave an unbalance"):
+        jv.balanced_stability(loaded(), [0.0, np.pi], imbalance=0.01)

@@ -51,8 +51,8 @@ class Dynamics(eqx.Module):
     effects: tuple[Effect, ...]
     axes: tuple[int, ...] = eqx.field(static=True)
 
-    def __call__(self, t: Array, state: State) -> State:
-        """The time derivative of `state` at time `t`.
+    def __call__(self, t: Array, state: State, port_force: Array | None = None) -> State:
+        """The time derivative of `state` at time `t`, with an outer `port_force` (np,) N if one is given.
 
         Each load is eliminated first. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c it obeys
         u'' = H^-1 (r - m J^T a), a the port's acceleration, and pushes the port with -(W a + g),
@@ -93,6 +93,8 @@ class Dynamics(eqx.Module):
         unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
         if self.gyroscopic is not None:
             unforced = unforced - speed * _times(self.gyroscopic, state.velocity)
+        if port_force is not None:
+            unforced = unforced + _times(self.push, port_force)
         port_free = _times(self.port, unforced)
         n = len(axes)
         matrix = [

@@ -10,10 +10,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import State, vector_field
+from jaxvib.motion.dynamics import vector_field
+from jaxvib.steady.balanced_flow import at_constant_speed, balanced_motion, imbalance_force, monodromy
 from jaxvib.steady.response import circular_loads
 
 __all__ = [
@@ -181,14 +181,17 @@ class BalancedStability(eqx.Module):
     error: float
 
 
-def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
+def balanced_stability(
+    scene: Scene, angles: ArrayLike | None = None, *, imbalance: float = 0.0, steps: int = 48
+) -> BalancedStability:
     """Exact stability of the motion in which the loads turn with the rotor and cancel each other.
 
     The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
     for heavy loads or weak drag, as the criterion does.
 
     **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel; left out, the first of
-    `balanced_states`. `steps` of a sixth-order Magnus method over one turn.
+    `balanced_states`. `imbalance` kg m, the rotor's own, at angle 0 of its frame, that the loads cancel too (its mass belongs
+    to the machine's). `steps` of a sixth-order Magnus method over one turn.
 
     **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, and for
     effects that disturb the balanced motion (gravity); `ComputationError` with the status of `balanced_states` if
@@ -202,8 +205,8 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
     """
-    angles, neutral = _arrangement(scene, angles)
-    matrix = _monodromies(scene, jnp.asarray(angles), steps)
+    angles, neutral = _arrangement(scene, angles, imbalance)
+    matrix = _monodromies(scene, jnp.asarray(angles), jnp.asarray(imbalance), steps)
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
@@ -213,11 +216,13 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
 
 
-def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int = 48) -> np.ndarray:
+def balanced_growth(
+    scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, imbalance: float = 0.0, steps: int = 48
+) -> np.ndarray:
     """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
 
-    **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own speed is not
-    used.
+    **Arguments**: `speeds` rad/s, any shape; `angles`, `imbalance`, `steps` as `balanced_stability`. The scene's own
+    speed is not used.
 
     **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
 
@@ -227,24 +232,33 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     >>> jv.balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
-    angles, neutral = _arrangement(scene, angles)
+    angles, neutral = _arrangement(scene, angles, imbalance)
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
-    flows = _flows(_at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(padded), steps)[: flat.size]
+    flows = _flows(at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(imbalance), jnp.asarray(padded), steps)[
+        : flat.size
+    ]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
 @eqx.filter_jit
-def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
+def _flows(scene: Scene, angles: Array, imbalance: Array, speeds: Array, steps: int) -> Array:
     def flow(speed: Array) -> Array:
-        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
+        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, imbalance, steps)
 
     return jax.lax.map(flow, speeds, batch_size=_BATCH)
 
 
 def balanced_intervals(
-    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int = 48
+    scene: Scene,
+    low: float,
+    high: float,
+    angles: ArrayLike | None = None,
+    *,
+    points: int = 200,
+    imbalance: float = 0.0,
+    steps: int = 48,
 ) -> list[list[float]]:
     """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
 
@@ -262,8 +276,8 @@ def balanced_intervals(
     if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")
     grid = np.linspace(low, high, points)
-    stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
-    changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
+    stable = balanced_growth(scene, grid, angles, imbalance=imbalance, steps=steps) < 0.0
+    changes = stability_changes(scene, grid, stable, angles, imbalance=imbalance, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
     return [[float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True)]
 
@@ -275,6 +289,7 @@ def stability_changes(
     angles: ArrayLike | None = None,
     *,
     close: float = 1e-7,
+    imbalance: float = 0.0,
     steps: int = 48,
 ) -> np.ndarray:
     """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
@@ -285,24 +300,24 @@ def stability_changes(
     left, right = speeds[change], speeds[change + 1]
     while left.size and np.max((right - left) / right) > close:
         middle = (left + right) / 2.0
-        same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
+        same = (balanced_growth(scene, middle, angles, imbalance=imbalance, steps=steps) < 0.0) == stable[change]
         left, right = np.where(same, middle, left), np.where(same, right, middle)
     return (left + right) / 2.0
 
 
-def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
+def _arrangement(scene: Scene, angles: ArrayLike | None, imbalance: float) -> tuple[np.ndarray, int]:
     """Angles at which the loads are known to cancel, and how many neutral directions they have."""
     sides = _sides(circular_loads(scene))
     if angles is None:
-        states = balanced_states(scene)
+        states = balanced_states(scene, imbalance=imbalance)
         if not len(states.angles):
             raise ComputationError(_name(states.status), BalanceStatus[states.status])
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
-    if abs(np.sum(sides * np.exp(1j * angles))) > 1e-9 * sides.sum():
+    if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
         raise InputError("angles", "leave an unbalance; take them from balanced_states(scene).angles")
-    _require_undisturbed(scene, angles)
-    return angles, _neutral(sides, angles).shape[1]
+    _require_undisturbed(scene, angles, imbalance)
+    return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
 
 
 def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: int) -> np.ndarray:
@@ -316,77 +331,19 @@ def _name(status: BalanceStatus) -> str:
     return next(name for name in ("unique", "family", "alone", "outweighed") if getattr(BalanceStatus, name) == status)
 
 
-def _balanced(scene: Scene, angles: Array, turn: Array) -> State:
-    """The balanced motion when the rotor has turned by `turn` rad."""
-    rest = jnp.zeros_like(scene.machine.carrier().mass[0])
-    return State(rest, rest, (turn + angles,), (jnp.full_like(angles, 1.0) * scene.drive.speed,))
-
-
-def _at_constant_speed(scene: Scene) -> Scene:
-    return Scene(scene.machine, scene.loads, ConstantSpeed(scene.drive.speed), scene.effects)
-
-
-def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
-    field = vector_field(_at_constant_speed(scene))
+def _require_undisturbed(scene: Scene, angles: np.ndarray, imbalance: float) -> None:
+    field = vector_field(at_constant_speed(scene))
     speed = float(scene.drive.speed)
     for turn in (0.0, 1.0, 2.0):
-        change = field(jnp.zeros(()), _balanced(scene, jnp.asarray(angles), jnp.asarray(turn)))
+        turned = jnp.asarray(turn)
+        change = field(
+            jnp.zeros(()), balanced_motion(scene, jnp.asarray(angles), turned), imbalance_force(scene, imbalance, turned)
+        )
         if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
             problem = "disturb the balanced motion (gravity does), which then is no motion of its own; leave them out"
             raise InputError("effects", problem)
 
 
-def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
-    """What one turn of the rotor makes of small errors of the balanced motion, (2 (nd + N), 2 (nd + N)).
-
-        x' = A(n t) x,  x = (q / R, q' / (R n), dphi, dphi' / n),     monodromy = x(turn) for x(0) = 1
-
-    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of the Magnus method, static. `jit`,
-    `vmap` and `grad` go through it; whoever calls it makes sure that the loads cancel.
-    """
-    scene = _at_constant_speed(scene)
-    field = vector_field(scene)
-    speed = scene.drive.speed
-    radius = jnp.mean(circular_loads(scene).radius)
-    scale = (radius, radius * speed, jnp.ones_like(speed), speed)
-    nd, n = field.stiffness.shape[0], angles.shape[0]
-    sizes = jnp.concatenate([jnp.full((k,), 1.0) * v for k, v in zip((nd, nd, n, n), scale, strict=True)])
-
-    def rate(turn: Array, x: Array) -> Array:
-        base = _balanced(scene, angles, turn)
-        e = x * sizes
-        state = State(e[:nd], e[nd : 2 * nd], (base.angle[0] + e[2 * nd : 2 * nd + n],), (base.rate[0] + e[2 * nd + n :],))
-        change = field(turn / speed, state)
-        return jnp.concatenate([change.displacement, change.velocity, change.angle[0], change.rate[0]]) / (sizes * speed)
-
-    def generator(turn: Array) -> Array:
-        return jax.jacfwd(lambda x: rate(turn, x))(jnp.zeros_like(sizes))
-
-    h = 2.0 * jnp.pi / steps
-
-    def step(flow: Array, k: Array) -> tuple[Array, None]:
-        # Three Gauss points a step.
-        a, b, c = jax.vmap(generator)((k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h)
-        a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
-        c1 = _commutator(a1, a2)
-        c2 = -_commutator(a1, 2.0 * a3 + c1) / 60.0
-        omega = a1 + a3 / 12.0 + _commutator(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
-        return _exponential(omega) @ flow, None
-
-    return jax.lax.scan(step, jnp.eye(sizes.shape[0], dtype=sizes.dtype), jnp.arange(steps) * 1.0)[0]
-
-
 @eqx.filter_jit
-def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
-    return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)
-
-
-def _exponential(a: Array) -> Array:
-    """exp(a) by Taylor's series of a/16 to the twelfth power, squared four times; written out, so that it batches."""
-    eye = jnp.eye(a.shape[0], dtype=a.dtype)
-    series = jax.lax.fori_loop(0, 12, lambda k, x: eye + (a / 16.0) @ x / (12.0 - k), eye)
-    return jax.lax.fori_loop(0, 4, lambda _, x: x @ x, series)
-
-
-def _commutator(x: Array, y: Array) -> Array:
-    return x @ y - y @ x
+def _monodromies(scene: Scene, angles: Array, imbalance: Array, steps: int) -> tuple[Array, Array]:
+    return monodromy(scene, angles, imbalance, steps), monodromy(scene, angles, imbalance, steps // 2)
