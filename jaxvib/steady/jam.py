@@ -400,10 +400,14 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
             width = tolerance * jnp.maximum(jnp.abs(a), jnp.abs(b))
             return (steps < 2 * jnp.finfo(low.dtype).bits) & (jnp.abs(b - a) > width) & (fa != 0.0) & (fb != 0.0)
 
+        def size(value: Array) -> Array:
+            return jnp.where(jnp.isnan(value), jnp.inf, jnp.abs(value))
+
         def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-            steps, a, fa, b, fb, share = carry
+            steps, a, fa, b, fb, share, best, least = carry
             x = a + share * (b - a)
             fx = g(x)
+            best, least = jnp.where(size(fx) < least, x, best), jnp.minimum(size(fx), least)
             same = (fx > 0.0) == (fa > 0.0)
             c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
             b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
@@ -414,12 +418,15 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
             guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
             edge = jnp.minimum(0.5 * tolerance * jnp.abs(a) / jnp.abs(b - a), 0.5)
             share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
-            return steps + 1, a, fa, b, fb, share
+            return steps + 1, a, fa, b, fb, share, best, least
 
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
-        start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5))
-        _, a, fa, b, fb, _ = jax.lax.while_loop(open_, step, start)
-        return jnp.where(jnp.abs(fa) < jnp.abs(fb), a, b)
+        # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
+        # from that of the other and the bracket is lost. The point where |g| was least is the root all the same.
+        best = jnp.where(size(f_low) < size(f_high), low, high)
+        least = jnp.minimum(size(f_low), size(f_high))
+        start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
+        return jax.lax.while_loop(open_, step, start)[6]
 
     low, high = jax.lax.stop_gradient((low, high))
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
