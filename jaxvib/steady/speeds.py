@@ -11,7 +11,6 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import traced
-from jaxvib.steady.jam import bracketed_root
 from jaxvib.steady.response import (
     dynamic_stiffness,
     hermitian_modes,
@@ -22,6 +21,7 @@ from jaxvib.steady.response import (
     small_solve,
     turning,
 )
+from jaxvib.steady.roots import bracketed_root
 
 __all__ = ["CharacteristicSpeeds", "characteristic_speeds", "port_receptance"]
 

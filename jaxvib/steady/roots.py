@@ -1,0 +1,64 @@
+"""Roots in a bracket, with derivatives by the implicit function theorem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+__all__ = ["bracketed_root"]
+
+
+def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
+    """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digits.
+
+    Inverse quadratic interpolation where it is safe, halving elsewhere (Chandrupatla, Adv. Eng. Software 28, 1997).
+    Derivatives of any order by the implicit function theorem.
+    """
+
+    def solve(g: Callable[[Array], Array], _: Array) -> Array:
+        tolerance = 2.0 * jnp.finfo(low.dtype).eps
+
+        def open_(carry: tuple[Array, ...]) -> Array:
+            steps, a, fa, b, fb, *_ = carry
+            width = tolerance * jnp.maximum(jnp.abs(a), jnp.abs(b))
+            return (steps < 2 * jnp.finfo(low.dtype).bits) & (jnp.abs(b - a) > width) & (fa != 0.0) & (fb != 0.0)
+
+        def size(value: Array) -> Array:
+            return jnp.where(jnp.isnan(value), jnp.inf, jnp.abs(value))
+
+        def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+            steps, a, fa, b, fb, share, best, least = carry
+            x = a + share * (b - a)
+            fx = g(x)
+            best, least = jnp.where(size(fx) < least, x, best), jnp.minimum(size(fx), least)
+            same = (fx > 0.0) == (fa > 0.0)
+            c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
+            b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
+            a, fa = x, fx
+            # Between a (newest) and b lies the root; c was there before.
+            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+            safe = (1.0 - jnp.sqrt(1.0 - xi) < phi) & (phi < jnp.sqrt(xi))
+            guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+            edge = jnp.minimum(0.5 * tolerance * jnp.abs(a) / jnp.abs(b - a), 0.5)
+            share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
+            return steps + 1, a, fa, b, fb, share, best, least
+
+        f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
+        # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
+        # from that of the other and the bracket is lost. The point where |g| was least is the root all the same.
+        best = jnp.where(size(f_low) < size(f_high), low, high)
+        least = jnp.minimum(size(f_low), size(f_high))
+        start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
+        return jax.lax.while_loop(open_, step, start)[6]
+
+    low, high = jax.lax.stop_gradient((low, high))
+    return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
+
+
+def _nonzero(slope: Array) -> Array:
+    """At a fold the slope is 0 and there is no derivative; the status says so, and nothing overflows."""
+    tiny = jnp.finfo(slope.dtype).tiny ** 0.5
+    return jnp.where(jnp.abs(slope) < tiny, tiny, slope)
