@@ -24,7 +24,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
         def open_(carry: tuple[Array, ...]) -> Array:
             steps, a, fa, b, fb, *_ = carry
             width = tolerance * jnp.maximum(jnp.abs(a), jnp.abs(b))
-            return (steps < 2 * jnp.finfo(low.dtype).bits) & (jnp.abs(b - a) > width) & (fa != 0.0) & (fb != 0.0)
+            bracketed = ((fa > 0.0) != (fb > 0.0)) & (fa != 0.0) & (fb != 0.0)
+            return (steps < 2 * jnp.finfo(low.dtype).bits) & (jnp.abs(b - a) > width) & bracketed
 
         def size(value: Array) -> Array:
             return jnp.where(jnp.isnan(value), jnp.inf, jnp.abs(value))
@@ -48,7 +49,7 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
 
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
         # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
-        # from that of the other and the bracket is lost. The point where |g| was least is the root all the same.
+        # from that of the other and the bracket is lost: then the point where |g| was least is the root.
         best = jnp.where(size(f_low) < size(f_high), low, high)
         least = jnp.minimum(size(f_low), size(f_high))
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
