@@ -281,3 +281,10 @@ def test_imbalance_is_a_load_that_cannot_leave_the_rotor(speed):
 def test_imbalance_that_the_angles_do_not_cancel_is_refused():
     with pytest.raises(jv.InputError, match="leave an unbalance"):
         jv.balanced_stability(loaded(), [0.0, np.pi], imbalance=0.01)
+
+
+def test_a_machine_that_can_drift_is_refused():
+    """Its free motion has multipliers of 1, and what is left of them by rounding would be read as growth."""
+    s = eqx.tree_at(lambda x: x.machine.stiffness, loaded(), jnp.zeros(2))
+    with pytest.raises(jv.InputError, match="lets the machine drift"):
+        jv.balanced_growth(s, [30.0, 60.0])

@@ -14,7 +14,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import vector_field
 from jaxvib.steady.balanced_flow import at_constant_speed, balanced_motion, imbalance_force, monodromy
-from jaxvib.steady.response import circular_loads
+from jaxvib.steady.response import circular_loads, natural_frequencies
 
 __all__ = [
     "BalanceStatus",
@@ -193,9 +193,9 @@ def balanced_stability(
     `balanced_states`. `imbalance` kg m, the rotor's own, at angle 0 of its frame, that the loads cancel too (its mass belongs
     to the machine's). `steps` of a sixth-order Magnus method over one turn.
 
-    **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, and for
-    effects that disturb the balanced motion (gravity); `ComputationError` with the status of `balanced_states` if
-    nothing cancels.
+    **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, for a machine
+    that can drift, and for effects that disturb the balanced motion (gravity); `ComputationError` with the status of
+    `balanced_states` if nothing cancels.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -308,6 +308,11 @@ def stability_changes(
 def _arrangement(scene: Scene, angles: ArrayLike | None, imbalance: float) -> tuple[np.ndarray, int]:
     """Angles at which the loads are known to cancel, and how many neutral directions they have."""
     sides = _sides(circular_loads(scene))
+    if not float(jnp.min(natural_frequencies(scene))) > 0.0:
+        problem = (
+            "let the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
+        )
+        raise InputError("machine.stiffness", problem)
     if angles is None:
         states = balanced_states(scene, imbalance=imbalance)
         if not len(states.angles):
