@@ -310,7 +310,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None, imbalance: float) -> tu
     sides = _sides(circular_loads(scene))
     if not float(jnp.min(natural_frequencies(scene))) > 0.0:
         problem = (
-            "let the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
+            "lets the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
         )
         raise InputError("machine.stiffness", problem)
     if angles is None:
