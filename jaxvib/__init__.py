@@ -15,6 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.supports import CubicSupport, Stop
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
+from jaxvib.motion.regime import PhasePattern, Regime, RegimeName, phase_pattern, regime
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -35,7 +36,9 @@ from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_ro
 from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
+from jaxvib.study.run_ups import RunUps, run_ups
 
 __all__ = [
     "BalanceStatus",
@@ -50,6 +53,7 @@ __all__ = [
     "Criterion",
     "CriterionMap",
     "CriterionStatus",
+    "CriticalSpeeds",
     "CubicSupport",
     "DCMotor",
     "Dimensionless",
@@ -75,12 +79,16 @@ __all__ = [
     "Motor",
     "Orbit",
     "OrbitStatus",
+    "PhasePattern",
     "PlanarRotor",
     "Platforms",
+    "Regime",
+    "RegimeName",
     "Rotor",
     "Run",
     "RunStatus",
     "RunUp",
+    "RunUps",
     "Scene",
     "SpecialPoint",
     "SpinUp",
@@ -89,6 +97,7 @@ __all__ = [
     "Stop",
     "Throw",
     "Trajectory",
+    "Whirl",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -100,6 +109,7 @@ __all__ = [
     "criterion_functional",
     "criterion_map",
     "criterion_table",
+    "critical_speeds",
     "energy",
     "foundation_force",
     "initial_state",
@@ -111,11 +121,14 @@ __all__ = [
     "network",
     "one_mass",
     "pendulums",
+    "phase_pattern",
     "planar_rotor",
     "port_receptance",
     "power",
+    "regime",
     "rollers",
     "rotor",
+    "run_ups",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
@@ -125,4 +138,5 @@ __all__ = [
     "three_mass",
     "two_mass",
     "vector_field",
+    "whirl",
 ]

@@ -18,10 +18,13 @@ __all__ = ["dynamic_stiffness", "loaded_mass", "magnitude", "natural_frequencies
 
 
 def loaded_mass(scene: Scene) -> Array:
-    """M + sum_j m_j B^T B (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port."""
+    """M + sum_j m_j B_j^T B_j (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port or their stations."""
     carrier = scene.machine.carrier()
-    mass = jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
-    return carrier.mass + mass * carrier.port.T @ carrier.port
+    each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
+    if carrier.stations is None:
+        return carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
+    rows = jax.vmap(carrier.port_at)(carrier.stations)
+    return carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
 
 
 def natural_frequencies(scene: Scene) -> Array:
