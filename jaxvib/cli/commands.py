@@ -103,6 +103,7 @@ def _regime(found: jv.Regime) -> dict[str, Any]:
         "ripple": float(found.ripple),
         "phase": found.phase.tolist(),
         "unbalance": float(found.unbalance),
+        "rotor_caught": bool(found.caught),
         "change": float(found.change),
     }
 

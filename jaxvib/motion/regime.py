@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.machine.drive import Motor
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import rotor_angle
 from jaxvib.motion.observables import Trajectory
@@ -56,6 +57,7 @@ class Regime(eqx.Module):
     - `unbalance`: what loads and rotor together leave out of balance in the rotor's frame, relative to the loads' own together
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed` rad/s
     - `mode`: the jam mode that rises to it (2 resonance - 1) or falls from it (2 resonance), 0 where the loads are not jammed
+    - `caught`: whether the rotor itself is held at a resonance, below the speed that its motor would give it without a load
     - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's
     """
 
@@ -69,6 +71,7 @@ class Regime(eqx.Module):
     resonance: Array
     resonance_speed: Array
     mode: Array
+    caught: Array
     change: Array
 
     @property
@@ -94,6 +97,8 @@ class Regime(eqx.Module):
             evidence += [near, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence.append(f"{100.0 * float(self.unbalance):.2g} % of the loads' unbalance is left, {pattern}")
+        if bool(self.caught):
+            evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{sentence} ({'; '.join(evidence)})"
 
@@ -176,8 +181,16 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
         mode=jnp.where(name == RegimeName.jammed, mode, 0),
+        caught=_caught(scene, natural, rotor),
         change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
     )
+
+
+def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
+    """Whether a motor's rotor hangs at a resonance: less than 15 % below one, and more than 5 % below the motor's own speed."""
+    if not isinstance(scene.drive, Motor):
+        return jnp.zeros((), bool)
+    return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
 
 
 def _relative(angle: Array, half: int) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
@@ -23,7 +24,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.steady.response import natural_frequencies
 
-__all__ = ["simulate"]
+__all__ = ["enough_steps", "simulate"]
 
 _WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -34,7 +35,7 @@ _PER_TURN = 16
 _MOST_STEPS = 2**31 - 1
 
 
-class _Tolerance(diffrax.AbstractStepSizeController):
+class _Tolerance(diffrax.AbstractAdaptiveStepSizeController):
     """A step size controller that measures every part of the state in its own unit, and angles absolutely.
 
     An angle grows without end; an error relative to it would let a long run lose its phase.
@@ -42,9 +43,12 @@ class _Tolerance(diffrax.AbstractStepSizeController):
 
     inner: diffrax.AbstractStepSizeController
     unit: State
+    rtol: Any
+    atol: Any
+    norm: Any = optimistix.rms_norm
 
     def wrap(self, direction: Any) -> _Tolerance:
-        return _Tolerance(self.inner.wrap(direction), self.unit)
+        return eqx.tree_at(lambda c: c.inner, self, self.inner.wrap(direction))
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
         return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -162,10 +166,10 @@ def simulate(
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
     state = _whole(scene, start) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
-        max_steps = _enough_steps(scene, end)
+        max_steps = enough_steps(scene, end)
     if controller is None:
         steps = diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
-        controller = _Tolerance(_on_kinks(scene, steps), _units(scene))
+        controller = _Tolerance(inner=_on_kinks(scene, steps), unit=_units(scene), rtol=tolerance, atol=tolerance)
     else:
         controller = _on_kinks(scene, controller)
     run = _run(
@@ -214,7 +218,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
     return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(min(max(float(wanted), 2000.0), 2.0**18)))
 
 
-def _enough_steps(scene: Scene, end: Array) -> int:
+def enough_steps(scene: Scene, end: Array) -> int:
     """500 steps for each turn of what moves fastest, rounded up to a power of 2 so that few numbers need few compilations."""
     fastest = jnp.maximum(scene.drive.speed, jnp.max(natural_frequencies(scene)))
     turns = end * fastest / (2.0 * jnp.pi)

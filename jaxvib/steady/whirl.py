@@ -88,11 +88,12 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
     gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
     part = _TIE * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
 
-    def motions(n: Array, coupling: Array) -> tuple[Array, Array, Array]:
+    def first_order(n: Array, coupling: Array) -> Array:
         resisting = carrier.damping + n * gyroscopic + coupling
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
-        first = jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
-        values, vectors = jnp.linalg.eig(first)
+        return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
+
+    def one_of_each(values: Array) -> tuple[Array, Array]:
         # Of each conjugate pair the one that turns forward in time; real ones, where damping is heavy, come last in pairs.
         scale = jnp.max(jnp.abs(values))
         oscillates = jnp.abs(values.imag) > 1e-12 * scale
@@ -100,15 +101,15 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
         heavy = jnp.sum(~oscillates)
         # Real eigenvalues come first in this order; every other one of them stands for a pair.
         picks = jnp.where(jnp.arange(nd) < heavy // 2, 2 * jnp.arange(nd), jnp.arange(nd) + heavy - heavy // 2)
-        chosen = order[picks]
-        speed = jnp.where(oscillates[chosen], values.imag[chosen], 0.0)
-        return speed, -values.real[chosen], vectors[:nd, chosen]
+        return order[picks], oscillates
 
     def at(n: Array) -> tuple[Array, Array, Array]:
-        speed, decay, _ = motions(n, jnp.zeros_like(mass))
+        values = jnp.linalg.eigvals(first_order(n, jnp.zeros_like(mass)))
+        chosen, oscillates = one_of_each(values)
+        speed = jnp.where(oscillates[chosen], values.imag[chosen], 0.0)
         # Two whirls of one speed are told apart by a coupling too small to be seen in the speeds.
-        shapes = jax.lax.stop_gradient(motions(n, part)[2])
-        return speed, decay, _sense(carrier, shapes) > 0.0
+        apart, shapes = jnp.linalg.eig(jax.lax.stop_gradient(first_order(n, part)))
+        return speed, -values.real[chosen], _sense(carrier, shapes[:nd, one_of_each(apart)[0]]) > 0.0
 
     whirls = jax.vmap(at)(speeds)
     return Whirl(speeds, *whirls, critical=critical_speeds(scene, loads=loads))

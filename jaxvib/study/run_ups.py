@@ -15,9 +15,9 @@ from jaxvib.draw.regimes import regime_chart
 from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, count, numbers
+from jaxvib.machine.units import Number, count, number, numbers
 from jaxvib.motion.regime import Regime, RegimeName
-from jaxvib.motion.simulate import simulate
+from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
 
 if TYPE_CHECKING:
@@ -111,17 +111,13 @@ def run_ups(
         sets = np.asarray(initial_state(scene).angle[0])[None]
     count(batch, "batch")
 
-    def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
-        value, start = lane
-        lane_scene = eqx.tree_at(lambda s: s.loads.drag, scene, value)
-        state = eqx.tree_at(lambda s: s.angle, initial_state(lane_scene), (start,))
-        run = simulate(lane_scene, until, start=state, save="window", tolerance=tolerance, max_steps=max_steps, throw=False)
-        return run.regime, run.omega, jnp.isfinite(run.omega)
-
     grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))
     shape = (len(drags), len(sets))
     size = min(batch, shape[0] * shape[1])
-    named, omega, finished = jax.jit(lambda lanes: jax.lax.map(one, lanes, batch_size=size))(grid)
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    if max_steps is None:
+        max_steps = enough_steps(scene, end)
+    named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
     code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in KINDS]))(named.name)
     kind = np.asarray(KINDS)[np.argmax(np.asarray(code), axis=1)]
 
@@ -136,3 +132,17 @@ def run_ups(
         omega=np.asarray(folded(omega)),
         finished=np.asarray(folded(finished)),
     )
+
+
+@eqx.filter_jit
+def _all(
+    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, tolerance: float, max_steps: int
+) -> tuple[Regime, Array, Array]:
+    def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
+        drag, angle = lane
+        this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
+        start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
+        run = simulate(this, until, start=start, save="window", tolerance=tolerance, max_steps=max_steps, throw=False)
+        return run.regime, run.omega, jnp.isfinite(run.omega)
+
+    return jax.lax.map(one, lanes, batch_size=batch)
