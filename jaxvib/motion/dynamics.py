@@ -170,8 +170,9 @@ class Dynamics(eqx.Module):
     ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
         """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
         if not isinstance(self.drive, Motor):
-            extra = [0.0] * len(part.reaction) if throw is None else throw[1]
-            return part.weight, [g + b for g, b in zip(part.reaction, extra, strict=True)], None
+            if throw is None:
+                return part.weight, part.reaction, None
+            return part.weight, [g + b for g, b in zip(part.reaction, throw[1], strict=True)], None
         free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
