@@ -380,3 +380,35 @@ def test_mujoco_agrees_on_a_planar_rotor_with_loads():
     end = run.trajectory.state
     np.testing.assert_allclose(end.displacement[-1], data.qpos[:2], atol=1e-8)
     np.testing.assert_allclose(end.angle[0][-1], data.qpos[2:], atol=1e-6)
+
+
+def test_loads_in_contact_keep_their_order_and_their_distance():
+    """Four balls, pressed together at rest, spun up: they touch, never pass, and overlap by no more than the spring allows."""
+    diameter, stiffness = 0.03, 2e5
+    s = jv.Scene(
+        jv.planar_rotor(mass=5.0, stiffness=2e4, damping=40.0),
+        jv.balls(count=4, mass=0.1, radius=0.1, drag=0.3),
+        jv.ConstantSpeed(60.0),
+        (jv.Gravity(), jv.LoadContact(diameter=diameter, stiffness=stiffness, damping=30.0)),
+    )
+    start = jv.initial_state(s)
+    step = 2.0 * np.arcsin(diameter / 0.2)
+    np.testing.assert_allclose(np.diff(start.angle[0]), step, rtol=1e-12)
+    run = jv.simulate(s, 3.0, start=start, tolerance=1e-7)
+    angle = np.asarray(run.trajectory.state.angle[0])
+    gaps = np.diff(np.concatenate([angle, angle[:, :1] + 2.0 * np.pi], axis=1), axis=1)
+    assert np.all(gaps > 0.9 * step)
+    assert np.any(gaps[:, :3] < step)
+
+
+def test_a_jam_beside_the_contact_is_the_one_without_it_until_loads_overlap():
+    """A start in a jam lays touching loads side by side about the jam's angle."""
+    s = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.5),
+        jv.ConstantSpeed(60.0),
+        (jv.LoadContact(diameter=0.01, stiffness=1e5),),
+    )
+    start = jv.initial_state(s, "jam", mode=1)
+    np.testing.assert_allclose(np.diff(start.angle[0]), 2.0 * np.arcsin(0.05), rtol=1e-12)
+    np.testing.assert_allclose(jnp.mean(start.angle[0]), 0.0, atol=1e-12)
