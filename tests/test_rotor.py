@@ -405,7 +405,7 @@ def test_a_jam_beside_the_contact_is_the_one_without_it_until_loads_overlap():
     """A start in a jam lays touching loads side by side about the jam's angle."""
     s = jv.Scene(
         jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
-        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.5),
+        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15),
         jv.ConstantSpeed(60.0),
         (jv.LoadContact(diameter=0.01, stiffness=1e5),),
     )

@@ -63,4 +63,5 @@ class Scene(eqx.Module):
         self.machine = machine
         self.loads = loads
         self.drive = drive
-        self.effects = effects
+        # The order has no meaning; it is the one in which a scene file names them.
+        self.effects = tuple(sorted(effects, key=lambda effect: not effect.repeatable))
