@@ -206,6 +206,7 @@ EVERY_EFFECT = (
     jv.DryFriction(0.0015, diameter=0.012, reaction="run_up", width=0.3),
     jv.CubicSupport(1e9, position=0.1),
     jv.Stop(1e6, gap=1e-3, damping=30.0, position=0.165),
+    jv.CubicSupport(2e9, position=-0.1),
     jv.Stop(2e6, gap=2e-3, position=-0.155),
     jv.LoadContact(diameter=0.03, stiffness=1e5, damping=2.0),
 )

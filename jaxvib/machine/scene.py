@@ -64,4 +64,5 @@ class Scene(eqx.Module):
         self.loads = loads
         self.drive = drive
         # The order has no meaning; it is the one in which a scene file names them.
-        self.effects = tuple(sorted(effects, key=lambda effect: not effect.repeatable))
+        first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
+        self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
