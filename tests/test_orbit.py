@@ -71,8 +71,9 @@ def integrate(scene, orbit, periods):
     """SciPy's DOP853 from the orbit at theta = 0 through whole periods; rows are the changes after each, relative."""
     state, period, w = jv.State(*orbit.at(0.0)), 2.0 * np.pi / float(orbit.omega), float(orbit.omega)
     start, restore = ravel_pytree(state)
-    size = jv.State(orbit.amplitude, w * orbit.amplitude, (jnp.ones(orbit.count),), (jnp.full(orbit.count, w),))
-    turns = jv.State(0.0 * orbit.amplitude, 0.0 * orbit.amplitude, (jnp.ones(orbit.count),), (jnp.zeros(orbit.count),))
+    count = orbit.offsets.size
+    size = jv.State(orbit.amplitude, w * orbit.amplitude, (jnp.ones(count),), (jnp.full(count, w),))
+    turns = jv.State(0.0 * orbit.amplitude, 0.0 * orbit.amplitude, (jnp.ones(count),), (jnp.zeros(count),))
     size, turns = (np.asarray(ravel_pytree(x)[0]) for x in (size, turns))
     field = jax.jit(lambda y: ravel_pytree(jv.vector_field(scene)(0.0, restore(y * size)))[0] / size)
     times = period * np.arange(periods + 1)
@@ -188,7 +189,7 @@ def test_light_loads_jam_at_leading_order():
 
 def numbers_of(orbit):
     parts = (orbit.omega, orbit.slope, orbit.amplitude, orbit.foundation_force, orbit.power)
-    parts += (orbit.lag_harmonics[1:3].real, orbit.displacement_harmonics[:, 0].imag)
+    parts += (orbit.lag_harmonics[0, 1:3].real, orbit.displacement_harmonics[:, 0].imag)
     return jnp.concatenate([jnp.ravel(part) for part in parts])
 
 

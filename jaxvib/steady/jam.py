@@ -124,13 +124,13 @@ class JamModes(Jam):
         return "\n".join(lines)
 
 
-def jam_rotor_speed(scene: Scene, omega: Array) -> Array:
+def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
     """The rotor's speed n (rad/s) at which the loads jam, collected, at speed `omega` (scalar, rad/s), for light loads.
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
     with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
-    `omega`, and single-valued through the folds.
+    `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -142,7 +142,7 @@ def jam_rotor_speed(scene: Scene, omega: Array) -> Array:
     """
     loads = circular_loads(scene)
     carrier = scene.machine.carrier()
-    port = carrier.port @ steady_displacement(scene, omega)
+    port = carrier.port @ steady_displacement(scene, omega, speed)
     torque = -loads.unbalance() * omega**2 * jnp.sum(jnp.conj(turning(carrier)) * port).imag / 2.0
     return omega + torque / loads.drag_sum()
 

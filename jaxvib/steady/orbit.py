@@ -18,10 +18,13 @@ from jaxvib.steady.collocation import (
     Harmonics,
     Motion,
     along,
+    bodies,
+    circle,
     grid_of,
     harmonics_of,
     has_half_turn,
     load_torque,
+    per_load,
     periodic_motion,
 )
 from jaxvib.steady.jam import jam_modes, jam_rotor_speed
@@ -41,7 +44,7 @@ class OrbitStatus(eqx.Enumeration):
     absent = "this mode does not exist at this rotor speed"
     not_converged = "no periodic motion was found: the torque balance could not be met"
     coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
-    held = "the loads differ and would part: this is their motion as one body, which nothing holds together"
+    held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
 
 
@@ -60,8 +63,9 @@ class Orbit(eqx.Module):
     - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
       Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
       the multiplier that is 1, as computed
-    - `lag_harmonics` (J,) rad, `displacement_harmonics` (nd, K) m, `force_harmonics` (nb, K) N: the c_k
-    - `lag_orders`, `orders`: the k they belong to; `count`: how many loads
+    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, `force_harmonics` (nb, K) N: the c_k; loads that share
+      every number have one lag (G = 1), else each has its own (G = count)
+    - `lag_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
     """
 
     status: OrbitStatus
@@ -80,9 +84,9 @@ class Orbit(eqx.Module):
     lag_harmonics: Array
     displacement_harmonics: Array
     force_harmonics: Array
+    offsets: Array
     lag_orders: tuple[int, ...] = eqx.field(static=True)
     orders: tuple[int, ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
 
     @property
     def message(self) -> str:
@@ -106,8 +110,8 @@ class Orbit(eqx.Module):
         return (
             (self.displacement_harmonics @ wave).real,
             self.omega * (self.displacement_harmonics @ (1j * k * wave)).real,
-            (jnp.full((self.count,), phi),),
-            (jnp.full((self.count,), rate),),
+            (self.offsets + phi,),
+            (jnp.broadcast_to(rate, self.offsets.shape),),
         )
 
     def summary(self) -> str:
@@ -139,8 +143,9 @@ def jam_orbit(
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
-    stay together by themselves where kappa R and b_W R/m of each are the same, their masses may differ; else their motion as
-    one body is returned, never `stable`, with the status `held`.
+    that share every number are collected at one point, or side by side where they have an `own_radius` (S is then
+    m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other the status is `held`). Loads that differ each
+    have their own psi_j, and take the places next to each other that their torques ask for.
 
     **Arguments**, one of the first three
 
@@ -181,7 +186,7 @@ def jam_orbit(
     if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
-    exists, direction, start = jnp.asarray(True), jnp.asarray(0.0), frozen.drive.speed
+    exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
     if mode is not None:
         direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
         jam = jam_modes(frozen).select(mode, throw=throw)
@@ -193,20 +198,20 @@ def jam_orbit(
     value = scene.drive.speed
     if omega is not None:
         value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
-        which, start = "omega", jam_rotor_speed(frozen, jax.lax.stop_gradient(value))
+        which, start = "omega", light_rotor_speed(frozen, jax.lax.stop_gradient(value))
 
     half = has_half_turn(scene)
     if points is None and not concrete:
         points = 16 if half else 33
     tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
-    speed = jax.lax.stop_gradient(value) if which == "omega" else start
+    still = jax.lax.stop_gradient(value)
     # Reverse-mode derivatives ask for a number of steps that is part of the program.
-    steps = steps_for(frozen, speed)
+    steps = steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
     static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
     many, found = tried[0], None
     for many in tried if concrete else ():
-        found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, direction, which, many, steps, accuracy)
+        found = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy)
         if not float(found.error) > accuracy:
             break
     if found is None or differentiated:
@@ -224,7 +229,7 @@ def _orbit(
     value: Array,
     start: Array,
     exists: Array,
-    direction: Array,
+    direction: Array | None,
     given: Literal["omega", "rotor_speed"],
     points: int,
     steps: int | Array,
@@ -233,10 +238,29 @@ def _orbit(
     lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
-    there = exists & ~(orbit.slope * direction < 0.0)
+    there = exists if direction is None else exists & ~(orbit.slope * direction < 0.0)
     orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
     status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
     return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))
+
+
+def light_rotor_speed(scene: Scene, omega: Array) -> Array:
+    """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
+
+    Where the rotor's speed turns the carrier's answer (gyroscopic), n = w + torque(w, n)/drag is solved for by Newton from
+    n = w: the jam at the lowest rotor speed, if there are several.
+    """
+    if scene.machine.carrier().gyroscopic is None:
+        return jam_rotor_speed(scene, omega)
+
+    def left_over(n: Array) -> Array:
+        return n - jam_rotor_speed(scene, omega, n)
+
+    def newton(_: int, n: Array) -> Array:
+        value, slope = jax.jvp(left_over, (n,), (jnp.ones_like(n),))
+        return jnp.maximum(n - jnp.where(slope > 0.5, value / slope, value), omega)
+
+    return jax.lax.fori_loop(0, 12, newton, omega)
 
 
 def orbits(
@@ -266,26 +290,26 @@ def orbits(
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
     largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
 
-    slope, speed_error, lag_error, amplitude, force, power = measured
+    slope, speed_error, lag_error, amplitude, force, power, push = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = motion.residual < 4096.0 * tiny
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), lag_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
-    parts = _part(scene)
+    parts = push < 0.0
 
-    def status(is_met: Array, is_flat: Array, is_good: Array) -> OrbitStatus:
+    def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
         known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
         known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
-        known = OrbitStatus.where(parts, OrbitStatus.held, known)
+        known = OrbitStatus.where(pulls, OrbitStatus.held, known)
         return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
 
     def or_nan(values: Array) -> Array:
         return jnp.moveaxis(jnp.where(met, values, jnp.nan), -1, 0)
 
     orbit = Orbit(
-        status=jax.vmap(status)(met, flat, error <= accuracy),
+        status=jax.vmap(status)(met, flat, error <= accuracy, parts),
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
@@ -303,30 +327,36 @@ def orbits(
         force_harmonics=or_nan(harmonics.force),
         lag_orders=tuple(map(int, grid.lag_orders)),
         orders=tuple(map(int, grid.orders)),
-        count=scene.loads.count,
+        offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
     )
     return orbit, growth
 
 
-def _part(scene: Scene) -> Array:
-    """Whether the loads' own equations differ, kappa R phi'' + (b_W R/m) (phi' - n) + e'(phi) . a = 0 of each."""
-    loads = circular_loads(scene)
-
-    def differs(value: Array) -> Array:
-        each = jnp.broadcast_to(value, (loads.count,))
-        return jnp.max(each) - jnp.min(each) > 1e3 * jnp.finfo(each.dtype).eps * jnp.max(each)
-
-    return differs(loads.inertia_factor() * loads.radius) | differs(loads.drag * loads.radius / loads.mass)
-
-
 def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
-    """Slope, the two errors, amplitude, foundation force and power of one motion."""
+    """Slope, the two errors, amplitude, foundation force, power and least push between loads of one motion."""
     branch = along(scene, grid, motion)
-    rate = motion.omega * (1.0 + grid.first @ motion.lag)
-    drive = load_torque(scene, grid.theta + motion.lag, rate, motion.rotor_speed, effects=())
+    phi, rate = grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T)
+    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, effects=()), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
-    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * jnp.mean(drive))
+    push = _least_push(scene, grid, motion, harmonics, phi, rate)
+    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
+
+
+def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, phi: Array, rate: Array) -> Array:
+    """The least torque, N m, with which in a period a load that lies side by side with others pushes the next one ahead.
+
+    Load j needs  kappa m R^2 phi'' - torque_j + m R e'(phi_j).a  from its neighbours, the loads up to j the sum of these.
+    """
+    loads = circular_loads(scene)
+    if loads.own_radius is None or loads.count == 1:
+        return jnp.zeros_like(motion.omega)
+    each, acceleration = phi + loads.offsets()[:, None], (harmonics.acceleration @ grid.synthesis).real
+    torque = loads.resistance((each,), (per_load(scene, rate),), motion.rotor_speed)[0]
+    torque = sum((effect.load_force(loads, (each,))[0] for effect in scene.effects), torque)
+    inertia = loads.inertia_factor() * loads.mass * loads.radius**2 * motion.omega**2 * (motion.lag @ grid.second.T)
+    vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, each)[1], acceleration)
+    return jnp.min(-jnp.cumsum(inertia - torque + vibration, axis=0)[:-1])
 
 
 def _swing(grid: Grid, harmonics: Array) -> Array:
