@@ -73,7 +73,9 @@ def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: boo
         motion, harmonics = jax.vmap(one, out_axes=-1)(w)
         if not multipliers:
             return motion.rotor_speed, ()
-        return motion.rotor_speed, floquet(scene, grid, motion, harmonics, jnp.max(steps_for(scene, w, motion.rotor_speed))).roots
+        return motion.rotor_speed, floquet(
+            scene, grid, motion, harmonics, jnp.max(steps_for(scene, w, motion.rotor_speed))
+        ).roots
 
     return jax.lax.map(batch, omega.reshape(-1, 100))
 

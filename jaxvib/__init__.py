@@ -28,7 +28,8 @@ from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
-from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
+from jaxvib.steady.jam_orbit import jam_orbit
+from jaxvib.steady.orbit import Orbit, OrbitStatus
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.study.criterion_map import CriterionMap, criterion_map

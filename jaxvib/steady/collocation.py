@@ -24,12 +24,13 @@ __all__ = [
     "along",
     "bodies",
     "circle",
+    "each_load",
     "grid_of",
     "harmonics_of",
     "has_half_turn",
     "load_torque",
     "periodic_motion",
-    "per_load",
+    "torque_of_each",
 ]
 
 _STEPS = 60
@@ -120,27 +121,28 @@ def has_half_turn(scene: Scene) -> bool:
     return not scene.effects
 
 
-def per_load(scene: Scene, of_bodies: Array) -> Array:
-    """What belongs to the G bodies (G, ...) for each load (count, ...)."""
-    return jnp.broadcast_to(of_bodies, (scene.loads.count, *of_bodies.shape[1:]))
+def each_load(scene: Scene, phi: Array, rate: Array) -> tuple[Array, Array]:
+    """Angles and rates of bodies (G, M) as those of each load (count, M)."""
+    shape = (scene.loads.count, phi.shape[1])
+    return phi + circular_loads(scene).offsets()[:, None], jnp.broadcast_to(rate, shape)
+
+
+def torque_of_each(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+    """What turns loads at angles `phi` besides the vibration, N m: resistance and effects (the scene's unless named)."""
+    loads, acting = scene.loads, scene.effects if effects is None else effects
+    torque = loads.resistance((phi,), (rate,), speed)[0]
+    return sum((effect.load_force(loads, (phi,))[0] for effect in acting), torque)
 
 
 def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
-    """What turns the bodies at angles `phi` (G, M) besides the vibration, N m: resistance and effects of their loads, (G, M).
-
-    `effects` are the scene's unless others are named; () leaves what the rotor gives.
-    """
-    loads, acting = circular_loads(scene), scene.effects if effects is None else effects
-
-    def each(angle: Array, angle_rate: Array) -> Array:
-        torque = loads.resistance((angle,), (angle_rate,), speed)[0]
-        return sum((effect.load_force(loads, (angle,))[0] for effect in acting), torque)
-
+    """What turns the bodies at angles `phi` (G, M), see `torque_of_each`, summed over the loads of each, (G, M)."""
+    loads = circular_loads(scene)
     if not loads.alike:
-        return jax.vmap(each, in_axes=1, out_axes=1)(phi, rate)
+        each = jax.vmap(lambda p, r: torque_of_each(scene, p, r, speed, effects), in_axes=1, out_axes=1)
+        return each(phi, rate)
     if loads.own_radius is None:
-        return loads.count * each(phi, rate)
-    return jnp.sum(each(phi + loads.offsets()[:, None], per_load(scene, rate)), axis=0, keepdims=True)
+        return loads.count * torque_of_each(scene, phi, rate, speed, effects)
+    return jnp.sum(torque_of_each(scene, *each_load(scene, phi, rate), speed, effects), axis=0, keepdims=True)
 
 
 def circle(scene: Scene, phi: Array) -> tuple[Array, Array]:
@@ -237,9 +239,7 @@ class Motion(NamedTuple):
     residual: Array
 
 
-def periodic_motion(
-    scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None
-) -> Motion:
+def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
         I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n) - S_g e'(phi_g) . a
@@ -284,7 +284,9 @@ class _State(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def _newton(scene: Scene, value: Array, start: Array, lag: Array, *, grid: tuple[int, bool], given: Given) -> tuple[Array, Array]:
+def _newton(
+    scene: Scene, value: Array, start: Array, lag: Array, *, grid: tuple[int, bool], given: Given
+) -> tuple[Array, Array]:
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.

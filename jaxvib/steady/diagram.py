@@ -162,7 +162,9 @@ def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
 @eqx.filter_jit
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
     start = jax.vmap(lambda w: light_rotor_speed(scene, w))(omega)
-    orbit, growth = orbits(scene, omega, start, "omega", many, jnp.max(jax.vmap(lambda w, n: steps_for(scene, w, n))(omega, start)), accuracy)
+    orbit, growth = orbits(
+        scene, omega, start, "omega", many, jnp.max(jax.vmap(lambda w, n: steps_for(scene, w, n))(omega, start)), accuracy
+    )
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 
