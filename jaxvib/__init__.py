@@ -33,6 +33,9 @@ from jaxvib.steady.orbit import Orbit, OrbitStatus
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
+from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
+from jaxvib.study.onset import StabilityMap, onset, stability_map
+from jaxvib.study.tiers import Tiers, compare_tiers
 
 __all__ = [
     "BalanceStatus",
@@ -54,6 +57,7 @@ __all__ = [
     "ExactBranches",
     "Folds",
     "Gravity",
+    "HarmonicConvergence",
     "InputError",
     "Jam",
     "JamModes",
@@ -69,7 +73,9 @@ __all__ = [
     "Scene",
     "SpecialPoint",
     "SpinUp",
+    "StabilityMap",
     "State",
+    "Tiers",
     "Trajectory",
     "balanced_growth",
     "balanced_intervals",
@@ -78,12 +84,14 @@ __all__ = [
     "balls",
     "branches",
     "characteristic_speeds",
+    "compare_tiers",
     "criterion",
     "criterion_functional",
     "criterion_map",
     "criterion_table",
     "energy",
     "foundation_force",
+    "harmonic_convergence",
     "initial_state",
     "jam_modes",
     "jam_orbit",
@@ -92,6 +100,7 @@ __all__ = [
     "natural_frequencies",
     "network",
     "one_mass",
+    "onset",
     "pendulums",
     "port_receptance",
     "power",
@@ -101,6 +110,7 @@ __all__ = [
     "scene_to_toml",
     "settle",
     "simulate",
+    "stability_map",
     "steady_displacement",
     "three_mass",
     "two_mass",

@@ -115,12 +115,12 @@ def jam_orbit(
     steps = steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
     static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
-    many, found = tried[0], None
+    many, found, settle = tried[0], None, False
 
     def attempt() -> Orbit:
         nonlocal many
         for many in tried:
-            orbit = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy)
+            orbit = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
             if not float(orbit.error) > accuracy:
                 break
         return orbit
@@ -130,11 +130,12 @@ def jam_orbit(
         if mode is not None and not bool(jnp.abs(found.omega / start - 1.0) < _FAR):
             # The leading order has no such mode, or it is far from the exact one: look at the whole exact branch.
             searched = exact_mode_speeds(frozen).get(int(mode))
-            if searched is not None:
-                exists, start = jnp.asarray(True), jnp.asarray(searched, dtype=start.dtype)
-                found = attempt()
+            exists = jnp.asarray(searched is not None)
+            start = start if searched is None else jnp.asarray(searched, dtype=start.dtype)
+            settle = True
+            found = attempt()
     if found is None or differentiated:
-        found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy)
+        found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy, settle)
     elif throw:
         for status in ("absent", "not_converged"):
             if bool(found.status == getattr(OrbitStatus, status)):
@@ -153,8 +154,14 @@ def _orbit(
     points: int,
     steps: int | Array,
     accuracy: float,
+    settle: bool = False,
 ) -> Orbit:
-    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
+    """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
+    lag = None
+    if settle:
+        grid = grid_of(points, has_half_turn(scene))
+        lag = periodic_motion(scene, grid, "omega", start, light_rotor_speed(scene, start)).lag[None]
+    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, lag)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
     there = exists
@@ -172,12 +179,12 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     """
     crowded, resonances = fold_points(scene, _SEARCH)
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
-    crowded = np.append(crowded[crowded < target], target)
+    crowded = np.sort(np.append(crowded, target))
     omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
     speed, slope = (np.ravel(x) for x in _branch(scene, jnp.asarray(omega).reshape(-1, _LANES)))
-    known = np.isfinite(speed)
-    omega, speed, slope = omega[known], speed[known], slope[known]
-    turn = np.flatnonzero(slope[1:] * slope[:-1] < 0.0)[: 4 * nd]
+    omega, speed = _between(*(x[np.isfinite(speed)] for x in (omega, speed, slope)))
+    rising = speed[1:] > speed[:-1]
+    turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
     padded = np.pad(turn, (0, 4 * nd - turn.size))
     main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
     there = main < turn.size
@@ -188,12 +195,18 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
         found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
     # So close to a fold that it lies between two points: both of its modes are about there.
-    for k in turn:
-        reach = 0.5 * slope[k] ** 2 / (slope[k] - slope[k + 1]) * (omega[k + 1] - omega[k])
-        if 0.0 <= (target - speed[k]) / reach <= 1.5:
-            found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k]))
-            found.setdefault(int(modes[np.searchsorted(cuts, omega[k + 1])]), float(omega[k + 1]))
+    for k in turn[np.abs(speed[turn] - target) < 1e-6 * target]:
+        for side in (k - 1, k + 1):
+            found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
     return found
+
+
+def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray, parts: int = 32) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cubics through (x, y) with these slopes, `parts` an interval."""
+    t, h = np.arange(parts) / parts, np.diff(x)[:, None]
+    a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
+    cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
+    return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
 
 
 @eqx.filter_jit

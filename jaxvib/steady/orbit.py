@@ -148,19 +148,21 @@ def orbits(
     points: int,
     steps: int | Array,
     accuracy: float,
+    lag: Array | None = None,
 ) -> tuple[Orbit, Floquet]:
-    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from.
+    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from, `lag`
+    (P, G, M) where psi does.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
     grid = grid_of(points, has_half_turn(scene))
 
-    def one(v: Array, s: Array) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
-        motion = periodic_motion(scene, grid, given, v, s)
+    def one(v: Array, s: Array, lag: Array | None) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
+        motion = periodic_motion(scene, grid, given, v, s, lag)
         harmonics = harmonics_of(scene, grid, motion)
         return motion, harmonics, _measured(scene, grid, motion, harmonics)
 
-    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start)
+    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, lag)
     growth = floquet(scene, grid, motion, harmonics, steps)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
