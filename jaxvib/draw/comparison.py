@@ -27,13 +27,13 @@ def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable:
 
 
 def convergence_chart(harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str]) -> Figure:
-    """Errors (n, w) over the highest harmonic (n,), log scale; `known` (n, w), what is said of them, dashed."""
+    """Errors (n, w) over the highest harmonic (n,), log scale; their estimates `known` (n, w) dashed."""
     figure, (axes,) = panels(1, size=(7.0, 4.0))
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
         axes.semilogy(harmonics, np.maximum(error[:, k], floor), "o-", color=color, ms=4.5, label=name)
         axes.semilogy(harmonics, np.maximum(known[:, k], floor), ls=(0, (3, 2)), lw=1.0, color=color)
-    axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="as the orbit says")
+    axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="estimate")
     axes.set_xlabel("highest harmonic")
     axes.set_ylabel("relative error of the rotor speed")
     axes.legend(title="loads at")

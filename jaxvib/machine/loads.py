@@ -86,9 +86,9 @@ class CircularLoads(Loads):
     def offsets(self) -> Array:
         """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
         if self.own_radius is None:
-            return jnp.zeros((self.count,), dtype=self.mass.dtype)
-        place = jnp.arange(1 - self.count, self.count, 2, dtype=self.mass.dtype)
-        return place * jnp.arcsin(self.own_radius / self.radius)
+            return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
+        angle = jnp.arcsin(self.own_radius / self.radius)
+        return jnp.arange(1 - self.count, self.count, 2, dtype=angle.dtype) * angle
 
     def unbalance(self) -> Array:
         """The unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
@@ -137,7 +137,7 @@ def _fit(loads: CircularLoads, r: Array) -> None:
         if not float(r) < most:
             raise InputError(
                 "loads.own_radius",
-                f"is {float(r):.6g} m; {loads.count} side by side on a circle of {float(loads.radius):.6g} m have room if it is "
+                f"is {float(r):.6g} m; {loads.count} side by side on a circle of {float(loads.radius):.6g} m have room "
                 f"below {most:.6g} m",
             )
 

@@ -413,8 +413,8 @@ def _lag_harmonics(grid: Grid, values: Array) -> Array:
 
 
 class Harmonics(NamedTuple):
-    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (G, J) rad; `displacement` (nd, K) m of the
-    carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (G, J) rad; `displacement` (nd, K) m of
+    the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
 
     lag: Array
     displacement: Array
