@@ -33,12 +33,16 @@ from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
-from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
+from jaxvib.steady.jam_orbit import jam_orbit
+from jaxvib.steady.orbit import Orbit, OrbitStatus
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
+from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
+from jaxvib.study.onset import StabilityMap, onset, stability_map
 from jaxvib.study.run_ups import RunUps, run_ups
+from jaxvib.study.tiers import Tiers, compare_tiers
 
 __all__ = [
     "BalanceStatus",
@@ -65,6 +69,7 @@ __all__ = [
     "Folds",
     "Friction",
     "Gravity",
+    "HarmonicConvergence",
     "IdealDrive",
     "InductionMotor",
     "InputError",
@@ -92,10 +97,12 @@ __all__ = [
     "Scene",
     "SpecialPoint",
     "SpinUp",
+    "StabilityMap",
     "State",
     "StaticImbalance",
     "Stop",
     "Throw",
+    "Tiers",
     "Trajectory",
     "Whirl",
     "balanced_growth",
@@ -105,6 +112,7 @@ __all__ = [
     "balls",
     "branches",
     "characteristic_speeds",
+    "compare_tiers",
     "criterion",
     "criterion_functional",
     "criterion_map",
@@ -112,6 +120,7 @@ __all__ = [
     "critical_speeds",
     "energy",
     "foundation_force",
+    "harmonic_convergence",
     "initial_state",
     "jam_modes",
     "jam_orbit",
@@ -120,6 +129,7 @@ __all__ = [
     "natural_frequencies",
     "network",
     "one_mass",
+    "onset",
     "pendulums",
     "phase_pattern",
     "planar_rotor",
@@ -134,6 +144,7 @@ __all__ = [
     "scene_to_toml",
     "settle",
     "simulate",
+    "stability_map",
     "steady_displacement",
     "three_mass",
     "two_mass",

@@ -208,7 +208,7 @@ def _fields(part: Any, build: Callable[..., Any]) -> dict[str, Any]:
     fields = {}
     for name in inspect.signature(build).parameters:
         value = getattr(part, name)
-        if value is None:
+        if value is None:  # an option that was not taken
             continue
         if isinstance(value, tuple):
             fields[name] = [list(pair) for pair in value]
@@ -229,6 +229,7 @@ count = 3
 mass = "800 g"              # of one load
 radius = "120 mm"           # of the circle of the loads' centres
 drag = "1.5 N s/m"          # viscous resistance of one load against the rotor, at that radius
+# own_radius = "20 mm"      # of a ball or roller: collected loads then lie side by side, else at one point
 # inertia = 0.0             # kg m^2 about the mass centre, pendulums only
 
 [drive]
