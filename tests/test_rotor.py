@@ -91,13 +91,16 @@ CASES = {
             jv.Stop(2e6, gap=2e-4, damping=300.0, side="below", platform=1),
         ),
     ),
-    "contact": lambda: (machine(0.0), "dc", (jv.Gravity(), jv.LoadContact(diameter=0.03, stiffness=1e5, damping=20.0))),
+    "contact": lambda: (machine(0.0), "dc", (jv.Gravity(), jv.LoadContact(stiffness=1e5, damping=20.0))),
 }
 
 
 def case(name):
     carried, drive, effects = CASES[name]()
-    return jv.Scene(carried, pendulums(), DRIVES[drive](), effects)
+    loads = pendulums()
+    if name == "contact":
+        loads = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.2, own_radius=0.015)
+    return jv.Scene(carried, loads, DRIVES[drive](), effects)
 
 
 def residual(s, t, state, field):
@@ -109,7 +112,8 @@ def residual(s, t, state, field):
     planar = nd == 2
     vertical = isinstance(s.machine, jv.Platforms)
     motor = isinstance(s.drive, jv.Motor)
-    m, r, inertia, drag = (float(getattr(s.loads, name)) for name in ("mass", "radius", "inertia", "drag"))
+    m, r, drag = (float(getattr(s.loads, name)) for name in ("mass", "radius", "drag"))
+    inertia = float(s.loads.inertia) if s.loads.kind == "pendulum" else 0.4 * m * r**2
     stations = np.zeros(n) if planar else np.broadcast_to(np.asarray(s.machine.stations), (n,))
     kinds = {e.kind: e for e in s.effects}
     g = float(kinds["gravity"].g) if "gravity" in kinds else 0.0
@@ -182,7 +186,7 @@ def residual(s, t, state, field):
             c = kinds["load_contact"]
             for j in range(n):
                 apart = jnp.sqrt(jnp.sum((bob(x, j) - bob(x, (j + 1) % n)) ** 2))
-                total += 0.5 * c.stiffness * jnp.maximum(c.diameter - apart, 0.0) ** 2
+                total += 0.5 * c.stiffness * jnp.maximum(2.0 * s.loads.own_radius - apart, 0.0) ** 2
         return total
 
     def resisting(x, v):
@@ -232,8 +236,9 @@ def residual(s, t, state, field):
             for j in range(n):
                 apart = lambda y, j=j: jnp.sqrt(jnp.sum((bob(y, j) - bob(y, (j + 1) % n)) ** 2))  # noqa: E731
                 gap, rate = jax.jvp(apart, (x,), (v,))
-                press = jnp.maximum(c.stiffness * (c.diameter - gap) - c.damping * rate, 0.0)
-                force += jnp.where(gap < c.diameter, press - c.stiffness * (c.diameter - gap), 0.0) * jax.grad(apart)(x)
+                spring = c.stiffness * (2.0 * s.loads.own_radius - gap)
+                press = jnp.maximum(spring - c.damping * rate, 0.0)
+                force += jnp.where(spring > 0.0, press - spring, 0.0) * jax.grad(apart)(x)
         if motor:
             force = force.at[-1].add(s.drive.torque(v[-1]))
         return force
@@ -387,9 +392,9 @@ def test_loads_in_contact_keep_their_order_and_their_distance():
     diameter, stiffness = 0.03, 2e5
     s = jv.Scene(
         jv.planar_rotor(mass=5.0, stiffness=2e4, damping=40.0),
-        jv.balls(count=4, mass=0.1, radius=0.1, drag=0.3),
+        jv.balls(count=4, mass=0.1, radius=0.1, drag=0.3, own_radius=0.5 * diameter),
         jv.ConstantSpeed(60.0),
-        (jv.Gravity(), jv.LoadContact(diameter=diameter, stiffness=stiffness, damping=30.0)),
+        (jv.Gravity(), jv.LoadContact(stiffness=stiffness, damping=30.0)),
     )
     start = jv.initial_state(s)
     step = 2.0 * np.arcsin(diameter / 0.2)
@@ -401,13 +406,13 @@ def test_loads_in_contact_keep_their_order_and_their_distance():
     assert np.any(gaps[:, :3] < step)
 
 
-def test_a_jam_beside_the_contact_is_the_one_without_it_until_loads_overlap():
+def test_touching_loads_start_a_jam_side_by_side():
     """A start in a jam lays touching loads side by side about the jam's angle."""
     s = jv.Scene(
         jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
-        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15),
+        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15, own_radius=0.005),
         jv.ConstantSpeed(60.0),
-        (jv.LoadContact(diameter=0.01, stiffness=1e5),),
+        (jv.LoadContact(stiffness=1e5),),
     )
     start = jv.initial_state(s, "jam", mode=1)
     np.testing.assert_allclose(np.diff(start.angle[0]), 2.0 * np.arcsin(0.05), rtol=1e-12)

@@ -208,7 +208,6 @@ EVERY_EFFECT = (
     jv.Stop(1e6, gap=1e-3, damping=30.0, position=0.165),
     jv.CubicSupport(2e9, position=-0.1),
     jv.Stop(2e6, gap=2e-3, position=-0.155),
-    jv.LoadContact(diameter=0.03, stiffness=1e5, damping=2.0),
 )
 
 
@@ -227,7 +226,9 @@ def test_scene_file_of_a_rotor_with_every_effect(drive, stations, tmp_path):
     loads_ = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
     s = eqx.tree_at(lambda s: s.drive.speed, jv.Scene(machine_, loads_, drive, EVERY_EFFECT), drive.speed / 3.0)
     same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
-    plane = jv.Scene(jv.planar_rotor(mass=3.0, stiffness=1e5, damping=0.1), loads_, drive, (jv.Stop(1e6, gap=1e-3),))
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    extra = (jv.Stop(1e6, gap=1e-3), jv.LoadContact(stiffness=1e5, damping=2.0))
+    plane = jv.Scene(jv.planar_rotor(mass=3.0, stiffness=1e5, damping=0.1), balls_, drive, extra)
     same(jv.load_scene(jv.save_scene(plane, tmp_path / "scene.toml")), plane)
 
 
@@ -245,8 +246,13 @@ def two():
     return jv.two_mass(**TWO_MASS)
 
 
-def contact(diameter):
-    return (jv.LoadContact(diameter=diameter, stiffness=1e5),)
+def contact():
+    return (jv.LoadContact(stiffness=1e5),)
+
+
+def touching():
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    return jv.Scene(jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]), balls_, jv.ConstantSpeed(1.0), contact())
 
 
 WRONG_ROTORS = {
@@ -269,8 +275,8 @@ WRONG_ROTORS = {
     "side of a ring": (lambda: rotor_scene(effects=(jv.Stop(1.0, 0.0, side="above", position=0.1),)), r"it must be 'both'"),
     "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),
     "reaction": (lambda: jv.DryFriction(0.1, 0.01, reaction="none"), r"is 'none'; allowed: exact, run_up, steady"),
-    "too many to fit": (lambda: rotor_scene(effects=contact(0.15)), r"at most 2 such loads fit on the track, the scene has 4"),
-    "too large to fit": (lambda: rotor_scene(effects=contact(0.17)), r"it must fit in the track"),
+    "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their own_radius"),
+    "contact of several tracks": (lambda: touching(), r"needs loads on one track; this machine has them at several stations"),
     "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"names gravity 2 times"),
 }
 

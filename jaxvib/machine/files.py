@@ -261,7 +261,6 @@ gravity = true              # gravity on the loads
 static_imbalance = { moment = "8 g m" }
 # moment_imbalance = { moment = 1e-4 }    # kg m^2
 # dry_friction = { coefficient = 0.0015, diameter = "12 mm" }
-# load_contact = { diameter = "30 mm", stiffness = 1e6 }
 # [[effects.stop]]
 # position = 0.165
 # stiffness = 1e7

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.effects import Effect
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.response import circular_loads, dynamic_stiffness, small_solve
@@ -135,7 +136,8 @@ def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, effects
     """What turns loads at angles `phi` besides the vibration, N m: resistance and effects (the scene's unless named)."""
     loads, acting = scene.loads, scene.effects if effects is None else effects
     torque = loads.resistance((jnp.asarray(phi),), (rate,), speed)[0]
-    forces = (effect.load_force(loads, (jnp.asarray(phi),)) for effect in acting)
+    # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
+    forces = (effect.load_force(loads, (jnp.asarray(phi),)) for effect in acting if not isinstance(effect, LoadContact))
     return sum((force[0] for force in forces if force is not None), torque)
 
 
