@@ -162,3 +162,9 @@ def test_loads_side_by_side_need_room_and_one_size():
 def test_modes_have_no_numbers_where_resonances_move_with_the_rotor():
     with pytest.raises(jv.InputError, match="give omega or near"):
         jv.jam_orbit(rotor(0.093), mode=1)
+
+
+def test_a_rotor_out_of_balance_has_no_periodic_jam():
+    s = scene("two_mass", effects=(jv.StaticImbalance(0.01),))
+    with pytest.raises(jv.InputError, match=r"effects\.static_imbalance shakes the machine at the rotor's own speed"):
+        jv.jam_orbit(s, mode=1)

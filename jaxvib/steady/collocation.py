@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.errors import InputError
 from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.effects import Effect
 from jaxvib.machine.scene import Scene
@@ -111,8 +112,13 @@ class Bodies(NamedTuple):
 
 
 def bodies(scene: Scene) -> Bodies:
-    """The collected loads of the scene as bodies."""
+    """The collected loads of the scene as bodies. **Raises** `InputError` for a rotor out of balance."""
     loads = circular_loads(scene)
+    for effect in scene.effects:
+        if effect.throws:
+            raise InputError(
+                f"effects.{effect.kind}", "shakes the machine at the rotor's own speed, so that no motion repeats; leave it out"
+            )
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
     if loads.alike:
         n = loads.count
