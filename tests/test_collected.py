@@ -8,7 +8,7 @@ import pytest
 from gyroscopic_rotor import rotor
 from jax.flatten_util import ravel_pytree
 from periodic import integrate, monodromy, ordered
-from scenes import machines
+from scenes import machines, scene
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
