@@ -9,7 +9,9 @@ from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_
 from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.averaged import Amplitudes, Averaged, averaged_field
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.motion.envelope import Envelope, Envelopes, EnvelopeStatus, envelope
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
@@ -34,6 +36,8 @@ from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, po
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
 
 __all__ = [
+    "Amplitudes",
+    "Averaged",
     "BalanceStatus",
     "BalancedStability",
     "BalancedStates",
@@ -50,6 +54,9 @@ __all__ = [
     "Drive",
     "Dynamics",
     "Effect",
+    "Envelope",
+    "EnvelopeStatus",
+    "Envelopes",
     "ExactBranches",
     "Folds",
     "Gravity",
@@ -70,6 +77,7 @@ __all__ = [
     "SpinUp",
     "State",
     "Trajectory",
+    "averaged_field",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -82,6 +90,7 @@ __all__ = [
     "criterion_map",
     "criterion_table",
     "energy",
+    "envelope",
     "foundation_force",
     "initial_state",
     "jam_modes",
