@@ -17,8 +17,8 @@ that turn with theta. Its slow part is kept, the part at twice the speed is drop
     I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a),     psi_j' = w_j - Omega,     a = e^H B A
 
 Only a, the forward circular part of the port's acceleration, drives loads; the backward part averages to zero. As A contains
-w_j', the loads' own reaction, the w_j' are implicit; with p = e^H B M^-1 B^T e, s_j = S_j^2/(2 I_j) and f_j = D_j (n - w_j)/I_j they
-follow from one complex number a:
+w_j', the loads' own reaction, the w_j' are implicit; with p = e^H B M^-1 B^T e, s_j = S_j^2/(2 I_j) and
+f_j = D_j (n - w_j)/I_j they follow from one complex number a:
 
     (1 - p sum_j s_j/2) a + (p/2) sum_j s_j e^{2 i psi_j} conj(a) = e^H B M^-1(...) + p sum_j S_j e^{i psi_j} (w_j^2 - i f_j)
 

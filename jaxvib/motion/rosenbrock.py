@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 __all__ = ["Rodas4"]
@@ -35,6 +36,29 @@ _DENSE = (
     (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
     (-0.6762803392801253, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
 )
+
+
+@jax.custom_jvp
+def _inverse(matrix: Array) -> Array:
+    """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the time
+    loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
+
+    There is no search for pivots: what is inverted is 1/(gamma h) - J, whose diagonal outweighs the rest where h is small, and a
+    step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
+    """
+    for i in range(matrix.shape[0]):
+        here = np.arange(matrix.shape[0]) == i
+        pivot = 1.0 / matrix[i, i]
+        row = jnp.where(here, pivot, matrix[i] * pivot)
+        others = jnp.where(here[None, :], 0.0, matrix) - matrix[:, i][:, None] * row[None, :]
+        matrix = jnp.where(here[:, None], row[None, :], others)
+    return matrix
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    inverse = _inverse(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
@@ -94,7 +118,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         _, along = jax.linearize(lambda t, y: terms.vf(t, y, args), t0, y0)
         jacobian = jax.vmap(lambda v: along(jnp.zeros_like(t0), v), out_axes=1)(columns)
         change = along(jnp.ones_like(t0), jnp.zeros_like(y0))
-        inverse = jnp.linalg.inv(per_step / _GAMMA * columns - jacobian)
+        inverse = _inverse(per_step / _GAMMA * columns - jacobian)
 
         stages: list[Array] = []
         for a, c, node, slope in zip(_A, _C, _NODES, _SLOPES, strict=True):
