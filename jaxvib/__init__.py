@@ -13,7 +13,9 @@ from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, t
 from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.supports import CubicSupport, Stop
+from jaxvib.motion.averaged import Amplitudes, Averaged, averaged_field
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.motion.envelope import Envelope, Envelopes, EnvelopeStatus, envelope
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.regime import PhasePattern, Regime, RegimeName, phase_pattern, regime
 from jaxvib.motion.run import Run, RunStatus
@@ -45,6 +47,8 @@ from jaxvib.study.run_ups import RunUps, run_ups
 from jaxvib.study.tiers import Tiers, compare_tiers
 
 __all__ = [
+    "Amplitudes",
+    "Averaged",
     "BalanceStatus",
     "BalancedStability",
     "BalancedStates",
@@ -65,6 +69,9 @@ __all__ = [
     "DryFriction",
     "Dynamics",
     "Effect",
+    "Envelope",
+    "EnvelopeStatus",
+    "Envelopes",
     "ExactBranches",
     "Folds",
     "Friction",
@@ -105,6 +112,7 @@ __all__ = [
     "Tiers",
     "Trajectory",
     "Whirl",
+    "averaged_field",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -119,6 +127,7 @@ __all__ = [
     "criterion_table",
     "critical_speeds",
     "energy",
+    "envelope",
     "foundation_force",
     "harmonic_convergence",
     "initial_state",
