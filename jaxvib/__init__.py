@@ -15,6 +15,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.swing import BearingPendulum, Swing, SwingStatus, swing
 from jaxvib.steady.balance import (
     BalancedStability,
     BalancedStates,
@@ -32,11 +33,15 @@ from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
+from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
+from jaxvib.study.identify import Identified, IdentifyStatus, identify
+from jaxvib.study.record import Record, read_record
 
 __all__ = [
     "BalanceStatus",
     "BalancedStability",
     "BalancedStates",
+    "BearingPendulum",
     "Branches",
     "Carrier",
     "CharacteristicSpeeds",
@@ -46,13 +51,17 @@ __all__ = [
     "Criterion",
     "CriterionMap",
     "CriterionStatus",
+    "Decrement",
     "Dimensionless",
     "Drive",
     "Dynamics",
     "Effect",
+    "Estimate",
     "ExactBranches",
     "Folds",
     "Gravity",
+    "Identified",
+    "IdentifyStatus",
     "InputError",
     "Jam",
     "JamModes",
@@ -63,13 +72,17 @@ __all__ = [
     "Orbit",
     "OrbitStatus",
     "Platforms",
+    "Record",
     "Run",
     "RunStatus",
     "Scene",
     "SpecialPoint",
     "SpinUp",
     "State",
+    "Swing",
+    "SwingStatus",
     "Trajectory",
+    "TurningPoints",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -83,6 +96,7 @@ __all__ = [
     "criterion_table",
     "energy",
     "foundation_force",
+    "identify",
     "initial_state",
     "jam_modes",
     "jam_orbit",
@@ -94,6 +108,7 @@ __all__ = [
     "pendulums",
     "port_receptance",
     "power",
+    "read_record",
     "rollers",
     "save_scene",
     "scene_from_toml",
@@ -101,7 +116,10 @@ __all__ = [
     "settle",
     "simulate",
     "steady_displacement",
+    "swing",
+    "ten_periods",
     "three_mass",
+    "turning_points",
     "two_mass",
     "vector_field",
 ]
