@@ -135,7 +135,7 @@ def swing(
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)
     >>> run = jv.swing(rod, np.linspace(0.0, 200.0, 5), angle="10 deg", viscous=2e-4, dry=0.02)
     >>> bool(run.status == jv.SwingStatus.stopped), round(float(run.stopped_at), 1)
-    (True, 36.7)
+    (True, 56.2)
 
     Source: Artyunin, Sumenkov 2019, equations (1)-(3).
     """
@@ -163,9 +163,7 @@ def swing(
         count(max_steps, "max_steps"),
     )
     if throw and not traced(run.steps) and bool(run.status == SwingStatus.max_steps_reached):
-        raise ComputationError(
-            "max_steps_reached", f"{SwingStatus.max_steps_reached._value} ({max_steps}); give more max_steps"
-        )
+        raise ComputationError("max_steps_reached", f"{SwingStatus[run.status]} ({max_steps}); give a larger max_steps")
     return run
 
 
@@ -195,24 +193,24 @@ def swing_states(
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
 
     def moving(t: Any, y: tuple[Array, Array], args: None, **_: Any) -> Array:
-        """Changes its sign to minus where the pendulum turns within the dead zone."""
+        """Changes its sign to minus where the pendulum is slow within the dead zone: there the smooth sign lets it creep."""
         assert dry is not None and width is not None
         f, slip = y
-        return jnp.maximum(jnp.abs(slip) - width, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
+        slow = jnp.abs(slip) - 3.0 * width
+        return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
 
     # A start that is held already changes no sign.
-    free = jnp.asarray(True) if dry is None else moving(times[0], (angle, rate), None) > 0.0
+    free = None if dry is None else moving(times[0], (angle, rate), None) > 0.0
 
     def term(t: Any, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
         f, slip = y
         gravity = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f)
-        if dry is None:
-            torque = bearing_torque(slip, viscous=viscous)
-        else:
-            load = pendulum.radial_load(f, slip)
-            diameter = _diameter(pendulum)
-            torque = bearing_torque(slip, viscous=viscous, dry=dry, radial_load=load, diameter=diameter, width=width)
-        return jnp.where(free, slip, 0.0), jnp.where(free, (gravity + torque) / pendulum.total_inertia, 0.0)
+        inertia = pendulum.total_inertia
+        if free is None:
+            return slip, (gravity + bearing_torque(slip, viscous=viscous)) / inertia
+        load, diameter = pendulum.radial_load(f, slip), _diameter(pendulum)
+        torque = bearing_torque(slip, viscous=viscous, dry=dry, radial_load=load, diameter=diameter, width=width)
+        return jnp.where(free, slip, 0.0), jnp.where(free, (gravity + torque) / inertia, 0.0)
 
     scale = jax.lax.stop_gradient(frequency)
     solution = diffrax.diffeqsolve(
@@ -227,22 +225,32 @@ def swing_states(
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
-        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Newton(1e-10, 1e-10)),
+        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12)),
     )
     assert solution.ts is not None and solution.ys is not None
-    (f, slip), ((end,), _) = solution.ys
+    (f, slip), ((end,), (end_slip,)) = solution.ys
     stopped = solution.result == diffrax.RESULTS.event_occurred
-    last = jnp.where(free, jax.lax.stop_gradient(solution.ts[1][0]), times[0])
-    stopped = stopped | ~free
-    after = stopped & (times > last)
+    last = solution.ts[1][0]
+    if free is not None:
+        assert dry is not None
+        last, stopped = jnp.where(free, last, times[0]), stopped | ~free
+        # The last bit of the way by the sharp sign: harmonic, about the end of the dead zone that it moves away from.
+        way = jnp.where(end_slip < 0.0, -1.0, 1.0)
+        middle = -way * pendulum.dead_zone(dry)
+        reach = jnp.hypot(end - middle, end_slip / frequency)
+        last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
+        phase = frequency * jnp.maximum(last - times, 0.0)
+        after = stopped & ~jnp.isfinite(f)
+        f = jnp.where(after, middle + way * reach * jnp.cos(phase), f)
+        slip = jnp.where(after, way * reach * frequency * jnp.sin(phase), slip)
     good = stopped | (solution.result == diffrax.RESULTS.successful)
     status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
     return Swing(
         status=SwingStatus.where(good, status, SwingStatus.max_steps_reached),
         time=times,
-        angle=jnp.where(after, end, jnp.where(good, f, jnp.nan)),
-        rate=jnp.where(after, 0.0, jnp.where(good, slip, jnp.nan)),
-        stopped_at=jnp.where(stopped, last, jnp.nan),
+        angle=jnp.where(good, f, jnp.nan),
+        rate=jnp.where(good, slip, jnp.nan),
+        stopped_at=jax.lax.stop_gradient(jnp.where(stopped, last, jnp.nan)),
         width=jnp.full_like(frequency, jnp.nan) if width is None else width,
         steps=solution.stats["num_steps"],
     )

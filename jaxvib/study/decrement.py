@@ -66,7 +66,7 @@ def turning_points(record: Record) -> TurningPoints:
     t, f = record.time, record.angle
     rough = np.diff(f, 4)
     noise = float(np.median(np.abs(rough))) / 0.6745 / np.sqrt(70.0)  # a smooth signal has hardly a fourth difference
-    peaks = _alternating(f, max(6.0 * noise, 1e-3 * float(np.ptp(f))))
+    peaks = _regular(t, _alternating(f, max(8.0 * noise, 1e-3 * float(np.ptp(f)))))
     if len(peaks) < 3:
         raise InputError(
             record.name, f"turns {len(peaks)} times; at least 3 turning points are needed, record more of the swing"
@@ -117,6 +117,15 @@ def _alternating(f: np.ndarray, least: float) -> list[int]:
     return [k for k in found if 0 < k < f.size - 1]
 
 
+def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
+    """The longest stretch of turning points in step: noise about a pendulum at rest, or the hand that let go, is not."""
+    steps = np.diff(t[peaks])
+    even = [True, *((steps[1:] < 1.6 * steps[:-1]) & (steps[1:] > 0.6 * steps[:-1])), False]
+    cuts = [0, *(k for k, is_even in enumerate(even) if not is_even)]
+    longest = int(np.argmax(np.diff(cuts))) if len(peaks) > 2 else 0
+    return peaks[cuts[longest] : cuts[longest + 1] + 1] if len(peaks) > 2 else peaks
+
+
 def ten_periods(
     pendulum: BearingPendulum, record: Record, *, periods: int = 10, instrument: float = 0.0, turns: TurningPoints | None = None
 ) -> Decrement:
@@ -137,7 +146,7 @@ def ten_periods(
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
     >>> t = np.arange(0.0, 15.0, 0.04)
     >>> run = jv.swing(rod, t, angle="3 deg", viscous=1.5e-3)
-    >>> round(jv.ten_periods(rod, jv.Record(t, run.angle)).viscous.value, 7)
+    >>> round(jv.ten_periods(rod, jv.Record(t, run.angle)).viscous.value, 5)
     0.0015
 
     Source: Artyunin, Sumenkov 2019, equation (3).

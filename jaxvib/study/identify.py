@@ -139,8 +139,8 @@ def identify(
     Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
     Levenberg and Marquardt's method with forward-mode derivatives through the integration. The frequency is free, because a
     pendulum's size is never known well enough for its phase; it is the factor g that gives way, and J is taken from
-    `pendulum`, so that mu1 is in proportion to it. `width` is 0.03 of the smallest swing's speed: dry friction on it is
-    0.04 % too small, on larger ones less.
+    `pendulum`, so that mu1 is in proportion to it. `width` is 0.005 of the smallest swing's speed: dry friction on it is
+    0.001 % too small, on larger ones less.
 
     **Arguments**: `dry`: find mu2 as well (the pendulum needs `bearing`); `instrument`: relative uncertainty of J, from ruler
     and scales (0.03 in the paper), added to the intervals in squares; `throw`: raise where no fit is found.
@@ -216,7 +216,7 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
         viscous=jnp.asarray(2.0 * inertia * w * share / math.pi),
         dry=jnp.asarray(loss * length / float(pendulum.bearing)) if dry and pendulum.bearing is not None else None,
     )
-    return guess, jnp.asarray(0.03 * w * float(np.min(a)))
+    return guess, jnp.asarray(0.005 * w * float(np.min(a)))
 
 
 def steps_for(start: Unknowns, time: Any) -> int:
