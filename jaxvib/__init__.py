@@ -2,15 +2,20 @@
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.drive import ConstantSpeed, Drive, SpinUp
-from jaxvib.machine.effects import Effect, Gravity
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
+from jaxvib.machine.effects import Effect, Friction, Gravity, MomentImbalance, StaticImbalance, Throw
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
+from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.supports import CubicSupport, Stop
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
+from jaxvib.motion.regime import PhasePattern, Regime, RegimeName, phase_pattern, regime
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -32,10 +37,12 @@ from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_ro
 from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
 from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
 from jaxvib.study.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.record import Record, read_record
+from jaxvib.study.run_ups import RunUps, run_ups
 
 __all__ = [
     "BalanceStatus",
@@ -51,38 +58,59 @@ __all__ = [
     "Criterion",
     "CriterionMap",
     "CriterionStatus",
+    "CriticalSpeeds",
+    "CubicSupport",
+    "DCMotor",
     "Decrement",
     "Dimensionless",
     "Drive",
+    "DryFriction",
     "Dynamics",
     "Effect",
     "Estimate",
     "ExactBranches",
     "Folds",
+    "Friction",
     "Gravity",
+    "IdealDrive",
     "Identified",
     "IdentifyStatus",
+    "InductionMotor",
     "InputError",
     "Jam",
     "JamModes",
     "JamStatus",
+    "LoadContact",
     "Loads",
     "Machine",
     "Measured",
+    "MomentImbalance",
+    "Motor",
     "Orbit",
     "OrbitStatus",
+    "PhasePattern",
+    "PlanarRotor",
     "Platforms",
     "Record",
+    "Regime",
+    "RegimeName",
+    "Rotor",
     "Run",
     "RunStatus",
+    "RunUp",
+    "RunUps",
     "Scene",
     "SpecialPoint",
     "SpinUp",
     "State",
+    "StaticImbalance",
+    "Stop",
     "Swing",
     "SwingStatus",
+    "Throw",
     "Trajectory",
     "TurningPoints",
+    "Whirl",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -94,6 +122,7 @@ __all__ = [
     "criterion_functional",
     "criterion_map",
     "criterion_table",
+    "critical_speeds",
     "energy",
     "foundation_force",
     "identify",
@@ -106,10 +135,15 @@ __all__ = [
     "network",
     "one_mass",
     "pendulums",
+    "phase_pattern",
+    "planar_rotor",
     "port_receptance",
     "power",
     "read_record",
+    "regime",
     "rollers",
+    "rotor",
+    "run_ups",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
@@ -122,4 +156,5 @@ __all__ = [
     "turning_points",
     "two_mass",
     "vector_field",
+    "whirl",
 ]

@@ -12,7 +12,7 @@ from scipy.integrate import quad, solve_ivp
 
 import jaxvib as jv
 from jaxvib.cli.app import run
-from jaxvib.machine.friction import bearing_torque, sliding_sign
+from jaxvib.machine.friction import sliding_sign
 from jaxvib.study.identify import first_guess, fit_swing, steps_for, student_quantile
 
 T = 0.05 * np.arange(400)
@@ -54,13 +54,6 @@ def test_radial_load_is_what_holds_the_bob_on_its_circle():
     felt = jax.jacfwd(jax.jacfwd(circle))(0.0) + jnp.array([0.0, 9.81])
     toward_bearing = -circle(0.0) / 0.25
     np.testing.assert_allclose(ROD.radial_load(f, rate), 0.3 * felt @ toward_bearing, rtol=1e-14)
-
-
-def test_bearing_torque_brakes_and_is_the_papers():
-    for slip in (-3.0, 2.0):
-        torque = bearing_torque(slip, viscous=1e-3, dry=0.0015, radial_load=-50.0, diameter=0.02, width=1e-3)
-        np.testing.assert_allclose(torque, -np.sign(slip) * (1e-3 * abs(slip) + 0.0015 * 50.0 * 0.01), rtol=1e-15)
-    assert bearing_torque(2.0, viscous=1e-3) == -2e-3
 
 
 def test_smooth_sign_loses_the_stated_share():

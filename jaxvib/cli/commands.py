@@ -88,11 +88,27 @@ def simulate(
         "amplitude": run.amplitude.tolist(),
         "foundation_force": float(run.foundation_force),
         "drift": float(run.drift),
+        "regime": _regime(run.regime),
         "settled": bool(run.settled),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
     }
     output.done(document, run.summary, "simulate")
+
+
+def _regime(found: jv.Regime) -> dict[str, Any]:
+    """The regime and its evidence; names as in `RegimeName` and `PhasePattern`."""
+    return {
+        "name": found.label,
+        "pattern": found.pattern_label,
+        "mode": int(found.mode),
+        "resonance": int(found.resonance),
+        "resonance_speed": float(found.resonance_speed),
+        "ripple": float(found.ripple),
+        "phase": found.phase.tolist(),
+        "unbalance": float(found.unbalance),
+        "change": float(found.change),
+    }
 
 
 @app.command("optimize")

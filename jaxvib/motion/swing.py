@@ -14,7 +14,7 @@ import optimistix as optx
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.friction import bearing_torque
+from jaxvib.machine.friction import dry_lever
 from jaxvib.machine.units import Number, count, number, numbers, traced
 
 __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
@@ -23,9 +23,9 @@ __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
 class BearingPendulum(eqx.Module):
     """A pendulum on a bearing that stands still, its angle f counted from hanging.
 
-        J f'' = - m g l sin f + M(f', N),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f'),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
 
-    M is the bearing's friction, see `jaxvib.machine.friction.bearing_torque`; N is its radial load, along the rod.
+    mu1 and mu2 are the bearing's viscous and dry friction; N is its radial load, along the rod.
 
     **Arguments**: `mass` m kg; `length` l m, from the bearing's axis to the mass centre; `inertia` J_C kg m^2 about the mass
     centre (0: a point mass; a rod of length L has m L^2/12); `bearing` its diameter d m, needed for dry friction only;
@@ -204,13 +204,12 @@ def swing_states(
 
     def term(t: Any, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
         f, slip = y
-        gravity = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f)
-        inertia = pendulum.total_inertia
+        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
         if free is None:
-            return slip, (gravity + bearing_torque(slip, viscous=viscous)) / inertia
-        load, diameter = pendulum.radial_load(f, slip), _diameter(pendulum)
-        torque = bearing_torque(slip, viscous=viscous, dry=dry, radial_load=load, diameter=diameter, width=width)
-        return jnp.where(free, slip, 0.0), jnp.where(free, (gravity + torque) / inertia, 0.0)
+            return slip, torque / pendulum.total_inertia
+        assert dry is not None and width is not None
+        torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
+        return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
 
     scale = jax.lax.stop_gradient(frequency)
     solution = diffrax.diffeqsolve(

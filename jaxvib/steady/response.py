@@ -8,6 +8,9 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.contact import LoadContact
+from jaxvib.machine.drive import IdealDrive
+from jaxvib.machine.effects import Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
@@ -15,10 +18,13 @@ __all__ = ["dynamic_stiffness", "loaded_mass", "magnitude", "natural_frequencies
 
 
 def loaded_mass(scene: Scene) -> Array:
-    """M + sum_j m_j B^T B (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port."""
+    """M + sum_j m_j B_j^T B_j (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port or their stations."""
     carrier = scene.machine.carrier()
-    mass = jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
-    return carrier.mass + mass * carrier.port.T @ carrier.port
+    each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
+    if carrier.stations is None:
+        return carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
+    rows = jax.vmap(carrier.port_at)(carrier.stations)
+    return carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
 
 
 def natural_frequencies(scene: Scene) -> Array:
@@ -144,6 +150,15 @@ def circular_loads(scene: Scene) -> CircularLoads:
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if not isinstance(scene.loads, CircularLoads):
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
+    if scene.machine.carrier().stations is not None:
+        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
+    if not isinstance(scene.drive, IdealDrive):
+        raise InputError(
+            "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
+        )
+    for effect in scene.effects:
+        if not isinstance(effect, (Gravity, StaticImbalance, MomentImbalance, LoadContact)):
+            raise InputError(f"effects.{effect.kind}", "is not part of this theory; leave it out here, or simulate")
     return scene.loads
 
 
