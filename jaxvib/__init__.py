@@ -35,6 +35,7 @@ from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, crite
 from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
+from jaxvib.steady.phases import PhaseJam, PhaseJams, PhaseStatus, phase_jam, phase_jams, phase_torques
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
@@ -88,7 +89,10 @@ __all__ = [
     "Motor",
     "Orbit",
     "OrbitStatus",
+    "PhaseJam",
+    "PhaseJams",
     "PhasePattern",
+    "PhaseStatus",
     "PlanarRotor",
     "Platforms",
     "Record",
@@ -135,7 +139,10 @@ __all__ = [
     "network",
     "one_mass",
     "pendulums",
+    "phase_jam",
+    "phase_jams",
     "phase_pattern",
+    "phase_torques",
     "planar_rotor",
     "port_receptance",
     "power",
