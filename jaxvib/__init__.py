@@ -22,6 +22,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.swing import BearingPendulum, Swing, SwingStatus, swing
 from jaxvib.steady.balance import (
     BalancedStability,
     BalancedStates,
@@ -37,12 +38,17 @@ from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.orbit import Orbit, OrbitStatus
+from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
+from jaxvib.steady.phases import PhaseJam, PhaseJams, PhaseStatus, phase_jam, phase_jams, phase_torques
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
 from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
 from jaxvib.study.onset import StabilityMap, onset, stability_map
+from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
+from jaxvib.study.identify import Identified, IdentifyStatus, identify
+from jaxvib.study.record import Record, read_record
 from jaxvib.study.run_ups import RunUps, run_ups
 from jaxvib.study.tiers import Tiers, compare_tiers
 
@@ -52,6 +58,7 @@ __all__ = [
     "BalanceStatus",
     "BalancedStability",
     "BalancedStates",
+    "BearingPendulum",
     "Branches",
     "Carrier",
     "CharacteristicSpeeds",
@@ -64,6 +71,7 @@ __all__ = [
     "CriticalSpeeds",
     "CubicSupport",
     "DCMotor",
+    "Decrement",
     "Dimensionless",
     "Drive",
     "DryFriction",
@@ -72,12 +80,15 @@ __all__ = [
     "Envelope",
     "EnvelopeStatus",
     "Envelopes",
+    "Estimate",
     "ExactBranches",
     "Folds",
     "Friction",
     "Gravity",
     "HarmonicConvergence",
     "IdealDrive",
+    "Identified",
+    "IdentifyStatus",
     "InductionMotor",
     "InputError",
     "Jam",
@@ -91,9 +102,13 @@ __all__ = [
     "Motor",
     "Orbit",
     "OrbitStatus",
+    "PhaseJam",
+    "PhaseJams",
     "PhasePattern",
+    "PhaseStatus",
     "PlanarRotor",
     "Platforms",
+    "Record",
     "Regime",
     "RegimeName",
     "Rotor",
@@ -108,9 +123,12 @@ __all__ = [
     "State",
     "StaticImbalance",
     "Stop",
+    "Swing",
+    "SwingStatus",
     "Throw",
     "Tiers",
     "Trajectory",
+    "TurningPoints",
     "Whirl",
     "averaged_field",
     "balanced_growth",
@@ -130,6 +148,7 @@ __all__ = [
     "envelope",
     "foundation_force",
     "harmonic_convergence",
+    "identify",
     "initial_state",
     "jam_modes",
     "jam_orbit",
@@ -140,10 +159,14 @@ __all__ = [
     "one_mass",
     "onset",
     "pendulums",
+    "phase_jam",
+    "phase_jams",
     "phase_pattern",
+    "phase_torques",
     "planar_rotor",
     "port_receptance",
     "power",
+    "read_record",
     "regime",
     "rollers",
     "rotor",
@@ -155,7 +178,10 @@ __all__ = [
     "simulate",
     "stability_map",
     "steady_displacement",
+    "swing",
+    "ten_periods",
     "three_mass",
+    "turning_points",
     "two_mass",
     "vector_field",
     "whirl",

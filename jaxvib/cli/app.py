@@ -107,7 +107,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 def run(arguments: list[str]) -> int:
     """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
-    from jaxvib.cli import commands, criterion, modes, whirl  # noqa: F401 - registers the commands
+    from jaxvib.cli import commands, criterion, identify, modes, whirl  # noqa: F401 - registers the commands
 
     wants_json = "--json" in arguments
     try:

@@ -14,18 +14,22 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.study import measurement
 from optimize import Outcome, Synthesis, load_design, synthesize
 from optimize.files import TEMPLATE
 from optimize.synthesize import wanted
 
+_FILES = {"design": TEMPLATE, "measurement": measurement.TEMPLATE}
+"""The files besides scenes that a command reads."""
+
 
 @app.command("new")
-@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design"]))
+@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), *_FILES]))
 @shared
 def new(kind: str, output: Output) -> None:
-    """Print a commented scene file of that KIND of machine, or a design file."""
-    text = TEMPLATE if kind == "design" else TEMPLATES[kind.replace("-", "_")]
-    path = output.file("design.toml" if kind == "design" else "machine.toml")
+    """Print a commented scene file of that KIND of machine, a design file, or a measurement file for `identify`."""
+    text = _FILES[kind] if kind in _FILES else TEMPLATES[kind.replace("-", "_")]
+    path = output.file(f"{kind}.toml" if kind in _FILES else "machine.toml")
     if path is None:
         output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
         return

@@ -145,13 +145,19 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on a circle only."""
+    """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
+    loads = turning_loads(scene)
+    if scene.machine.carrier().stations is not None:
+        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
+    return loads
+
+
+def turning_loads(scene: Scene) -> CircularLoads:
+    """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if not isinstance(scene.loads, CircularLoads):
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
-    if scene.machine.carrier().stations is not None:
-        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
     if not isinstance(scene.drive, IdealDrive):
         raise InputError(
             "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
