@@ -2,7 +2,7 @@
 
     python benchmarks/envelope.py
 
-For every solver the loosest tolerance that still gives 1 % is found first, then the runs are timed in turn, the best of several,
+For every solver the loosest tolerance that still gives 1 % is found first, then the runs are timed in turn, best of several,
 compile and run time apart; ratios travel between machines, absolute times do not. The error is the largest difference of
 the platforms' amplitudes to a run at tolerance 1e-9, relative to the greatest amplitude of the platform: in each 64th of the
 run (the modulus of the analytic signal, by Fourier transform; not in the first and the last, where it has no
@@ -22,7 +22,6 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxvib as jv  # noqa: E402

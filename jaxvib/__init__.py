@@ -38,16 +38,15 @@ from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.orbit import Orbit, OrbitStatus
-from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.phases import PhaseJam, PhaseJams, PhaseStatus, phase_jam, phase_jams, phase_torques
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
-from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
-from jaxvib.study.onset import StabilityMap, onset, stability_map
 from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
+from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
 from jaxvib.study.identify import Identified, IdentifyStatus, identify
+from jaxvib.study.onset import StabilityMap, onset, stability_map
 from jaxvib.study.record import Record, read_record
 from jaxvib.study.run_ups import RunUps, run_ups
 from jaxvib.study.tiers import Tiers, compare_tiers

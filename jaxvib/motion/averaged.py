@@ -41,7 +41,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.drive import Drive
+from jaxvib.machine.drive import IdealDrive
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State
 from jaxvib.steady.response import _modes, circular_loads, loaded_mass
@@ -82,7 +82,7 @@ class Averaged(eqx.Module):
     unbalance: Array
     inertia: Array
     drag: Array
-    drive: Drive
+    drive: IdealDrive
     axes: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
@@ -142,6 +142,7 @@ def averaged_field(scene: Scene) -> Averaged:
     True
     """
     carrier, loads = scene.machine.carrier(), circular_loads(scene)
+    assert isinstance(scene.drive, IdealDrive)
     parts = [carrier.stiffness, carrier.damping, carrier.port.T]
     parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
     solved = jnp.linalg.solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed, SpinUp
+from jaxvib.machine.drive import ConstantSpeed, IdealDrive, SpinUp
 from jaxvib.machine.effects import Gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
@@ -316,6 +316,7 @@ def _run(
 
 def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
     carrier = scene.machine.carrier()
+    assert isinstance(scene.drive, IdealDrive)
     return Envelopes(
         time=t,
         displacement=state.displacement,
@@ -351,13 +352,14 @@ def _measure(window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
     and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
-    if not scene.effects:
+    loads, pulling = scene.loads, [effect for effect in scene.effects if isinstance(effect, Gravity)]
+    if not pulling:
         return jnp.asarray(True)
-    loads = scene.loads
     angles = jnp.linspace(0.0, 2.0 * jnp.pi, 64, endpoint=False)
     around = [jnp.broadcast_to(angle, (loads.count,)) for angle in angles]
-    height = jnp.stack([sum(effect.load_potential(loads, (u,)) for effect in scene.effects) for u in around])
-    torque = jnp.stack([sum(effect.load_force(loads, (u,))[0] for effect in scene.effects) for u in around])
+    height = jnp.stack([sum(effect.load_potential(loads, (u,)) for effect in pulling) for u in around])
+    slope = jax.vmap(jax.grad(lambda u: sum(jnp.sum(effect.load_potential(loads, (u,))) for effect in pulling)))
+    torque = slope(jnp.stack(around))
     passes = (jnp.max(height, axis=0) - jnp.min(height, axis=0)) / field.inertia
     lifted = field.drag * jnp.max(window.rotor_speed) > jnp.max(jnp.abs(torque), axis=0)
     return jnp.all((jnp.min(window.load_speed**2, axis=0) > passes) & (lifted | (begin.rate**2 > passes)))

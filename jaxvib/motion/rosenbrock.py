@@ -43,8 +43,8 @@ def _inverse(matrix: Array) -> Array:
     """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the time
     loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
 
-    There is no search for pivots: what is inverted is 1/(gamma h) - J, whose diagonal outweighs the rest where h is small, and a
-    step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
+    There is no search for pivots: what is inverted is 1/(gamma h) - J, whose diagonal outweighs the rest where h is small, and
+    a step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
     """
     for i in range(matrix.shape[0]):
         here = np.arange(matrix.shape[0]) == i

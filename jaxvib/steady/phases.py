@@ -38,9 +38,10 @@ class PhaseJam(eqx.Module):
     """A jam whose loads need not stand at one angle: phi_j = Omega t + phase_j.
 
     **Attributes**: `status` a `PhaseStatus`; `omega`, `rotor_speed` rad/s; `phase` (count,) rad, of the first load 0;
-    `pattern` a `PhasePattern`; `growth` 1/s, of the fastest growing small disturbance, and `stable` where it is negative; `displacement`
-    (nd,) complex amplitudes at Omega t; `amplitude` (nd,) and `foundation_force` N, zero to peak; `torque` (count,) N m, the mean torque of
-    the vibration on each load; `residual` of the balance, relative to the drag's torque. NaN where there is no jam.
+    `pattern` a `PhasePattern`; `growth` 1/s, of the fastest growing small disturbance, and `stable` where it is negative;
+    `displacement` (nd,) complex amplitudes at Omega t; `amplitude` (nd,) and `foundation_force` N, zero to peak; `torque`
+    (count,) N m, the mean torque of the vibration on each load; `residual` of the balance, relative to the drag's torque.
+    NaN where there is no jam.
     """
 
     status: PhaseStatus
@@ -131,7 +132,7 @@ def _torques(parts: _Parts, influence: Array, omega: Array, phase: Array) -> Arr
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
-    """Mean torque (count,) N m of the vibration on each of the loads; they turn at `omega` (scalar, rad/s), at `phase` (count,).
+    """Mean torque (count,) N m of the vibration on each load; they turn at `omega` (scalar, rad/s), at `phase` (count,).
 
         T_j = (w^4/2) S_j sum_k S_k Im[exp(i (a_k - a_j)) e^H L_j D(w)^-1 L_k^T e],     S = m R
         D(w) = K - w^2 (M + sum_j m_j L_j^T L_j) + i w (C + n G)
