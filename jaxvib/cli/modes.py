@@ -10,6 +10,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.errors import InputError
 from jaxvib.steady.jam_orbit import exact_mode_speeds
 
 _RPM = 30.0 / np.pi
@@ -20,14 +21,20 @@ _RPM = 30.0 / np.pi
 @click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
 @click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of the limit of light loads.")
+@click.option("--phases", is_flag=True, help="Jams of loads at unequal phases too; always so for a rotor.")
 @shared
-def modes(scene: Path, speed: str | None, unit: Any, exact: bool, output: Output) -> None:
+def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, output: Output) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram."""
     loaded = jv.load_scene(scene)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
+    if exact and phases:
+        raise InputError("--phases", "goes without --exact: jams at unequal phases are known for light loads only")
     if exact:
         _exact(loaded, unit, output)
+        return
+    if phases or loaded.machine.carrier().axes != (1,):
+        _phases(loaded, output)
         return
     found = jv.jam_modes(loaded)
     picture = output.file("branches.png")
@@ -75,6 +82,46 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, output: Output
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
         return "\n".join(lines)
+
+    output.done(document, text, "modes")
+
+
+def _phases(scene: jv.Scene, output: Output) -> None:
+    """The jams of light loads at any phases."""
+    found = jv.phase_jams(scene)
+    jams = [found.select(k) for k in range(found.omega.shape[0])]
+    document = {
+        "rotor_speed": float(scene.drive.speed),
+        "phase_jams": [
+            {
+                "omega": float(jam.omega),
+                "stable": bool(jam.stable),
+                "growth": float(jam.growth),
+                "pattern": jam.pattern_label,
+                "phase": jam.phase.tolist(),
+                "amplitude": jam.amplitude.tolist(),
+                "foundation_force": float(jam.foundation_force),
+            }
+            for jam in jams
+        ],
+    }
+
+    def text() -> str:
+        rows = [
+            [
+                f"{float(jam.omega):.5g}",
+                f"{_RPM * float(jam.omega):.5g}",
+                "stable" if jam.stable else "unstable",
+                jam.pattern_label,
+                " ".join(f"{np.rad2deg(float(a)):.4g}" for a in jam.phase),
+                f"{float(jam.foundation_force):.4g}",
+            ]
+            for jam in jams
+        ]
+        speed = float(scene.drive.speed)
+        head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "force on bed, N"]
+        title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
+        return table(title, head, rows) if rows else f"no jam at {speed:.5g} rad/s"
 
     output.done(document, text, "modes")
 

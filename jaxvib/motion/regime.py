@@ -82,9 +82,8 @@ class Regime(eqx.Module):
 
     @property
     def pattern_label(self) -> str:
-        """The pattern's own word: "together", "opposite", "spread" or "other"."""
-        words = ("together", "opposite", "spread", "other")
-        return next(word for word in words if bool(self.pattern == getattr(PhasePattern, word)))
+        """The pattern's own word, see `pattern_word`."""
+        return pattern_word(self.pattern)
 
     def summary(self) -> str:
         """The name and its evidence, for a person to read."""
@@ -101,6 +100,12 @@ class Regime(eqx.Module):
             evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{sentence} ({'; '.join(evidence)})"
+
+
+def pattern_word(pattern: PhasePattern) -> str:
+    """The pattern's own word: "together", "opposite", "spread" or "other"."""
+    words = ("together", "opposite", "spread", "other")
+    return next(word for word in words if bool(pattern == getattr(PhasePattern, word)))
 
 
 def phase_pattern(phase: Array) -> PhasePattern:

@@ -15,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import count, traced
-from jaxvib.motion.regime import PhasePattern, phase_pattern
+from jaxvib.motion.regime import PhasePattern, pattern_word, phase_pattern
 from jaxvib.steady.response import loaded_mass, magnitude, turning, turning_loads
 
 __all__ = ["PhaseJam", "PhaseJams", "PhaseStatus", "phase_jam", "phase_jams", "phase_torques"]
@@ -56,6 +56,11 @@ class PhaseJam(eqx.Module):
     foundation_force: Array
     torque: Array
     residual: Array
+
+    @property
+    def pattern_label(self) -> str:
+        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        return pattern_word(self.pattern)
 
 
 class PhaseJams(PhaseJam):
