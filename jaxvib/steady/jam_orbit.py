@@ -42,7 +42,7 @@ def jam_orbit(
     """The exact motion in which collected loads jam: no assumption that they are light.
 
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a,      a = B q''
-        D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w C
+        D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
@@ -64,8 +64,9 @@ def jam_orbit(
     **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function
     theorem, forward and reverse.
 
-    **Raises** `InputError` for wrong arguments, loads without drag or a machine that is not of platforms;
-    `ComputationError` with the status "absent" or "not_converged".
+    **Raises** `InputError` for wrong arguments, loads without drag, a `mode` of a machine with gyroscopic coupling (its
+    resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives
+    that at the lowest one); `ComputationError` with the status "absent" or "not_converged".
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
