@@ -37,9 +37,9 @@ from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, crite
 from jaxvib.steady.diagram import ExactBranches, SpecialPoint
 from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
 from jaxvib.steady.jam_orbit import jam_orbit
-from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
+from jaxvib.steady.orbit import Orbit, OrbitStatus
 from jaxvib.steady.phase_search import PhaseBranch, PhaseJams, phase_branch, phase_jams
-from jaxvib.steady.phases import PhaseJam, PhaseJams, PhaseStatus, phase_jam, phase_jams, phase_torques
+from jaxvib.steady.phases import PhaseJam, PhaseStatus, phase_jam, phase_torques
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl

@@ -55,6 +55,11 @@ class PhaseJam(eqx.Module):
     torque: Array
     residual: Array
 
+    @property
+    def pattern_label(self) -> str:
+        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        return pattern_word(self.pattern)
+
 
 class Parts(NamedTuple):
     """A scene as the balance needs it: matrices (nd, nd), what each load shakes (count, nd) complex, and the loads' numbers."""
