@@ -15,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import traced
-from jaxvib.motion.regime import PhasePattern, phase_pattern
+from jaxvib.motion.regime import PhasePattern, pattern_word, phase_pattern
 from jaxvib.steady.response import loaded_mass, magnitude, turning, turning_loads
 
 __all__ = ["PhaseJam", "PhaseStatus", "phase_jam", "phase_torques"]
