@@ -1,107 +1,29 @@
 """Differentiable simulation and design of vibration machines that work on the Sommerfeld effect."""
 
-from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.drive import ConstantSpeed, Drive, SpinUp
-from jaxvib.machine.effects import Effect, Gravity
-from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
-from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
-from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
-from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import Dynamics, State, vector_field
-from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
-from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.settle import settle
-from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import initial_state
-from jaxvib.steady.balance import (
-    BalancedStability,
-    BalancedStates,
-    BalanceStatus,
-    balanced_growth,
-    balanced_intervals,
-    balanced_stability,
-    balanced_states,
-)
-from jaxvib.steady.branches import Branches, branches
-from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
-from jaxvib.steady.diagram import ExactBranches, SpecialPoint
-from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
-from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
-from jaxvib.steady.response import natural_frequencies, steady_displacement
-from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
-from jaxvib.study.criterion_map import CriterionMap, criterion_map
+import ast
+import importlib
+from pathlib import Path
+from typing import Any
 
-__all__ = [
-    "BalanceStatus",
-    "BalancedStability",
-    "BalancedStates",
-    "Branches",
-    "Carrier",
-    "CharacteristicSpeeds",
-    "CircularLoads",
-    "ComputationError",
-    "ConstantSpeed",
-    "Criterion",
-    "CriterionMap",
-    "CriterionStatus",
-    "Dimensionless",
-    "Drive",
-    "Dynamics",
-    "Effect",
-    "ExactBranches",
-    "Folds",
-    "Gravity",
-    "InputError",
-    "Jam",
-    "JamModes",
-    "JamStatus",
-    "Loads",
-    "Machine",
-    "Measured",
-    "Orbit",
-    "OrbitStatus",
-    "Platforms",
-    "Run",
-    "RunStatus",
-    "Scene",
-    "SpecialPoint",
-    "SpinUp",
-    "State",
-    "Trajectory",
-    "balanced_growth",
-    "balanced_intervals",
-    "balanced_stability",
-    "balanced_states",
-    "balls",
-    "branches",
-    "characteristic_speeds",
-    "criterion",
-    "criterion_functional",
-    "criterion_map",
-    "criterion_table",
-    "energy",
-    "foundation_force",
-    "initial_state",
-    "jam_modes",
-    "jam_orbit",
-    "jam_rotor_speed",
-    "load_scene",
-    "natural_frequencies",
-    "network",
-    "one_mass",
-    "pendulums",
-    "port_receptance",
-    "power",
-    "rollers",
-    "save_scene",
-    "scene_from_toml",
-    "scene_to_toml",
-    "settle",
-    "simulate",
-    "steady_displacement",
-    "three_mass",
-    "two_mass",
-    "vector_field",
-]
+
+def _homes() -> dict[str, str]:
+    """The module each public name lives in: the imports of the stub beside this file, which type checkers read too."""
+    stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
+
+
+_HOMES = _homes()
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, its module imported the first time it is asked for: a command pays for what it uses only."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

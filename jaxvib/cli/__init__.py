@@ -28,3 +28,7 @@ def prepare() -> None:
         home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxvib"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+    from jaxvib.programs import keep_programs
+
+    keep_programs(Path(str(jax.config.values["jax_compilation_cache_dir"])) / "traced")

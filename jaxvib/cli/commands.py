@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
-from optimize import Outcome, Synthesis, load_design, synthesize
-from optimize.files import TEMPLATE
-from optimize.synthesize import wanted
+
+if TYPE_CHECKING:
+    from optimize import Outcome, Synthesis
 
 
 @app.command("new")
@@ -24,6 +22,8 @@ from optimize.synthesize import wanted
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of that KIND of machine, or a design file."""
+    from optimize.files import TEMPLATE
+
     text = TEMPLATE if kind == "design" else TEMPLATES[kind.replace("-", "_")]
     path = output.file("design.toml" if kind == "design" else "machine.toml")
     if path is None:
@@ -99,6 +99,11 @@ def simulate(
 @shared
 def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool, output: Output) -> None:
     """Search the machine that DESIGN asks for; --out keeps its scene file, the pictures and the motion it was checked by."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from optimize import load_design, synthesize
+
     loaded = load_design(design)
     given = {"starts": starts, "seed": seed}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
@@ -145,6 +150,8 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
 
 
 def _outcomes(best: Synthesis) -> str:
+    from optimize.synthesize import wanted
+
     columns: list[tuple[str, Outcome]] = [("before", best.before), ("after", best.after)]
     if best.verified is not None:
         columns.append(("verified", best.verified))

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import jax
 import numpy as np
 
 import jaxvib as jv
@@ -28,7 +29,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, output: Output
     if exact:
         _exact(loaded, unit, output)
         return
-    found = jv.jam_modes(loaded)
+    found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
     picture = output.file("branches.png")
     if picture is not None:
         jv.branches(loaded).plot(unit=unit).savefig(picture)

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.charts import time_histories
 from jaxvib.errors import InputError
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
@@ -79,6 +78,8 @@ class Run(Measured):
 
         **Returns** a matplotlib figure.
         """
+        from jaxvib.draw.charts import time_histories  # slow to import: only who draws pays
+
         kept = self._kept()
         return time_histories(
             np.asarray(kept.time),

@@ -21,6 +21,7 @@ from jaxvib.motion.observables import measure, trajectory
 from jaxvib.motion.progress import ProgressBar
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, initial_state
+from jaxvib.programs import kept
 from jaxvib.steady.response import natural_frequencies
 
 __all__ = ["simulate"]
@@ -208,7 +209,7 @@ def _enough_steps(scene: Scene, end: Array) -> int:
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
 
-@eqx.filter_jit
+@kept
 def _run(
     scene: Scene,
     end: Array,
