@@ -35,44 +35,6 @@ _PER_TURN = 16
 _MOST_STEPS = 2**31 - 1
 
 
-class _Tolerance(diffrax.AbstractStepSizeController):
-    """A step size controller that measures every part of the state in its own unit, and angles absolutely.
-
-    An angle grows without end; an error relative to it would let a long run lose its phase.
-    """
-
-    inner: diffrax.AbstractStepSizeController
-    unit: State
-
-    def wrap(self, direction: Any) -> _Tolerance:
-        return _Tolerance(self.inner.wrap(direction), self.unit)
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
-        return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
-
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
-        def scaled(y: State) -> State:
-            return jax.tree.map(lambda leaf, unit: leaf / unit, y, self.unit)
-
-        def absolute(y: State) -> State:
-            y = scaled(y)
-            return State(y.displacement, y.velocity, jax.tree.map(jnp.zeros_like, y.angle), y.rate)
-
-        return self.inner.adapt_step_size(
-            t0, t1, absolute(y0), absolute(y1_candidate), args, scaled(y_error), error_order, controller_state
-        )
-
-
 def _units(scene: Scene) -> State:
     """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
     carrier, loads = scene.machine.carrier(), scene.loads
