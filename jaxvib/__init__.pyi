@@ -2,13 +2,17 @@
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.drive import ConstantSpeed, Drive, SpinUp
-from jaxvib.machine.effects import Effect, Gravity
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
+from jaxvib.machine.effects import Effect, Friction, Gravity, MomentImbalance, StaticImbalance, Throw
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
+from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.supports import CubicSupport, Stop
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.run import Run, RunStatus
@@ -46,29 +50,44 @@ __all__ = [
     "Criterion",
     "CriterionMap",
     "CriterionStatus",
+    "CubicSupport",
+    "DCMotor",
     "Dimensionless",
     "Drive",
+    "DryFriction",
     "Dynamics",
     "Effect",
     "ExactBranches",
     "Folds",
+    "Friction",
     "Gravity",
+    "IdealDrive",
+    "InductionMotor",
     "InputError",
     "Jam",
     "JamModes",
     "JamStatus",
+    "LoadContact",
     "Loads",
     "Machine",
     "Measured",
+    "MomentImbalance",
+    "Motor",
     "Orbit",
     "OrbitStatus",
+    "PlanarRotor",
     "Platforms",
+    "Rotor",
     "Run",
     "RunStatus",
+    "RunUp",
     "Scene",
     "SpecialPoint",
     "SpinUp",
     "State",
+    "StaticImbalance",
+    "Stop",
+    "Throw",
     "Trajectory",
     "balanced_growth",
     "balanced_intervals",
@@ -92,9 +111,11 @@ __all__ = [
     "network",
     "one_mass",
     "pendulums",
+    "planar_rotor",
     "port_receptance",
     "power",
     "rollers",
+    "rotor",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",

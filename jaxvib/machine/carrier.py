@@ -25,8 +25,13 @@ class Carrier(eqx.Module):
     - `axes`: which direction of a load's plane (0 across, 1 up) each row of B moves in
     - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): ties to the bed, N/m and N s/m
     - `coordinates`: a name for each coordinate
+    - `tilt` T (np, nd), 1/m times the unit of a displacement: how the structure's axis turns with q; None where it cannot.
+      A point at the distance s along the axis from the port moves by (B + s T) q
+    - `stations` s_j (count,) m: where along the axis, counted from the port, each load runs; None where all run at the port
+    - `seat` m: where along the axis, counted from the port, the rotor's own mass centre lies; None where it is the port
 
-    Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6).
+    Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for stations
+    Artyunin 2013, equation (1).
     """
 
     mass: Array
@@ -38,6 +43,13 @@ class Carrier(eqx.Module):
     bed_damping: Array
     axes: tuple[int, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
+    tilt: Array | None = None
+    stations: Array | None = None
+    seat: Array | None = None
+
+    def port_at(self, distance: Array | float) -> Array:
+        """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""
+        return self.port if self.tilt is None else self.port + distance * self.tilt
 
 
 class Machine(eqx.Module):

@@ -8,23 +8,58 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.units import Number, number
+from jaxvib.errors import InputError
+from jaxvib.machine.units import Number, number, traced
 
-__all__ = ["ConstantSpeed", "Drive", "SpinUp"]
+__all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
 
 
 class Drive(eqx.Module):
-    """A drive gives the rotor's speed; `speed` is the one it works at."""
+    """What turns the rotor; `speed` is the one it works at, without a load.
+
+    An `IdealDrive` turns the rotor at speeds that no load can change; with a `Motor` the rotor's angle and speed are states.
+    """
 
     speed: eqx.AbstractVar[Array]
     kind: eqx.AbstractVar[str]
+
+
+class IdealDrive(Drive):
+    """A drive that gives the rotor's speed as a function of time."""
 
     @abc.abstractmethod
     def speed_at(self, t: Array) -> Array:
         """The rotor's speed at time t (s), rad/s."""
 
+    @abc.abstractmethod
+    def angle_at(self, t: Array) -> Array:
+        """The rotor's angle at time t, rad: the integral of its speed from 0."""
 
-class ConstantSpeed(Drive):
+    @abc.abstractmethod
+    def acceleration_at(self, t: Array) -> Array:
+        """The rotor's angular acceleration at time t, rad/s^2."""
+
+    def kinks(self) -> tuple[Array, ...]:
+        """Times at which the acceleration jumps, on which an integrator has to put a step."""
+        return ()
+
+
+class Motor(Drive):
+    """A drive of limited power: the rotor turns as its torque and the loads let it.
+
+        J theta'' = T(theta') - torque that the loads take off
+
+    J is the rotor's whole moment of inertia about its axis, what is out of balance included, loads not.
+    """
+
+    inertia: eqx.AbstractVar[Array]
+
+    @abc.abstractmethod
+    def torque(self, speed: Array) -> Array:
+        """T at the rotor's `speed` (rad/s), N m."""
+
+
+class ConstantSpeed(IdealDrive):
     """A rotor that turns at a constant speed whatever the loads do.
 
     **Arguments**: `speed` n, rad/s or a text such as "1500 rpm"; greater than 0.
@@ -47,8 +82,16 @@ class ConstantSpeed(Drive):
         """n at every t."""
         return self.speed
 
+    def angle_at(self, t: Array) -> Array:
+        """n t."""
+        return self.speed * t
 
-class SpinUp(Drive):
+    def acceleration_at(self, t: Array) -> Array:
+        """0."""
+        return jnp.zeros_like(self.speed)
+
+
+class SpinUp(IdealDrive):
     """A rotor brought smoothly from rest to its working speed, then held there.
 
         speed(t) = n (10 x^3 - 15 x^4 + 6 x^5),  x = min(t / duration, 1)
@@ -78,3 +121,134 @@ class SpinUp(Drive):
         """The smooth step from 0 to n."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         return self.speed * x**3 * (10.0 + x * (6.0 * x - 15.0))
+
+    def angle_at(self, t: Array) -> Array:
+        """n duration (5 x^4/2 - 3 x^5 + x^6) on the way up, from there on with speed n."""
+        x = jnp.clip(t / self.duration, 0.0, 1.0)
+        rise = self.duration * x**4 * (2.5 + x * (x - 3.0))
+        return self.speed * (rise + jnp.maximum(t - self.duration, 0.0))
+
+    def acceleration_at(self, t: Array) -> Array:
+        """30 n x^2 (1 - x)^2 / duration."""
+        x = jnp.clip(t / self.duration, 0.0, 1.0)
+        return 30.0 * self.speed / self.duration * (x * (1.0 - x)) ** 2
+
+
+class RunUp(IdealDrive):
+    """A rotor run up at a constant angular acceleration, then held at its working speed.
+
+        speed(t) = min(acceleration t, n)
+
+    The acceleration jumps where the working speed is reached; `simulate` puts a step on that time.
+
+    **Arguments**: `speed` n, rad/s or text, greater than 0; `acceleration` rad/s^2 or text, greater than 0.
+
+    **Raises** `InputError` for a wrong unit or a value that is not positive.
+
+    >>> import jaxvib as jv
+    >>> drive = jv.RunUp(460.0, acceleration=230.0)
+    >>> [float(drive.speed_at(t)) for t in (0.0, 1.0, 2.0, 3.0)]
+    [0.0, 230.0, 460.0, 460.0]
+
+    Source: Artyunin 2013, section IV.
+    """
+
+    speed: Array
+    acceleration: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, speed: Number, acceleration: Number):
+        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
+        self.acceleration = number(acceleration, "rad/s^2", "drive.acceleration", low=0.0, open_low=True)
+        self.kind = "run_up"
+
+    def _end(self) -> Array:
+        return self.speed / self.acceleration
+
+    def speed_at(self, t: Array) -> Array:
+        """min(acceleration t, n)."""
+        return jnp.where(t < self._end(), self.acceleration * t, self.speed)
+
+    def angle_at(self, t: Array) -> Array:
+        """acceleration t^2 / 2, from the kink on with speed n."""
+        end = self._end()
+        return jnp.where(t < end, 0.5 * self.acceleration * t**2, self.speed * (t - 0.5 * end))
+
+    def acceleration_at(self, t: Array) -> Array:
+        """The acceleration before the kink, 0 after it."""
+        return jnp.where(t < self._end(), self.acceleration, 0.0)
+
+    def kinks(self) -> tuple[Array, ...]:
+        """Where the working speed is reached."""
+        return (self._end(),)
+
+
+class DCMotor(Motor):
+    """A direct-current motor switched on at t = 0: its torque falls linearly with the speed.
+
+        T = stall_torque (1 - theta' / speed)
+
+    **Arguments**: `speed` without a load, rad/s or text; `stall_torque` N m; `inertia` J of the whole rotor, kg m^2; all
+    greater than 0.
+
+    **Raises** `InputError` for a wrong unit or a value that is not positive.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.DCMotor("3000 rpm", stall_torque=2.0, inertia=0.01)
+    >>> round(float(motor.torque(motor.speed / 2.0)), 6)
+    1.0
+    """
+
+    speed: Array
+    stall_torque: Array
+    inertia: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, speed: Number, stall_torque: Number, inertia: Number):
+        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
+        self.stall_torque = number(stall_torque, "N m", "drive.stall_torque", low=0.0, open_low=True)
+        self.inertia = number(inertia, "kg m^2", "drive.inertia", low=0.0, open_low=True)
+        self.kind = "dc_motor"
+
+    def torque(self, speed: Array) -> Array:
+        """The straight line from the stall torque to the speed without a load."""
+        return self.stall_torque * (1.0 - speed / self.speed)
+
+
+class InductionMotor(Motor):
+    """An induction motor switched on at t = 0, by Kloss's formula.
+
+        T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed
+
+    **Arguments**: `speed` synchronous, rad/s or text; `breakdown_torque` T_b N m, the greatest there is; `breakdown_slip` s_b,
+    the slip at which it is reached, below 1; `inertia` J of the whole rotor, kg m^2; all greater than 0.
+
+    **Raises** `InputError` for a wrong unit or a value that is not allowed.
+
+    >>> import jaxvib as jv
+    >>> motor = jv.InductionMotor("3000 rpm", breakdown_torque=4.0, breakdown_slip=0.2, inertia=0.01)
+    >>> round(float(motor.torque(0.8 * motor.speed)), 6)
+    4.0
+
+    Source: Kloss's formula for the steady torque; the currents' transients are left out.
+    """
+
+    speed: Array
+    breakdown_torque: Array
+    breakdown_slip: Array
+    inertia: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, speed: Number, breakdown_torque: Number, breakdown_slip: Number, inertia: Number):
+        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
+        self.breakdown_torque = number(breakdown_torque, "N m", "drive.breakdown_torque", low=0.0, open_low=True)
+        self.breakdown_slip = number(breakdown_slip, "", "drive.breakdown_slip", low=0.0, open_low=True)
+        if not traced(self.breakdown_slip) and not self.breakdown_slip < 1.0:
+            raise InputError("drive.breakdown_slip", f"is {float(self.breakdown_slip):g}; it must be below 1")
+        self.inertia = number(inertia, "kg m^2", "drive.inertia", low=0.0, open_low=True)
+        self.kind = "induction_motor"
+
+    def torque(self, speed: Array) -> Array:
+        """Kloss's formula."""
+        slip = 1.0 - speed / self.speed
+        return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)

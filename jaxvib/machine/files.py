@@ -13,11 +13,15 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.drive import ConstantSpeed, SpinUp
-from jaxvib.machine.effects import Gravity
+from jaxvib.machine.contact import LoadContact
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
+from jaxvib.machine.effects import Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.supports import CubicSupport, Stop
 
 __all__ = [
     "TEMPLATES",
@@ -30,10 +34,31 @@ __all__ = [
     "scene_to_toml",
 ]
 
-_MACHINES = {"one_mass": one_mass, "two_mass": two_mass, "three_mass": three_mass, "network": network}
+_MACHINES = {
+    "one_mass": one_mass,
+    "two_mass": two_mass,
+    "three_mass": three_mass,
+    "network": network,
+    "planar_rotor": planar_rotor,
+    "rotor": rotor,
+}
 _LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}
-_DRIVES = {"constant_speed": ConstantSpeed, "spin_up": SpinUp}
-_EFFECTS = {"gravity": Gravity}
+_DRIVES = {
+    "constant_speed": ConstantSpeed,
+    "spin_up": SpinUp,
+    "run_up": RunUp,
+    "dc_motor": DCMotor,
+    "induction_motor": InductionMotor,
+}
+_EFFECTS = {
+    "gravity": Gravity,
+    "static_imbalance": StaticImbalance,
+    "moment_imbalance": MomentImbalance,
+    "dry_friction": DryFriction,
+    "cubic_support": CubicSupport,
+    "stop": Stop,
+    "load_contact": LoadContact,
+}
 _SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": _DRIVES}
 
 
@@ -126,8 +151,10 @@ def scene_from_tables(tables: Mapping[str, Any]) -> Scene:
             raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(_EFFECTS))}")
         if isinstance(value, Mapping):
             effects.append(called(_EFFECTS[name], value, f"effects.{name}"))
+        elif isinstance(value, list) and _EFFECTS[name].repeatable and all(isinstance(each, Mapping) for each in value):
+            effects += [called(_EFFECTS[name], each, f"effects.{name}[{index}]") for index, each in enumerate(value)]
         elif value is True:
-            effects.append(_EFFECTS[name]())
+            effects.append(called(_EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
             raise InputError(f"effects.{name}", f"is {value!r}; write true, false or a table of its arguments")
     return Scene(**parts, effects=tuple(effects))
@@ -168,7 +195,13 @@ def scene_to_toml(scene: Scene) -> str:
     for name, kinds in _SECTIONS.items():
         part = getattr(scene, name)
         tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
-    tables["effects"] = {effect.kind: _fields(effect, _EFFECTS[effect.kind]) for effect in scene.effects}
+    tables["effects"] = {}
+    for effect in scene.effects:
+        fields = _fields(effect, _EFFECTS[effect.kind])
+        if effect.repeatable:
+            tables["effects"].setdefault(effect.kind, []).append(fields)
+        else:
+            tables["effects"][effect.kind] = fields
     return tomli_w.dumps(tables)
 
 
@@ -176,9 +209,11 @@ def _fields(part: Any, build: Callable[..., Any]) -> dict[str, Any]:
     fields = {}
     for name in inspect.signature(build).parameters:
         value = getattr(part, name)
+        if value is None:
+            continue
         if isinstance(value, tuple):
             fields[name] = [list(pair) for pair in value]
-        elif isinstance(value, int):
+        elif isinstance(value, (int, str)):
             fields[name] = value
         else:
             array = np.asarray(value, dtype=float)

@@ -49,10 +49,17 @@ class Scene(eqx.Module):
         for index, effect in enumerate(effects):
             if not isinstance(effect, Effect):
                 raise InputError(f"effects[{index}]", f"is {effect!r}; it must be an Effect, for example Gravity()")
-        kinds = [effect.kind for effect in effects]
+        kinds = [effect.kind for effect in effects if not effect.repeatable]
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
+        stations = machine.carrier().stations
+        if stations is not None and stations.shape != (loads.count,):
+            raise InputError(
+                "machine.stations", f"has {stations.shape[0]} values; one for all loads or {loads.count} are needed"
+            )
+        for effect in effects:
+            effect.check(machine, loads)
         self.machine = machine
         self.loads = loads
         self.drive = drive

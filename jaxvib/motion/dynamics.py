@@ -2,42 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import functools
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects import Effect
+from jaxvib.machine.drive import Drive, IdealDrive, Motor
+from jaxvib.machine.effects import Effect, Friction, Gravity
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Dynamics", "State", "vector_field"]
+__all__ = ["Dynamics", "State", "rotor_angle", "rotor_speed", "vector_field"]
 
 
 class State(eqx.Module):
     """Where everything is and how fast; also the time derivative of such a state.
 
     **Attributes**: `displacement` q (nd,) m and `velocity` q' (nd,) m/s of the carrier's coordinates; `angle` and `rate`, a
-    tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s.
+    tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s;
+    `rotor` the rotor's angle and speed, rad and rad/s, where a motor drives it, None under an ideal drive.
     """
 
     displacement: Array
     velocity: Array
     angle: tuple[Array, ...]
     rate: tuple[Array, ...]
+    rotor: tuple[Array, Array] | None = None
+
+
+class _Support(eqx.Module):
+    """An effect that supports the carrier, the displacements it is at (k, nd), and what a force there accelerates (nd, k)."""
+
+    effect: Effect
+    rows: Array
+    push: Array
+
+
+class _Eliminated(NamedTuple):
+    """The loads without their own accelerations u'' = free - answers . a, a the acceleration of what carries each of them.
+
+    They push the port with -(weight a + reaction), and take the torque `drag` + `pull` . a (each (count,)) off the rotor.
+    """
+
+    free: tuple[Array, ...]
+    answers: dict[int, tuple[Array, ...]]
+    weight: list[list[Array]]
+    reaction: list[Array]
+    drag: Array
+    pull: dict[int, Array] | None
 
 
 class Dynamics(eqx.Module):
     """A scene made ready for time integration: all that does not change with time is computed once, here.
 
-    The carrier is solved for its accelerations, q'' = flow - with M's inverse already applied:
+    The carrier is solved for its accelerations, q'' = flow - with M's inverse already applied. P is the port B; where loads
+    run at stations of their own, or the rotor is out of balance elsewhere, the tilt T is below it:
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
-    - `push` M^-1 B^T (nd, np): acceleration per force at the port; `mobility` B M^-1 B^T (np, np); `port` B (np, nd)
+    - `push` M^-1 P^T (nd, nP): acceleration per force at the port; `mobility` P M^-1 P^T (nP, nP); `port` P (nP, nd)
+    - `stations` of the loads and `seat` of the rotor, see `Carrier`; `supports` that are not linear
     """
 
     stiffness: Array
@@ -46,6 +75,9 @@ class Dynamics(eqx.Module):
     push: Array
     mobility: Array
     port: Array
+    stations: Array | None
+    seat: Array | None
+    supports: tuple[_Support, ...]
     loads: Loads
     drive: Drive
     effects: tuple[Effect, ...]
@@ -55,67 +87,162 @@ class Dynamics(eqx.Module):
         """The time derivative of `state` at time `t`, with an outer `port_force` (np,) N if one is given.
 
         Each load is eliminated first. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c it obeys
-        u'' = H^-1 (r - m J^T a), a the port's acceleration, and pushes the port with -(W a + g),
-        W = m 1 - m^2 J H^-1 J^T, g = m (J H^-1 r + c). What is left is (1 + mobility W) a = a_free - mobility g, one
-        equation for each port direction, however many platforms and loads there are.
+        u'' = H^-1 (r - E a), a the acceleration of the point that carries it, and pushes that point with -(W a + g),
+        W = m 1 - m J H^-1 E, g = m (J H^-1 r + c). E is m J^T, less what a friction proportional to the load's reaction adds.
+        A motor's rotor that is out of balance is one more such body. What is left is (1 + mobility W) a = a_free - mobility g,
+        one equation for each row of P, however many platforms and loads there are.
         """
-        loads, u, rate = self.loads, state.angle, state.rate
-        speed = self.drive.speed_at(t)
+        speed = rotor_speed(self.drive, t, state)
+        unforced = self._unforced(state, speed, port_force)
+        throw = self._throw(t, state)
+        loads = _kinematics(self.loads, state.angle, state.rate)
 
-        columns, curvature = _kinematics(loads, u, rate)
-        force = loads.resistance(u, rate, speed)
+        def accelerations(friction: Sequence[Friction]) -> tuple[list[Any], Array, _Eliminated, Array | None]:
+            part = self._eliminate(loads, state, speed, friction)
+            weight, reaction, spin = self._with_rotor(part, throw, speed)
+            a, carrier = self._close(weight, reaction, unforced)
+            return a, carrier, part, None if spin is None else spin[0] - _dot(spin[1], a)
+
+        friction = self._friction(state, speed)
+        if any(each.normal is not None for each in friction):
+            # The sign of a reaction that depends on the accelerations: that of the motion without its friction.
+            at_loads = self._at_loads(accelerations([each for each in friction if each.normal is None])[0])
+            friction = [_signed(each, at_loads) for each in friction]
+        a, carrier, part, spin = accelerations(friction)
+        at_loads = self._at_loads(a)
+        change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
+        return State(state.velocity, carrier, state.rate, change, None if spin is None else (speed, spin))
+
+    def _unforced(self, state: State, speed: Array, port_force: Array | None) -> Array:
+        """Accelerations of the carrier without loads and imbalance."""
+        flow = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
+        if self.gyroscopic is not None:
+            flow = flow - speed * _times(self.gyroscopic, state.velocity)
+        for support in self.supports:
+            x, v = _times(support.rows, state.displacement), _times(support.rows, state.velocity)
+            flow = flow - _times(support.push, support.effect.support_force(x, v))
+        if port_force is not None:
+            flow = flow + _times(self.push[:, : len(self.axes)], port_force)
+        return flow
+
+    def _friction(self, state: State, speed: Array) -> list[Friction]:
+        g = sum(effect.g for effect in self.effects if isinstance(effect, Gravity))
+        found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
+        return [each for each in found if each is not None]
+
+    def _eliminate(self, kinematics: Any, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
+        loads, axes = self.loads, self.axes
+        columns, curvature = kinematics
+        torque = loads.resistance(state.angle, state.rate, speed)
+        drag, force = torque[0], list(torque)
         for effect in self.effects:
-            force = tuple(f + e for f, e in zip(force, effect.load_force(loads, u), strict=True))
+            for extra in (effect.load_force(loads, state.angle), effect.load_resistance(loads, state.angle, state.rate)):
+                if extra is not None:
+                    force = [f + e for f, e in zip(force, extra, strict=True)]
+        pull = None
+        for each in friction:
+            rub = each.lever * each.reaction
+            drag, force[0] = drag + rub, force[0] + rub
+            if each.normal is not None:
+                pull = {axis: each.lever * each.normal[axis] + (0.0 if pull is None else pull[axis]) for axis in axes}
         m = loads.mass
         inertia = loads.inertia_factor() * m
-        remainder = tuple(
-            f - inertia * sum(x * c for x, c in zip(column, curvature, strict=True))
-            for f, column in zip(force, columns, strict=True)
-        )
-        gram = [[inertia * sum(x * y for x, y in zip(a, b, strict=True)) for b in columns] for a in columns]
-        solve = _small_inverse(gram)
-        free = solve(remainder)
-
-        axes = self.axes
-        answers = [solve(tuple(m * column[axis] for column in columns)) for axis in axes]
+        solve = small_inverse([[inertia * _dot(a, b) for b in columns] for a in columns])
+        free = solve(tuple(f - inertia * _dot(column, curvature) for f, column in zip(force, columns, strict=True)))
+        rows = {axis: [m * column[axis] for column in columns] for axis in axes}
+        if pull is not None:
+            rows = {axis: [row[0] - pull[axis], *row[1:]] for axis, row in rows.items()}
+        answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
+        across = {axis: [column[axis] for column in columns] for axis in axes}
+        # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
+        onto = [(axis, None) for axis in axes]
+        if self.stations is not None:
+            onto += [(axis, self.stations) for axis in axes]
         weight = [
-            [
-                _total(
-                    m * (1.0 if i == k else 0.0) - m * sum(x[a] * y for x, y in zip(columns, answers[k], strict=True)),
-                    loads,
-                )
-                for k in range(len(axes))
-            ]
-            for i, a in enumerate(axes)
+            [self._total(m * (1.0 if i == k else 0.0) - m * _dot(across[i], answers[k]), first, second) for k, second in onto]
+            for i, first in onto
         ]
-        reaction = [_total(m * (sum(x[a] * f for x, f in zip(columns, free, strict=True)) + curvature[a]), loads) for a in axes]
+        reaction = [self._total(m * (_dot(across[i], free) + curvature[i]), arm) for i, arm in onto]
+        return _Eliminated(free, answers, weight, reaction, drag, pull)
 
-        unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
-        if self.gyroscopic is not None:
-            unforced = unforced - speed * _times(self.gyroscopic, state.velocity)
-        if port_force is not None:
-            unforced = unforced + _times(self.push, port_force)
-        port_free = _times(self.port, unforced)
-        n = len(axes)
+    def _with_rotor(
+        self, part: _Eliminated, throw: tuple[list[Array], list[Array]] | None, speed: Array
+    ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
+        """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
+        if not isinstance(self.drive, Motor):
+            extra = [0.0] * len(part.reaction) if throw is None else throw[1]
+            return part.weight, [g + b for g, b in zip(part.reaction, extra, strict=True)], None
+        free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
+        row = [jnp.zeros_like(free)] * len(part.reaction)
+        if part.pull is not None:
+            arms = [None] if self.stations is None else [None, self.stations]
+            row = [self._total(part.pull[axis], arm) / self.drive.inertia for arm in arms for axis in self.axes]
+        if throw is None:
+            return part.weight, part.reaction, (free, row)
+        along, bend = throw
+        row = [r + d / self.drive.inertia for r, d in zip(row, along, strict=True)]
+        weight = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(part.weight, along, strict=True)]
+        reaction = [g + b + d * free for g, b, d in zip(part.reaction, bend, along, strict=True)]
+        return weight, reaction, (free, row)
+
+    def _throw(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
+        """With d(theta) (nP,) what is out of balance: d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2."""
+        if not any(effect.throws for effect in self.effects):
+            return None
+        turn, rate = rotor_angle(self.drive, t, state), rotor_speed(self.drive, t, state)
+
+        def thrown(angle: Array) -> tuple[Array, ...]:
+            found = [throw for throw in (effect.throw(angle) for effect in self.effects) if throw is not None]
+            static = tuple(_sum(throw.static[axis] for throw in found) for axis in self.axes)
+            if self.stations is None:
+                return static
+            lean = tuple(_sum(throw.lean[axis] for throw in found) for axis in self.axes)
+            if self.seat is not None:
+                lean = tuple(x + self.seat * y for x, y in zip(lean, static, strict=True))
+            return (*static, *lean)
+
+        def slope(angle: Array) -> tuple[Array, ...]:
+            return jax.jvp(thrown, (angle,), (jnp.ones_like(angle),))[1]
+
+        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        push = [b * rate**2 for b in bend]
+        if isinstance(self.drive, IdealDrive):
+            change = self.drive.acceleration_at(t)
+            push = [p + d * change for p, d in zip(push, along, strict=True)]
+        return list(along), push
+
+    def _close(self, weight: list[list[Array]], reaction: list[Array], unforced: Array) -> tuple[list[Any], Array]:
+        """Accelerations of P's rows and of the carrier."""
+        n = len(reaction)
+        free = _times(self.port, unforced)
         matrix = [
             [(1.0 if i == k else 0.0) + sum(self.mobility[i, j] * weight[j][k] for j in range(n)) for k in range(n)]
             for i in range(n)
         ]
-        right = [port_free[i] - sum(self.mobility[i, j] * reaction[j] for j in range(n)) for i in range(n)]
-        port_acceleration = _small_inverse(matrix)(tuple(right))
-        push = [-sum(weight[i][k] * port_acceleration[k] for k in range(n)) - reaction[i] for i in range(n)]
-        acceleration = unforced + sum(self.push[:, i] * push[i] for i in range(n))
-        rate_change = tuple(
-            f - sum(answer[i] * a for answer, a in zip(answers, port_acceleration, strict=True)) for i, f in enumerate(free)
-        )
-        return State(state.velocity, acceleration, rate, rate_change)
+        right = tuple(free[i] - sum(self.mobility[i, j] * reaction[j] for j in range(n)) for i in range(n))
+        a = small_inverse(matrix)(right)
+        push = [-sum(weight[i][k] * a[k] for k in range(n)) - reaction[i] for i in range(n)]
+        return list(a), unforced + sum(self.push[:, i] * push[i] for i in range(n))
+
+    def _at_loads(self, a: list[Any]) -> dict[int, Any]:
+        """Accelerations of the points that carry the loads, by axis."""
+        n = len(self.axes)
+        if self.stations is None:
+            return dict(zip(self.axes, a[:n], strict=True))
+        return {axis: a[k] + self.stations * a[n + k] for k, axis in enumerate(self.axes)}
+
+    def _total(self, values: Array, *arms: Array | None) -> Array:
+        for arm in arms:
+            values = values if arm is None else values * arm
+        return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
 
 
 def vector_field(scene: Scene) -> Dynamics:
     """The right-hand side of the scene's equations of motion.
 
-        M q'' + (C + speed G) q' + K q + sum_j m_j B^T (B q'' + d^2 p_j/dt^2) = 0
-        kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B q'' = Q_u          (J = dp/du, for each load)
+        M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = what the effects add
+        kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B_j q'' = Q_u        (J = dp/du, for each load)
+        J_r theta'' = T(theta') - what loads and imbalance take off              (under a motor)
 
     **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative; `jit`, `vmap` and
     `grad` go through it and through the scene.
@@ -127,27 +254,64 @@ def vector_field(scene: Scene) -> Dynamics:
     >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m), the platform giving way
     143.8746
 
-    Source: the general form of all five papers; for platforms the antiphase paper, equation (2).
+    Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
+    equation (1). A gyroscopic matrix acts with the rotor's speed alone: what its change would add, C theta'' psi / 2, is left
+    out as in the paper.
     """
-    carrier = scene.machine.carrier()
-    parts = [carrier.stiffness, carrier.damping, carrier.port.T]
+    carrier, effects = scene.machine.carrier(), scene.effects
+    stations, port = carrier.stations, carrier.port
+    if carrier.tilt is not None and (stations is not None or any(effect.throws for effect in effects)):
+        port = jnp.concatenate([port, carrier.tilt])
+        stations = jnp.zeros_like(carrier.mass[0, 0]) if stations is None else stations
+    places = [(effect, effect.place(carrier)) for effect in effects]
+    places = [(effect, rows) for effect, rows in places if rows is not None]
+    parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for _, rows in places)]
     if carrier.gyroscopic is not None:
         parts.append(carrier.gyroscopic)
     solved = jnp.linalg.solve(carrier.mass, jnp.concatenate(parts, axis=1))
-    n, p = carrier.mass.shape[0], carrier.port.shape[0]
-    push = solved[:, 2 * n : 2 * n + p]
+    stiffness, damping, push, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
     return Dynamics(
-        stiffness=solved[:, :n],
-        damping=solved[:, n : 2 * n],
-        gyroscopic=None if carrier.gyroscopic is None else solved[:, 2 * n + p :],
+        stiffness=stiffness,
+        damping=damping,
+        gyroscopic=None if carrier.gyroscopic is None else rest[-1],
         push=push,
-        mobility=carrier.port @ push,
-        port=carrier.port,
+        mobility=port @ push,
+        port=port,
+        stations=stations,
+        seat=carrier.seat,
+        supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
         loads=scene.loads,
         drive=scene.drive,
-        effects=scene.effects,
+        effects=effects,
         axes=carrier.axes,
     )
+
+
+def rotor_speed(drive: Drive, t: Array, state: State) -> Array:
+    """The rotor's speed at time `t` in `state`, rad/s."""
+    if isinstance(drive, Motor):
+        assert state.rotor is not None
+        return state.rotor[1]
+    assert isinstance(drive, IdealDrive)
+    return drive.speed_at(t)
+
+
+def rotor_angle(drive: Drive, t: Array, state: State) -> Array:
+    """The rotor's angle at time `t` in `state`, rad."""
+    if isinstance(drive, Motor):
+        assert state.rotor is not None
+        return state.rotor[0]
+    assert isinstance(drive, IdealDrive)
+    return drive.angle_at(t)
+
+
+def _signed(friction: Friction, a: dict[int, Any]) -> Friction:
+    """A friction whose reaction is known to be positive or negative, so that it is linear in the accelerations."""
+    if friction.normal is None:
+        return friction
+    reaction = friction.reaction + sum(friction.normal[axis] * x for axis, x in a.items())
+    sign = jnp.where(reaction < 0.0, -1.0, 1.0)
+    return Friction(friction.lever * sign, friction.reaction, friction.normal)
 
 
 def _kinematics(
@@ -165,8 +329,12 @@ def _kinematics(
     return columns, jax.jvp(along(rate), u, rate)[1]
 
 
-def _total(values: Array, loads: Loads) -> Array:
-    return jnp.sum(jnp.broadcast_to(values, (loads.count,)))
+def _sum(values: Iterable[Array]) -> Array:
+    return functools.reduce(operator.add, values)
+
+
+def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    return sum(a * b for a, b in zip(x, y, strict=True))
 
 
 def _times(matrix: Array, vector: Array) -> Array:
@@ -174,11 +342,32 @@ def _times(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
-def _small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
-    """x of a x = b for 1 or 2 equations, written out; the entries may be arrays of many such systems."""
-    if len(a) == 1:
+def small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
+    """x of a x = b for a few equations, written out; the entries may be arrays of many such systems."""
+    n = len(a)
+    if n == 1:
         return lambda b: (b[0] / a[0][0],)
-    if len(a) == 2:
+    if n == 2:
         det = a[0][0] * a[1][1] - a[0][1] * a[1][0]
         return lambda b: ((a[1][1] * b[0] - a[0][1] * b[1]) / det, (a[0][0] * b[1] - a[1][0] * b[0]) / det)
-    raise ValueError(f"{len(a)} equations: ports with 1 or 2 directions and loads with 1 or 2 coordinates are written out")
+    return lambda b: _eliminate(a, b)
+
+
+def _eliminate(a: Sequence[Sequence[Any]], b: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Gauss' elimination, in each column the row with the largest entry first."""
+    rows = [[*line, right] for line, right in zip(a, b, strict=True)]
+    n = len(rows)
+    for k in range(n):
+        for i in range(k + 1, n):
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = (
+                [jnp.where(swap, y, x) for x, y in zip(rows[k], rows[i], strict=True)],
+                [jnp.where(swap, x, y) for x, y in zip(rows[k], rows[i], strict=True)],
+            )
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [y - factor * x if j > k else y for j, (x, y) in enumerate(zip(rows[k], rows[i], strict=True))]
+    x: list[Any] = [None] * n
+    for i in reversed(range(n)):
+        x[i] = (rows[i][n] - sum(rows[i][j] * x[j] for j in range(i + 1, n))) / rows[i][i]
+    return tuple(x)

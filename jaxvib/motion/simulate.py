@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed, SpinUp
+from jaxvib.machine.drive import ConstantSpeed, IdealDrive, Motor, SpinUp
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
@@ -42,7 +42,8 @@ def _units(scene: Scene) -> State:
     length = loads.count * throw / jnp.mean(jnp.diagonal(carrier.mass))
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
-    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,)))
+    rotor = (one, speed) if isinstance(scene.drive, Motor) else None
+    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
 
 
 def simulate(
@@ -125,7 +126,10 @@ def simulate(
     if max_steps is None:
         max_steps = _enough_steps(scene, end)
     if controller is None:
-        controller = _Tolerance(diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4), _units(scene))
+        steps = diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
+        controller = _Tolerance(_on_kinks(scene, steps), _units(scene))
+    else:
+        controller = _on_kinks(scene, controller)
     run = _run(
         scene,
         end,
@@ -143,9 +147,22 @@ def simulate(
     return run
 
 
+def _on_kinks(scene: Scene, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractStepSizeController:
+    """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
+    kinks = scene.drive.kinks() if isinstance(scene.drive, IdealDrive) else ()
+    if not kinks or not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        return controller
+    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(kinks)))
+
+
 def _whole(scene: Scene, state: State) -> State:
     """The state, if it has the scene's numbers of coordinates and loads."""
     nd, n = scene.machine.carrier().mass.shape[0], scene.loads.count
+    if isinstance(scene.drive, Motor) != (state.rotor is not None):
+        needed = (
+            "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
+        )
+        raise InputError("start.rotor", f"is {state.rotor!r}; under the drive {scene.drive.kind!r} it must be {needed}")
     for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
         shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
         if any(shape != (length,) for shape in shapes):

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.contact import LoadContact
+from jaxvib.machine.drive import ConstantSpeed, Motor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, numbers
 from jaxvib.motion.dynamics import State
@@ -29,7 +30,9 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
       state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"
     - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam, where
-      the platforms go with the mean angle)
+      the platforms go with the mean angle; loads that touch each other lie side by side there)
+
+    A motor's rotor starts at rest, at the angle 0.
 
     **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that
     does not exist at the scene's rotor speed.
@@ -48,10 +51,14 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
     zero = jnp.zeros_like(scene.machine.carrier().mass[0])
 
     def phases(value: float) -> Array:
-        return numbers(value if angles is None else angles, "rad", "angles", n)
+        if angles is not None:
+            return numbers(angles, "rad", "angles", n)
+        middle = jnp.full((n,), value, zero.dtype)
+        return sum((e.side_by_side(scene.loads) for e in scene.effects if isinstance(e, LoadContact)), middle)
 
     if start != "jam":
-        return State(zero, zero, (phases(-jnp.pi / 2),), (jnp.zeros((n,), zero.dtype),))
+        rotor = (zero[0], zero[0]) if isinstance(scene.drive, Motor) else None
+        return State(zero, zero, (phases(-jnp.pi / 2),), (jnp.zeros((n,), zero.dtype),), rotor)
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not isinstance(scene.drive, ConstantSpeed):

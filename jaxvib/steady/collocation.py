@@ -118,7 +118,8 @@ def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: t
 
     def each(angle: Array, angle_rate: Array) -> Array:
         torque = loads.resistance((angle,), (angle_rate,), speed)[0]
-        return sum((effect.load_force(loads, (angle,))[0] for effect in acting), torque)
+        forces = (effect.load_force(loads, (angle,)) for effect in acting)
+        return sum((force[0] for force in forces if force is not None), torque)
 
     if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(loads)):
         return loads.count * each(jnp.asarray(phi), rate)

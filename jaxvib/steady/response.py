@@ -8,6 +8,9 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.contact import LoadContact
+from jaxvib.machine.drive import IdealDrive
+from jaxvib.machine.effects import Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
@@ -144,6 +147,15 @@ def circular_loads(scene: Scene) -> CircularLoads:
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if not isinstance(scene.loads, CircularLoads):
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
+    if scene.machine.carrier().stations is not None:
+        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
+    if not isinstance(scene.drive, IdealDrive):
+        raise InputError(
+            "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
+        )
+    for effect in scene.effects:
+        if not isinstance(effect, (Gravity, StaticImbalance, MomentImbalance, LoadContact)):
+            raise InputError(f"effects.{effect.kind}", "is not part of this theory; leave it out here, or simulate")
     return scene.loads
 
 

@@ -1,0 +1,183 @@
+"""A rigid rotor on two elastic supports that moves across, up, and tilts both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.units import Number, number, numbers
+
+__all__ = ["PlanarRotor", "Rotor", "planar_rotor", "rotor"]
+
+
+class Rotor(Machine):
+    """A rigid rotor on two isotropic supports; q = (y, z, theta, psi): its mass centre across and up, the tilts of its axis.
+
+        M y'' + b1 y' + b2 theta' + c1 y + c2 theta = f_y
+        M z'' + b1 z' + b2 psi' + c1 z + c2 psi = f_z
+        A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = m_y
+        A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
+
+    w is the rotor's speed; a point at the distance s along the axis moves by (y + s theta, z + s psi). A load at the station
+    s_j pushes there. z is counted from static equilibrium.
+
+    **Attributes**
+
+    - `mass` M kg; `transverse_inertia` A and `polar_inertia` C kg m^2, of the rotor without loads
+    - `stiffness` k (2,) N/m, `damping` (2,) N s/m and `position` L (2,) m along the axis, of the two supports
+    - `stations` s of the loads along the axis, m: one for all (scalar) or (count,)
+    - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s): in place of those the supports
+      make, c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2 and b alike; or None
+
+    Source: Artyunin 2013, equation (1), with L_2 counted negative.
+    """
+
+    mass: Array
+    transverse_inertia: Array
+    polar_inertia: Array
+    stiffness: Array
+    damping: Array
+    position: Array
+    stations: Array
+    stiffness_terms: Array | None
+    damping_terms: Array | None
+    kind: str = eqx.field(static=True)
+
+    def carrier(self) -> Carrier:
+        """Four coordinates; the loads' port is the station all share, or the mass centre where each has its own."""
+
+        def terms(support: Array, given: Array | None) -> tuple[Array, Array, Array]:
+            if given is not None:
+                return given[0], given[1], given[2]
+            return jnp.sum(support), jnp.sum(support * self.position), jnp.sum(support * self.position**2)
+
+        def matrix(one: Array, two: Array, three: Array) -> Array:
+            plane = jnp.stack([jnp.stack([one, two]), jnp.stack([two, three])])
+            return jnp.kron(plane, jnp.eye(2, dtype=plane.dtype))
+
+        stiffness = terms(self.stiffness, self.stiffness_terms)
+        damping = terms(self.damping, self.damping_terms)
+        zero = jnp.zeros_like(self.mass)
+        dtype = self.mass.dtype
+        across = jnp.eye(2, 4, dtype=dtype)
+        tilt = jnp.eye(2, 4, 2, dtype=dtype)
+        shared = self.stations.ndim == 0
+        skew = np.zeros((4, 4))
+        skew[2, 3], skew[3, 2] = 1.0, -1.0
+        return Carrier(
+            mass=matrix(self.mass, zero, self.transverse_inertia),
+            damping=matrix(*damping),
+            stiffness=matrix(*stiffness),
+            gyroscopic=self.polar_inertia * jnp.asarray(skew, dtype=dtype),
+            port=across + self.stations * tilt if shared else across,
+            bed_stiffness=stiffness[0] * across + stiffness[1] * tilt,
+            bed_damping=damping[0] * across + damping[1] * tilt,
+            axes=(0, 1),
+            coordinates=("y", "z", "theta", "psi"),
+            tilt=tilt,
+            stations=None if shared else self.stations,
+            seat=-self.stations if shared else None,
+        )
+
+
+def rotor(
+    *,
+    mass: Number,
+    transverse_inertia: Number,
+    polar_inertia: Number,
+    stiffness: Number | Sequence[Number],
+    damping: Number | Sequence[Number],
+    position: Sequence[Number],
+    stations: Number | Sequence[Number] = 0.0,
+    stiffness_terms: Sequence[Number] | None = None,
+    damping_terms: Sequence[Number] | None = None,
+) -> Rotor:
+    """A rigid rotor on two supports, with the loads at one station or at several.
+
+    **Arguments**: `mass` kg, `transverse_inertia` A and `polar_inertia` C kg m^2 without loads; `stiffness` N/m, `damping`
+    N s/m and `position` m (along the axis from the mass centre, one side negative) of the two supports; `stations` m of the
+    loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3) where they are
+    not what the supports make, see `Rotor`.
+
+    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
+    ...                    damping=(420.0, 420.0), position=(0.165, -0.155), stations=(0.28, 0.25, -0.25, -0.28))
+    >>> machine.carrier().coordinates
+    ('y', 'z', 'theta', 'psi')
+    """
+
+    def terms(values: Sequence[Number] | None, units: tuple[str, str, str], field: str) -> Array | None:
+        if values is None:
+            return None
+        numbers([0.0] * len(values) if isinstance(values, (list, tuple)) else values, "", f"machine.{field}", 3)
+        return jnp.stack(
+            [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
+        )
+
+    return Rotor(
+        mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
+        transverse_inertia=number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True),
+        polar_inertia=number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0),
+        stiffness=numbers(stiffness, "N/m", "machine.stiffness", 2, low=0.0),
+        damping=numbers(damping, "N s/m", "machine.damping", 2, low=0.0),
+        position=numbers(position, "m", "machine.position", 2),
+        stations=numbers(stations, "m", "machine.stations", None, shared=True),
+        stiffness_terms=terms(stiffness_terms, ("N/m", "N", "N m"), "stiffness_terms"),
+        damping_terms=terms(damping_terms, ("N s/m", "N s", "N m s"), "damping_terms"),
+        kind="rotor",
+    )
+
+
+class PlanarRotor(Machine):
+    """A rotor on one isotropic support that moves across and up without tilting: M y'' + b y' + k y = f_y, z alike.
+
+    **Attributes**: `mass` M kg without loads, `stiffness` k N/m, `damping` b N s/m.
+
+    Source: the special case of `Rotor` with both supports and all loads in the plane of its mass centre.
+    """
+
+    mass: Array
+    stiffness: Array
+    damping: Array
+    kind: str = eqx.field(static=True)
+
+    def carrier(self) -> Carrier:
+        """Two coordinates, which are the port's two directions."""
+        eye = jnp.eye(2, dtype=self.mass.dtype)
+        return Carrier(
+            mass=self.mass * eye,
+            damping=self.damping * eye,
+            stiffness=self.stiffness * eye,
+            gyroscopic=None,
+            port=eye,
+            bed_stiffness=self.stiffness * eye,
+            bed_damping=self.damping * eye,
+            axes=(0, 1),
+            coordinates=("y", "z"),
+        )
+
+
+def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
+    """A rotor that moves across and up on one isotropic support.
+
+    **Arguments**: `mass` kg without loads, `stiffness` N/m, `damping` N s/m.
+
+    **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
+
+    >>> import jaxvib as jv
+    >>> jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0).carrier().port.shape
+    (2, 2)
+    """
+    return PlanarRotor(
+        mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
+        stiffness=number(stiffness, "N/m", "machine.stiffness", low=0.0),
+        damping=number(damping, "N s/m", "machine.damping", low=0.0),
+        kind="planar_rotor",
+    )
