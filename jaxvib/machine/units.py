@@ -171,7 +171,7 @@ def numbers(
         if shared or length is None:
             return scalar
         known = not isinstance(magnitude, jax.Array)
-        return jnp.asarray(np.broadcast_to(np.asarray(scalar), length)) if known else jnp.broadcast_to(scalar, (length,))
+        return jnp.asarray(np.full(length, magnitude), dtype=float) if known else jnp.broadcast_to(scalar, (length,))
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
         raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
     return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)

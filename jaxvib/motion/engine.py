@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -12,9 +14,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.motion.dynamics import Dynamics, State
-from jaxvib.motion.scalars import Unwritten, joined, on_numbers, split
+from jaxvib.motion.scalars import Unwritten, on_numbers, split
 
 __all__ = ["Motion", "Tolerance"]
+
+_TURN = 2.0 * math.pi
 
 _MOST_NUMBERS = 24
 """Above so many numbers in a state, arrays are compiled faster and run as fast."""
@@ -23,15 +27,24 @@ _MOST_NUMBERS = 24
 class Motion(eqx.Module):
     """Translates between a `State` and what the integrator holds: a tuple of numbers, or the state itself where it is large.
 
-    **Attributes**: `few` whether numbers are held; `term` the vector field for diffrax; `args` its arguments.
+    Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
+    single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
+
+    **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
+    the same turns, so that their differences stay.
+
+    **Attributes**: `few` whether numbers are held; `args` the arguments of `term`.
     """
 
     args: Any
     few: bool = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: Any = eqx.field(static=True)
+    wrapped: bool = eqx.field(static=True)
+    together: bool = eqx.field(static=True)
 
-    def __init__(self, field: Dynamics, state: State):
+    def __init__(self, field: Dynamics, state: State, *, wrapped: bool = False, together: bool = False):
+        self.wrapped, self.together = wrapped, together
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.few = sum(leaf.size for leaf in leaves) <= _MOST_NUMBERS
@@ -52,13 +65,65 @@ class Motion(eqx.Module):
 
     def held(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""
-        return _numbers(jax.tree.map(split, state)) if self.few else state
+        y = _numbers(jax.tree.map(split, state)) if self.few else state
+        return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
-    def states(self, held: Any) -> State:
-        """States along a leading axis, from what the integrator held at these times."""
+    def states(self, held: Any) -> tuple[State, State]:
+        """States along a leading axis, from what the integrator held then; and the same, angles counted from the first."""
+        if not self.wrapped:
+            state = self._state(held)
+            return state, state
+        y, turns = held
+        since = jax.tree.map(lambda n: n - n[:1], turns)
+        return self._state(self._turned(y, turns, 1.0)), self._state(self._turned(y, since, 1.0))
+
+    @property
+    def wrap(self) -> Callable[[Any], Any] | None:
+        """Takes whole turns out of the angles and counts them; None where angles are not wrapped."""
+        return self._wrap if self.wrapped else None
+
+    def _wrap(self, held: Any) -> Any:
+        y, turns = held
+        angles = self._angles(y)
+        first = jnp.ravel(angles[0])[0]
+        done = [
+            jnp.round((first if self.together and k < len(angles) - self._rotors else x) / _TURN) for k, x in enumerate(angles)
+        ]
+        done = [jnp.broadcast_to(n, x.shape) for n, x in zip(done, angles, strict=True)]
+        return self._turned(y, done, -1.0), [n + more for n, more in zip(turns, done, strict=True)]
+
+    @property
+    def _rotors(self) -> int:
+        return int(jax.tree.unflatten(self.like, self.shapes).rotor is not None)
+
+    def _places(self) -> list[int]:
+        """Where the angles are among the leaves of what is held."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])
+        numbered = jax.tree.unflatten(
+            self.like, [range(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
+        )
+        leaves = jax.tree.unflatten(self.like, range(len(self.shapes)))
+        chosen = numbered if self.few else jax.tree.map(lambda k: [k], leaves)
+        rotor = [] if chosen.rotor is None else [chosen.rotor[0]]
+        return [place for places in (*chosen.angle, *rotor) for place in places]
+
+    def _angles(self, y: Any) -> list[Array]:
+        leaves = jax.tree.leaves(y)
+        return [leaves[place] for place in self._places()]
+
+    def _turned(self, y: Any, turns: list[Array], sign: float) -> Any:
+        """Angles changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
+        leaves, rest = jax.tree.flatten(y)
+        for place, n in zip(self._places(), turns, strict=True):
+            high = np.asarray(_TURN, leaves[place].dtype)
+            low = np.asarray(_TURN - float(high), leaves[place].dtype)
+            leaves[place] = (leaves[place] + sign * n * high) + sign * n * low
+        return jax.tree.unflatten(rest, leaves)
+
+    def _state(self, y: Any) -> State:
         if not self.few:
-            return held
-        rows = iter(held)
+            return y
+        rows = iter(y)
         parts = []
         for shape in self.shapes:
             entries = [next(rows) for _ in np.ndindex(*shape)]
@@ -66,6 +131,12 @@ class Motion(eqx.Module):
         return jax.tree.unflatten(self.like, parts)
 
     def _rates(self, t: Any, y: Any, args: Any) -> Any:
+        if self.wrapped:
+            y, turns = y
+            return self._plain_rates(t, y, args), jax.tree.map(jnp.zeros_like, turns)
+        return self._plain_rates(t, y, args)
+
+    def _plain_rates(self, t: Any, y: Any, args: Any) -> Any:
         if not self.few:
             return args(t, y)
         field, numbers = args
@@ -73,9 +144,10 @@ class Motion(eqx.Module):
         cells = jax.tree.unflatten(rest, [_arranged(n, leaf.shape) for n, leaf in zip(numbers, leaves, strict=True)])
         rows = iter(y)
         state = jax.tree.unflatten(self.like, [_arranged([next(rows) for _ in np.ndindex(*s)], s) for s in self.shapes])
-        shape = jax.tree.map(lambda c: jnp.zeros(c.shape, y[0].dtype), state, is_leaf=_is_cells)
-        written = on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), y[0].dtype), shape, field)
-        return tuple(jnp.asarray(x, y[0].dtype) for x in _numbers(written(_arranged([jnp.asarray(t)], ()), state, cells)))
+        dtype = y[0].dtype
+        like = jax.tree.map(lambda c: jax.ShapeDtypeStruct(c.shape, dtype), state, is_leaf=_is_cells)
+        written = on_numbers(lambda t, y, f: f(t, y), jax.ShapeDtypeStruct((), dtype), like, field)
+        return tuple(jnp.asarray(x, dtype) for x in _numbers(written(_arranged([jnp.asarray(t, dtype)], ()), state, cells)))
 
 
 def _is_cells(x: Any) -> bool:

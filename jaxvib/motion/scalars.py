@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import lax
 from jax.extend import core
 
 from jaxvib.motion.sines import sine_and_cosine
@@ -59,11 +59,6 @@ def split(value: Any) -> Cells:
     for index in np.ndindex(*value.shape):
         cells[index] = value[index]
     return cells
-
-
-def joined(cells: Cells) -> Array:
-    """The array of an object array's entries."""
-    return jnp.stack([jnp.asarray(cell) for cell in cells.ravel()]).reshape(cells.shape) if cells.ndim else cells[()]
 
 
 def _cells(value: Any) -> Cells:
@@ -239,7 +234,9 @@ def _run(jaxpr: core.Jaxpr, consts: Any, arguments: list[Cells], angles: dict[in
     known: dict[Any, Cells] = {}
 
     def read(atom: Any) -> Cells:
-        return _cells(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, core.Literal) else known[atom]
+        return (
+            _cells(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if isinstance(atom, core.Literal) else known[atom]
+        )
 
     known.update(zip(jaxpr.constvars, (_cells(c) for c in consts), strict=True))
     known.update(zip(jaxpr.invars, arguments, strict=True))
@@ -250,8 +247,7 @@ def _run(jaxpr: core.Jaxpr, consts: Any, arguments: list[Cells], angles: dict[in
             inner = params[_INNER[name]]
             results = _run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), given, angles)
         elif name == "iota":
-            (aval,) = (v.aval for v in equation.outvars)
-            results = [_cells(np.asarray(lax.iota(aval.dtype, aval.size)).reshape(aval.shape))]
+            results = [_cells(np.indices(params["shape"])[params["dimension"]].astype(params["dtype"]))]
         elif name == "split":
             cuts = np.cumsum(params["sizes"])[:-1]
             results = np.split(given[0], cuts, axis=params["axis"])

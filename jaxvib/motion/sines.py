@@ -17,7 +17,9 @@ from jax import Array
 
 __all__ = ["sine_and_cosine"]
 
-_PI_2 = Fraction("1.57079632679489661923132169163975144209858469968755291048747229615390820314310449931401741267105853399107404326")
+_PI_2 = Fraction(
+    "1.57079632679489661923132169163975144209858469968755291048747229615390820314310449931401741267105853399107404326"
+)
 
 
 def _parts(dtype: np.dtype) -> tuple[float, float, float]:
@@ -64,8 +66,6 @@ def sine_and_cosine(x: Array) -> tuple[Array, Array]:
 
 
 @sine_and_cosine.defjvp
-def _sine_and_cosine_jvp(
-    primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _sine_and_cosine_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     s, c = sine_and_cosine(*primals)
     return (s, c), (c * tangents[0], -s * tangents[0])

@@ -27,7 +27,8 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
     each use of it (a step of 900 multiplications becomes one of 4500).
 
     **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them; the fence is then
-    a division by a 1 that the compiler cannot know, otherwise a detour through memory that costs less for single numbers.
+    a division by a 1 that the compiler cannot know, otherwise a detour through memory that costs less for single numbers;
+    `wrap` what is done to the state after each step, such as taking whole turns out of its angles.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -40,6 +41,8 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
     """
 
     lanes: bool = eqx.field(static=True, default=False)
+    wrap: Callable[[Any], Any] | None = None
+    tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., Any]] = diffrax.Dopri8.interpolation_cls
@@ -48,32 +51,34 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
         """8."""
         return 8
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        """Nothing is carried from step to step."""
-        return None
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        """The rates at the start: the last stage of a step is the first of the next one."""
+        return terms.vf(t0, y0, args)
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         """The vector field, for the choice of the first step."""
         return terms.vf(t0, y0, args)
 
     def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: None, made_jump: Any
-    ) -> tuple[Any, Any, dict[str, Any], None, Any]:
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
         """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
-        del solver_state, made_jump
+        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
+        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
         fence = _fence_of(self.lanes, jnp.where(t1 > t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
         nodes = np.concatenate([[0.0], np.asarray(_TABLEAU.c)])
-        stages: list[Any] = []
-        for row, c in zip([np.zeros(0), *_TABLEAU.a_lower[: _STAGES - 1]], nodes, strict=False):
-            y = fence(_moved(y0, dt, row, stages)) if stages else y0
+        stages = [first]
+        for row, c in zip(_TABLEAU.a_lower[: _STAGES - 1], nodes[1:], strict=False):
+            y = fence(_moved(y0, dt, row, stages))
             stages.append(fence(terms.vf(t0 + float(c) * dt, y, args)))
         y1 = fence(_moved(y0, dt, _TABLEAU.b_sol[:_STAGES], stages))
-        last = terms.vf(t1, y1, args)
+        last = fence(terms.vf(t1, y1, args))
         error = jax.tree.map(lambda *k: dt * _weighted(_ERROR[:_STAGES], k), *stages)
         # As increments over the step, as diffrax's interpolant takes them; the compiler drops what nobody asks for.
         k = jax.tree.map(lambda *k: jnp.stack([dt * value for value in k]), *stages, last)
-        return y1, error, dict(y0=y0, y1=y1, k=k), None, diffrax.RESULTS.successful
+        end = y1 if self.wrap is None else self.wrap(y1)
+        return end, error, dict(y0=y0, y1=y1, k=k), last, diffrax.RESULTS.successful
 
 
 def _weighted(weights: Any, values: Any) -> Array:
