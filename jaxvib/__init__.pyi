@@ -1,5 +1,6 @@
 """Differentiable simulation and design of vibration machines that work on the Sommerfeld effect."""
 
+from jaxvib.backend import prepare_cpu
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.contact import LoadContact
@@ -14,6 +15,7 @@ from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.supports import CubicSupport, Stop
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.motion.ensemble import Ensemble, ensemble
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
@@ -57,6 +59,7 @@ __all__ = [
     "DryFriction",
     "Dynamics",
     "Effect",
+    "Ensemble",
     "ExactBranches",
     "Folds",
     "Friction",
@@ -101,6 +104,7 @@ __all__ = [
     "criterion_map",
     "criterion_table",
     "energy",
+    "ensemble",
     "foundation_force",
     "initial_state",
     "jam_modes",
@@ -114,6 +118,7 @@ __all__ = [
     "planar_rotor",
     "port_receptance",
     "power",
+    "prepare_cpu",
     "rollers",
     "rotor",
     "save_scene",

@@ -21,6 +21,9 @@ def prepare() -> None:
     """Float64, and compiled programs kept on disk so that the second call of a command answers at once."""
     # Equinox turns runtime checks into host callbacks, which keep a program out of the cache; results carry a status instead.
     os.environ.setdefault("EQX_ON_ERROR", "nan")
+    from jaxvib.backend import prepare_cpu
+
+    prepare_cpu()
     import jax
 
     jax.config.update("jax_enable_x64", True)

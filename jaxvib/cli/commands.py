@@ -12,6 +12,7 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.machine.units import number
 
 if TYPE_CHECKING:
     from optimize import Outcome, Synthesis
@@ -43,7 +44,8 @@ def new(kind: str, output: Output) -> None:
 )
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, default=1e-8, show_default=True, help="Error a step may make.")
+@click.option("--tolerance", type=float, help="Error a step may make [1e-8].")
+@click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Fail after so many steps.")
 @click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
 @shared
@@ -53,22 +55,25 @@ def simulate(
     start: Any,
     mode: int | None,
     spin_up: str | None,
-    tolerance: float,
+    tolerance: float | None,
+    accuracy: float | None,
     max_steps: int | None,
     window: bool,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    loaded = jv.load_scene(scene)
     run = jv.simulate(
-        jv.load_scene(scene),
+        loaded,
         until,
         start=start,
         mode=mode,
         spin_up=spin_up,
         tolerance=tolerance,
+        accuracy=accuracy,
         max_steps=max_steps,
         save="window" if window else "all",
-        progress=sys.stderr.isatty(),
+        progress=sys.stderr.isatty() and _long(loaded, until),
     )
     picture, data = output.file("history.png"), output.file("run.npz")
     if picture is not None and data is not None:
@@ -87,8 +92,16 @@ def simulate(
         "settled": bool(run.settled),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
+        "error": float(run.error),
+        "evaluations": int(run.evaluations),
+        "seconds": float(run.seconds),
     }
     output.done(document, run.summary, "simulate")
+
+
+def _long(scene: jv.Scene, until: str) -> bool:
+    """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
+    return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
 
 
 @app.command("optimize")
