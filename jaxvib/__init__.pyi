@@ -37,6 +37,7 @@ from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_ro
 from jaxvib.steady.orbit import Orbit, OrbitStatus, jam_orbit
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.study.accuracy import Cost, CostRow, accuracy
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
 
 __all__ = [
@@ -49,6 +50,8 @@ __all__ = [
     "CircularLoads",
     "ComputationError",
     "ConstantSpeed",
+    "Cost",
+    "CostRow",
     "Criterion",
     "CriterionMap",
     "CriterionStatus",
@@ -92,6 +95,7 @@ __all__ = [
     "Stop",
     "Throw",
     "Trajectory",
+    "accuracy",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",

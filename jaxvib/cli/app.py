@@ -84,6 +84,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
+    "cost": "cost",
     "criterion": "criterion",
     "modes": "modes",
     "new": "commands",

@@ -20,8 +20,8 @@ __all__ = ["Motion", "Tolerance"]
 
 _TURN = 2.0 * math.pi
 
-_MOST_NUMBERS = 24
-"""Above so many numbers in a state, arrays are compiled faster and run as fast."""
+_MOST_NUMBERS = 8
+"""Above so many numbers in a state, a step written out on each of them takes too long to compile for what it saves."""
 
 
 class Motion(eqx.Module):

@@ -75,6 +75,7 @@ def on_kinks(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(kinks)))
 
 
+@kept
 def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count."""
     scene = jax.lax.stop_gradient(scene)
