@@ -159,6 +159,30 @@ def run(y, speeds, par, end, steps):
     return _made(source, "run", parallel=True)
 
 
+def rates_source() -> str:
+    """The vector field alone, `rates(y, par)` with the rotor's speed before the other numbers."""
+    names = dict(zip(NAMES, (f"y[{k}]" for k in range(6)), strict=True))
+    body = _RATES.format(i=0, **names).replace("s0", "math.sin(y[4])").replace("c0", "math.cos(y[4])")
+    return f"""
+import numpy as np
+def rates(y, par):
+    n, k11, k12, k22, d11, d12, d22, M1i, M2, mR, e, ek, g = par
+{body}
+    return np.array([K0_y1, K0_y2, K0_v1, K0_v2, K0_p, K0_w])
+"""
+
+
+def symbolic(y: Any, algebra: Any, speed: float, par: Any) -> list[Any]:
+    """The vector field in the symbols of jitcode."""
+    k11, k12, k22, d11, d12, d22, M1i, M2, mR, e, ek, g = par
+    s, c = algebra.sin(y(4)), algebra.cos(y(4))
+    torque = g * (speed - y(5))
+    force = -d22 * y(3) - k22 * y(1) - d12 * y(2) - k12 * y(0)
+    lift = (force + mR * (y(5) ** 2 * s - torque * c)) / (M2 - e * c * c)
+    first = (-d11 * y(2) - k11 * y(0) - d12 * y(3) - k12 * y(1)) * M1i
+    return [y(2), y(3), first, lift, y(5), torque - ek * lift * c]
+
+
 def flat(state: Any) -> np.ndarray:
     """A `State` of this machine as (6,) numbers."""
     return np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(state)])

@@ -53,18 +53,22 @@ def _controller(scene: Scene, motion: Motion, state: State, control: StepControl
     if control.steps is not None:
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
-    units = natural_units(scene)
+    natural = natural_units(scene)
     # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
     rotor = None if state.rotor is None else (jnp.zeros(()), jnp.ones(()))
     relative = State(jnp.ones(()), jnp.ones(()), (jnp.zeros(()),) * len(state.angle), (jnp.ones(()),) * len(state.rate), rotor)
-    unit = State(units.displacement, units.velocity, units.angle * len(state.angle), units.rate * len(state.rate), units.rotor)
+    angles, rates = natural.angle * len(state.angle), natural.rate * len(state.rate)
+    unit = State(natural.displacement, natural.velocity, angles, rates, natural.rotor)
     dtype = state.displacement.dtype
 
     def spread(tree: State) -> State:
         return jax.tree.map(lambda value, leaf: jnp.full(leaf.shape, value, dtype), tree, state)
 
     tolerance = jnp.asarray(control.tolerance, dtype)
-    return Tolerance(tolerance, motion.held(spread(unit)), motion.held(spread(relative)))
+    units = motion.held(spread(unit))
+    if motion.wrapped:  # the count of turns has no error, and any unit
+        units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
+    return Tolerance(tolerance, units, motion.held(spread(relative)))
 
 
 def on_kinks(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
