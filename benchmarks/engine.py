@@ -271,7 +271,8 @@ def mujoco_run(end: float) -> Callable[[float], np.ndarray]:
         model = mujoco.MjModel.from_xml_string(
             f"""<mujoco><compiler boundmass="0" boundinertia="0" balanceinertia="true"/>
             <option timestep="{step!r}" integrator="RK4" gravity="0 0 0"/><worldbody>{text}</worldbody><tendon>
-            <fixed stiffness="{float(m.link_stiffness[0])!r}" damping="{float(m.link_damping[0])!r}" springlength="0 0"><joint joint="y0" coef="1"/><joint joint="y1" coef="-1"/></fixed>
+            <fixed stiffness="{float(m.link_stiffness[0])!r}" damping="{float(m.link_damping[0])!r}" springlength="0 0">
+            <joint joint="y0" coef="1"/><joint joint="y1" coef="-1"/></fixed>
             </tendon></mujoco>"""
         )
         data = mujoco.MjData(model)

@@ -95,7 +95,8 @@ def ensemble(
 
     def whole(value: Any) -> tuple[Scene, State]:
         made = make(value)
-        scene, state = made if isinstance(made, tuple) else (made, initial_state(made))
+        alone = isinstance(made, Scene)
+        scene, state = (made, initial_state(made)) if alone else made if isinstance(made, tuple) else (made, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
             raise InputError("make", f"gives {made!r}; it must give a Scene, or a Scene and a State")
         return scene, state
