@@ -1,7 +1,8 @@
-"""What exact jams cost: collocation with the carrier eliminated against shooting with RK4, at the same accuracy.
+"""What exact jams cost: collocation with the carrier eliminated against other ways to the same orbits, at the same accuracy.
 
     python benchmarks/orbits.py
 
+Peers: shooting with RK4, jaxcont's collocation of the whole state (left out where it is not installed), SciPy's solve_bvp.
 Compile and run time apart, the best of several runs; ratios travel between machines, absolute times do not. The machine is
 the two-mass one of the antiphase paper with eps = 0.05.
 """
@@ -73,7 +74,9 @@ def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: boo
         motion, harmonics = jax.vmap(one, out_axes=-1)(w)
         if not multipliers:
             return motion.rotor_speed, ()
-        return motion.rotor_speed, floquet(scene, grid, motion, harmonics, jnp.max(steps_for(scene, w))).roots
+        return motion.rotor_speed, floquet(
+            scene, grid, motion, harmonics, jnp.max(steps_for(scene, w, motion.rotor_speed))
+        ).roots
 
     return jax.lax.map(batch, omega.reshape(-1, 100))
 
@@ -111,6 +114,96 @@ def shooting(scene: jv.Scene, omega: jax.Array, steps: int, start: jax.Array):
     return jax.lax.map(lambda a: jax.vmap(solve)(*a), (omega.reshape(-1, 100), start.reshape(-1, 100, 6)))
 
 
+def paper(u: jax.Array, n: jax.Array, eps: float = 0.05, np=jnp) -> jax.Array:
+    """The antiphase paper's equation (2) with one load: v1, v1', v2, v2', cos phi, sin phi, phi'; the circle attracts."""
+    v1, w1, v2, w2, c, s, rate = u
+    link = 0.02 * (w1 - w2) + 4 / 9 * (v1 - v2)
+    right, pull = -0.02 * w2 - v2 / 9 + link + s * rate**2, eps * (n - rate)
+    a2 = (right - c * pull) / (1.0 - eps * c * c)
+    round_ = 1.0 - c * c - s * s
+    turn = (c * round_ - s * rate, s * round_ + c * rate)
+    return np.stack([w1, -0.02 * w1 - v1 / 9 - link, w2, a2, *turn, pull - eps * c * a2])
+
+
+def trajectory(scene: jv.Scene, omega: float) -> tuple[jv.Orbit, np.ndarray, np.ndarray]:
+    """An exact jam, a period of times and the state of `paper` there."""
+    orbit = jv.jam_orbit(scene, omega=omega, points=24)
+    theta = np.linspace(0.0, 2.0 * np.pi, 2001)
+    q, velocity, (phi,), (rate,) = jax.vmap(orbit.at)(jnp.asarray(theta))
+    length = 0.05 * scene.loads.inertia_factor() * scene.loads.radius
+    v, w = q / length, velocity / length
+    state = np.stack([v[:, 0], w[:, 0], v[:, 1], w[:, 1], np.cos(phi[:, 0]), np.sin(phi[:, 0]), rate[:, 0]], axis=1)
+    return orbit, theta / omega, state
+
+
+def with_jaxcont(scene: jv.Scene, omega: jax.Array, runs: int) -> None:
+    """jaxcont's collocation of the whole state: a Newton solution at a rotor speed 0.1 % off the one it starts from."""
+    try:
+        from jaxcont.core.collocation import Collocation
+        from jaxcont.problems.periodic import periodic_orbit_problem
+        from jaxcont.solvers.implicit import differentiable_root
+    except ImportError:
+        print("jaxcont is not installed: left out")
+        return
+
+    def field(u, n, _):
+        return paper(u, n)
+
+    for intervals, degree in ((10, 4), (12, 5)):
+        errors, best, mesh = [], np.inf, Collocation(intervals, degree)
+        residual: list[Callable] = []
+
+        @jax.jit
+        def solve(u, n, a, b, mesh=mesh, residual=residual):
+            return differentiable_root(lambda x, p: residual[0](x, p, (a, b, field, mesh)), u, n, tol=1e-8, max_iter=8)
+
+        for w in map(float, omega):
+            orbit, times, states = trajectory(scene, w)
+            n, period = orbit.rotor_speed, 2.0 * np.pi / w
+            near = periodic_orbit_problem(field, jnp.asarray(states), jnp.asarray(times), period, 1.001 * n, mesh)
+            residual.append(near.f)
+            for _ in range(runs + 1):
+                begin = time.perf_counter()
+                found = jax.block_until_ready(solve(near.u0, n, *near.args[:2]))
+                best = min(best, time.perf_counter() - begin)
+            # An error of Omega at a given rotor speed is one of the rotor speed at a given Omega.
+            errors.append(abs(2.0 * np.pi / found[-1] / w - 1.0) * abs(orbit.slope) * w / n)
+        name = f"jaxcont, {intervals} intervals of degree {degree}, one orbit"
+        print(f"{name:58s} run {1e3 * best:9.3f} ms\n    error of n {max(errors):.1e}")
+
+
+def with_solve_bvp(omega: jax.Array) -> None:
+    """SciPy's solve_bvp on half a period, from the leading order."""
+    from scipy.integrate import solve_bvp
+
+    scene, eps = published(), 0.05
+    for tol in (1e-6, 1e-9):
+        errors, best = [], np.inf
+        for w in map(float, omega):
+            exact, times, states = trajectory(scene, w)
+            half = slice(0, 1001, 25)
+            y = states[half].T.copy()
+            phi = np.unwrap(np.arctan2(y[5], y[4]))
+            y = np.stack([*y[:4], phi, y[6]])
+            first = phi[0]
+            near = y * (1.0 + 1e-3)
+
+            def field(t, y, p, eps=eps):
+                full = np.stack([*y[:4], np.cos(y[4]), np.sin(y[4]), y[5]])
+                rates = paper(full, p[0], eps, np)
+                return np.stack([*rates[:4], y[5], rates[6]])
+
+            def ends(a, b, p, first=first):
+                return np.array([*(a[:4] + b[:4]), b[4] - a[4] - np.pi, b[5] - a[5], a[4] - first])
+
+            begin = time.perf_counter()
+            found = solve_bvp(field, ends, times[half], near, p=[1.001 * float(exact.rotor_speed)], tol=tol, max_nodes=20000)
+            best = min(best, time.perf_counter() - begin)
+            errors.append(abs(found.p[0] / float(exact.rotor_speed) - 1.0) if found.success else np.nan)
+        name = f"SciPy solve_bvp, tol {tol:.0e}, one orbit"
+        print(f"{name:58s} run {1e3 * best:9.3f} ms\n    error of n {np.nanmax(errors):.1e}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--orbits", type=int, default=2000, help="a multiple of 100")
@@ -143,19 +236,29 @@ def main() -> None:
         worst = error(np.where(right, np.ravel(result), np.nan))
         print(f"    error of n {worst:.1e} where it converged, on {np.mean(right):.1%}")
 
-    times = {}
-    for platforms in (2, 20):
-        machine = chain(platforms)
-        flat, restore = ravel_pytree(machine)
-        near = float(jv.natural_frequencies(machine)[1]) * 0.97
+    few = omega[:: max(1, options.orbits // 5)][1:]
+    with_jaxcont(scene, few, options.runs)
+    with_solve_bvp(few)
 
-        @jax.jit
-        def value_and_gradient(x, restore=restore, near=near):
-            return jax.value_and_grad(lambda v: jv.jam_orbit(restore(v), near=near, points=16).amplitude[0])(x)
+    for points in (8, 16):
+        times = {}
+        for platforms in (2, 20):
+            machine = chain(platforms)
+            flat, restore = ravel_pytree(machine)
+            modes = jv.jam_modes(machine)
+            mode = next(k for k in modes.mode_numbers() if k % 2 == 1)
+            near = float(modes.select(mode).omega)
 
-        text = f"value and gradient at a given rotor speed, {platforms} platforms"
-        _, times[platforms] = timed(text, lambda f=value_and_gradient, x=flat: f(x), 20 * options.runs)
-    print(f"    20 platforms take {times[20] / times[2]:.1f} times as long as 2")
+            @jax.jit
+            def value_and_gradient(x, restore=restore, near=near, points=points):
+                return jax.value_and_grad(lambda v: jv.jam_orbit(restore(v), near=near, points=points).amplitude[0])(x)
+
+            text = f"value and gradient at a given n, {platforms} platforms, {points} points"
+            _, times[platforms] = timed(text, lambda f=value_and_gradient, x=flat: f(x), 40 * options.runs)
+            at = jv.jam_orbit(machine, near=near, points=16)
+            rough = jv.jam_orbit(machine, near=near, points=points, throw=False)
+            print(f"    error of Omega {abs(float(rough.omega / at.omega) - 1.0):.1e} (against 16 points)")
+        print(f"    20 platforms take {times[20] / times[2]:.1f} times as long as 2")
 
 
 if __name__ == "__main__":

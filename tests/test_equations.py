@@ -146,6 +146,26 @@ def test_absent_effect_is_not_in_the_program():
     assert len(jax.tree.leaves(scene(effects=()))) + 1 == len(jax.tree.leaves(scene(effects=(jv.Gravity(),))))
 
 
+def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
+    """With every hook of an effect, a motor and a station taken out of the code, its program is the same, word for word."""
+    s = scene("two_mass", "pendulums")
+    state = random_state(s)
+
+    def program():
+        return str(jax.make_jaxpr(lambda t, y: jv.vector_field(s)(t, y))(0.0, state))
+
+    whole = program()
+    dynamics = jv.Dynamics
+    monkeypatch.setattr(dynamics, "_friction", lambda self, state, speed: [])
+    monkeypatch.setattr(dynamics, "_throw", lambda self, t, state: None)
+    monkeypatch.setattr(dynamics, "_with_rotor", lambda self, part, throw, speed: (part.weight, part.reaction, None))
+    monkeypatch.setattr(dynamics, "_at_loads", lambda self, a: dict(zip(self.axes, a, strict=True)))
+    monkeypatch.setattr(dynamics, "_total", lambda self, values, *arms: jnp.sum(jnp.broadcast_to(values, (s.loads.count,))))
+    for hook in ("load_force", "load_resistance", "friction", "throw", "place", "support_force"):
+        monkeypatch.delattr(jv.Effect, hook)
+    assert program() == whole
+
+
 def test_vertical_machine_has_no_sideways_coordinate():
     assert scene("two_mass").machine.carrier().port.shape == (1, 2)
     assert scene("two_mass").machine.carrier().gyroscopic is None

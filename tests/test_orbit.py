@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from periodic import integrate
 from scenes import machines, published
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
@@ -65,20 +66,6 @@ def solved(name):
     orbit = jv.jam_orbit(make(), **question)
     scene = eqx.tree_at(lambda s: s.drive.speed, make(), orbit.rotor_speed)
     return scene, orbit
-
-
-def integrate(scene, orbit, periods):
-    """SciPy's DOP853 from the orbit at theta = 0 through whole periods; rows are the changes after each, relative."""
-    state, period, w = jv.State(*orbit.at(0.0)), 2.0 * np.pi / float(orbit.omega), float(orbit.omega)
-    start, restore = ravel_pytree(state)
-    size = jv.State(orbit.amplitude, w * orbit.amplitude, (jnp.ones(orbit.count),), (jnp.full(orbit.count, w),))
-    turns = jv.State(0.0 * orbit.amplitude, 0.0 * orbit.amplitude, (jnp.ones(orbit.count),), (jnp.zeros(orbit.count),))
-    size, turns = (np.asarray(ravel_pytree(x)[0]) for x in (size, turns))
-    field = jax.jit(lambda y: ravel_pytree(jv.vector_field(scene)(0.0, restore(y * size)))[0] / size)
-    times = period * np.arange(periods + 1)
-    start = np.asarray(start) / size
-    run = solve_ivp(lambda t, y: np.asarray(field(y)), (0.0, times[-1]), start, "DOP853", times, rtol=1e-12, atol=1e-13)
-    return run.y.T - 2.0 * np.pi * np.arange(periods + 1)[:, None] * turns - start
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -178,6 +165,14 @@ def test_error_falls_exponentially_and_is_known():
     assert errors[1] < 1e-8 < 1e-4 * errors[0]
 
 
+def test_figure_of_convergence():
+    found = jv.harmonic_convergence(published(eps=0.05).scene(), [0.34, 0.97], points=(4, 8))
+    assert found.harmonics.tolist() == [3, 7] and np.all(found.error[1] < 1e-4 * found.error[0])
+    assert [line.get_label() for line in found.plot().axes[0].lines[::2]] == ["0.34 rad/s", "0.97 rad/s", "estimate"]
+    with pytest.raises(jv.InputError, match="ascending"):
+        jv.harmonic_convergence(published().scene(), [0.9], points=(8, 4))
+
+
 def test_light_loads_jam_at_leading_order():
     scene = published(eps=1e-6).scene()
     orbit, jam = jv.jam_orbit(scene, mode=3), jv.jam_modes(scene).select(3)
@@ -188,7 +183,7 @@ def test_light_loads_jam_at_leading_order():
 
 def numbers_of(orbit):
     parts = (orbit.omega, orbit.slope, orbit.amplitude, orbit.foundation_force, orbit.power)
-    parts += (orbit.lag_harmonics[1:3].real, orbit.displacement_harmonics[:, 0].imag)
+    parts += (orbit.lag_harmonics[0, 1:3].real, orbit.displacement_harmonics[:, 0].imag)
     return jnp.concatenate([jnp.ravel(part) for part in parts])
 
 
@@ -240,10 +235,30 @@ def test_limits_converge_or_say_why(form, omega):
         assert bool(orbit.status == jv.OrbitStatus.not_converged) or bool(orbit.status == jv.OrbitStatus.coarse)
 
 
-def test_loads_that_would_part_are_not_called_stable():
-    scene = eqx.tree_at(lambda s: s.loads.drag, two_sizes(), jnp.asarray([0.7, 1.5]))
-    orbit = jv.jam_orbit(scene, omega=27.0)
-    assert bool(orbit.status == jv.OrbitStatus.held) and not bool(orbit.stable)
+def test_at_a_fold_the_status_says_so():
+    omega, rotor_speed = 1.0022684475770662, 5.202824715161476  # as branches(exact=True) finds it
+    scene = published(eps=0.05, speed=rotor_speed * (1.0 - 1e-13)).scene()
+    orbit = jv.jam_orbit(scene, near=omega)
+    assert bool(orbit.status == jv.OrbitStatus.at_fold)
+    np.testing.assert_allclose(orbit.omega, omega, rtol=1e-6)
+    # A gradient there is huge, not infinite.
+    slope = jax.grad(lambda n: jv.jam_orbit(eqx.tree_at(lambda s: s.drive.speed, scene, n), near=omega, points=16).omega)
+    assert np.isfinite(slope(scene.drive.speed))
+
+
+def test_modes_that_the_leading_order_lacks_or_has_in_vain():
+    """The exact fold of mode 3 is at a rotor speed of 5.2028 for eps = 0.05, at 5.0975 for 0.3; in leading order at 5.1829."""
+    beyond = published(eps=0.05, speed=5.2028).scene()
+    assert jv.jam_modes(beyond).mode_numbers() == [5]
+    modes = [jv.jam_orbit(beyond, mode=k) for k in (3, 4, 5)]
+    assert [bool(m.status == jv.OrbitStatus.found) for m in modes] == [True] * 3
+    assert [float(m.slope) > 0.0 for m in modes] == [True, False, True]
+    np.testing.assert_allclose([m.omega for m in modes], [1.00219515, 1.00234177, 5.09332167], rtol=1e-8)
+    within = published(eps=0.3, speed=5.15).scene()
+    assert jv.jam_modes(within).mode_numbers() == [3, 4, 5]
+    for k in (3, 4):
+        with pytest.raises(jv.ComputationError, match="absent"):
+            jv.jam_orbit(within, mode=k)
 
 
 def test_wrong_questions_are_refused():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from periodic import monodromy, ordered
 from scenes import machines, published
 from scipy.integrate import solve_ivp
 
@@ -18,29 +19,6 @@ from jaxvib.study.onset import onset
 def gravity():
     loads = jv.balls(count=2, mass=0.8, radius=0.12, drag=1.5)
     return jv.Scene(machines()["two_mass"], loads, jv.ConstantSpeed(150.0), jv.Gravity())
-
-
-def monodromy(scene, orbit):
-    """By forward-mode differentiation of the full equations, every load for itself, and SciPy's DOP853."""
-    start, restore = ravel_pytree(jv.State(*orbit.at(0.0)))
-    n = start.size
-
-    def both(z):
-        y, columns = z[:n], z[n:].reshape(n, n)
-        rate, push = jax.linearize(lambda y: ravel_pytree(jv.vector_field(scene)(0.0, restore(y)))[0], y)
-        return jnp.concatenate([rate, jax.vmap(push, in_axes=1, out_axes=1)(columns).ravel()])
-
-    field = jax.jit(both)
-    begin = np.concatenate([start, np.eye(n).ravel()])
-    period = 2.0 * np.pi / float(orbit.omega)
-    run = solve_ivp(lambda t, z: np.asarray(field(z)), (0.0, period), begin, "DOP853", rtol=1e-11, atol=1e-11)
-    return np.linalg.eigvals(run.y[n:, -1].reshape(n, n))
-
-
-def ordered(values):
-    """Sorted so that rounding does not part equal pairs."""
-    values = np.asarray(values)
-    return values[np.lexsort((values.imag.round(5), values.real.round(5)))]
 
 
 @pytest.mark.parametrize("make, omega", [(lambda: published(eps=0.05, count=3).scene(), 0.97), (gravity, 60.0)])
@@ -106,13 +84,25 @@ def grows(omega, eps):
     return bool(orbit.stable), distance[-1] > 1e-4, float(orbit.multiplier)
 
 
-@pytest.mark.parametrize("kind, apart", [("torus", 2e-2), ("symmetry", 4e-3)])
-def test_time_integration_on_both_sides_of_a_special_point(kind, apart):
-    point = next(p for p in diagram(0.3).special if p.kind == kind)
+@pytest.mark.parametrize(
+    "kind, which, apart",
+    [("torus", 0, 2e-2), ("torus", 1, 2e-2), ("symmetry", 0, 4e-3)],
+    ids=["torus on mode 3", "torus on mode 5", "symmetry on mode 3"],
+)
+def test_time_integration_on_both_sides_of_a_special_point(kind, which, apart):
+    point = [p for p in diagram(0.3).special if p.kind == kind][which]
     sides = [grows(point.omega * (1.0 + side), 0.3) for side in (-apart, apart)]
     assert sides[0][0] != sides[1][0]
     for stable, grown, multiplier in sides:
         assert stable == (not grown) == (multiplier < 1.0)
+
+
+def test_figure_of_stability_over_the_load_mass():
+    found = jv.stability_map(lambda x: published(eps=x).scene(), [0.02, 0.05], omega=(0.36, 0.5), points=100)
+    assert [[p.kind for p in points] for points in found.special] == [["fold"], ["fold", "torus"]]
+    assert found.plot(label="eps").axes[0].get_ylabel() == "eps"
+    with pytest.raises(jv.InputError, match="ascending"):
+        jv.stability_map(lambda x: published(eps=x).scene(), [0.05, 0.02], omega=(0.36, 0.5))
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Numbers with units, scene files, and what is said about wrong input."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -181,8 +182,120 @@ def test_one_platform_one_load_and_no_links_survive_the_file():
 @pytest.mark.parametrize("kind", TEMPLATES)
 def test_template_loads_and_jams(kind):
     s = jv.scene_from_toml(TEMPLATES[kind])
-    assert s.machine.kind == kind and s.loads.count == 3 and s.effects == ()
-    np.testing.assert_allclose(s.loads.mass, 0.8)
+    assert s.machine.kind == kind
+    if "rotor" in kind:
+        assert s.loads.count == 4 and [e.kind for e in s.effects] == ["gravity", "static_imbalance"]
+        np.testing.assert_allclose(s.loads.mass, 0.05)
+    else:
+        assert s.loads.count == 3 and s.effects == ()
+        np.testing.assert_allclose(s.loads.mass, 0.8)
+
+
+ROTOR = dict(
+    mass=37.0,
+    transverse_inertia=0.479,
+    polar_inertia=0.093,
+    stiffness=(6e5, 5e5),
+    damping=400.0,
+    position=(0.165, -0.155),
+)
+EVERY_EFFECT = (
+    jv.Gravity(),
+    jv.StaticImbalance(0.01, angle=0.3),
+    jv.MomentImbalance(-1e-3, angle=0.1),
+    jv.DryFriction(0.0015, diameter=0.012, reaction="run_up", width=0.3),
+    jv.CubicSupport(1e9, position=0.1),
+    jv.Stop(1e6, gap=1e-3, damping=30.0, position=0.165),
+    jv.CubicSupport(2e9, position=-0.1),
+    jv.Stop(2e6, gap=2e-3, position=-0.155),
+)
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [
+        jv.RunUp(460.0, acceleration=230.0),
+        jv.DCMotor("3000 rpm", stall_torque=2.0, inertia=0.01),
+        jv.InductionMotor("3000 rpm", breakdown_torque=3.0, breakdown_slip=0.2, inertia=0.01),
+    ],
+    ids=lambda d: d.kind,
+)
+@pytest.mark.parametrize("stations", [0.1, [0.2, 0.1, -0.1, -0.2]], ids=["one station", "stations"])
+def test_scene_file_of_a_rotor_with_every_effect(drive, stations, tmp_path):
+    machine_ = jv.rotor(**ROTOR, stations=stations, damping_terms=(843.0, -0.47, 10.4))
+    loads_ = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
+    s = eqx.tree_at(lambda s: s.drive.speed, jv.Scene(machine_, loads_, drive, EVERY_EFFECT), drive.speed / 3.0)
+    same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    extra = (jv.Stop(1e6, gap=1e-3), jv.LoadContact(stiffness=1e5, damping=2.0))
+    plane = jv.Scene(jv.planar_rotor(mass=3.0, stiffness=1e5, damping=0.1), balls_, drive, extra)
+    same(jv.load_scene(jv.save_scene(plane, tmp_path / "scene.toml")), plane)
+
+
+def rotor_scene(machine_=None, drive=None, effects=(), count=4):
+    machine_ = jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]) if machine_ is None else machine_
+    loads_ = jv.pendulums(count=count, mass=0.05, radius=0.08, drag=0.1)
+    return jv.Scene(machine_, loads_, jv.ConstantSpeed(460.0) if drive is None else drive, effects)
+
+
+def motor(slip=0.2, inertia=0.01):
+    return jv.InductionMotor(300.0, breakdown_torque=1.0, breakdown_slip=slip, inertia=inertia)
+
+
+def two():
+    return jv.two_mass(**TWO_MASS)
+
+
+def contact():
+    return (jv.LoadContact(stiffness=1e5),)
+
+
+def touching():
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    return jv.Scene(jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]), balls_, jv.ConstantSpeed(1.0), contact())
+
+
+WRONG_ROTORS = {
+    "stations of other loads": (lambda: rotor_scene(count=3), r"machine\.stations has 4 values; one for all loads or 3"),
+    "slip": (lambda: motor(slip=1.2), r"drive\.breakdown_slip is 1\.2; it must be below 1"),
+    "no inertia": (lambda: motor(inertia=0.0), r"drive\.inertia is 0 kg m\^2; it must be greater than 0"),
+    "terms": (lambda: jv.rotor(**ROTOR, stiffness_terms=(1.0, 2.0)), r"machine\.stiffness_terms has 2 values; 3 are needed"),
+    "term's unit": (lambda: jv.rotor(**ROTOR, stiffness_terms=("1 N/m", "2 m", 3.0)), r"stiffness_terms\[1\] is '2 m'"),
+    "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"goes with a rotor that can tilt"),
+    "far platform": (
+        lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, platform=3),)),
+        r"is 3; the machine has platforms 1",
+    ),
+    "position of platforms": (
+        lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, position=0.1),)),
+        r"name a platform instead",
+    ),
+    "platform of a rotor": (lambda: rotor_scene(effects=(jv.CubicSupport(1.0, platform=1),)), r"a rotor needs a position"),
+    "both places": (lambda: jv.CubicSupport(1.0, platform=1, position=0.1), r"names a platform and a position"),
+    "side of a ring": (lambda: rotor_scene(effects=(jv.Stop(1.0, 0.0, side="above", position=0.1),)), r"it must be 'both'"),
+    "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),
+    "reaction": (lambda: jv.DryFriction(0.1, 0.01, reaction="none"), r"is 'none'; allowed: exact, run_up, steady"),
+    "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their own_radius"),
+    "contact of several tracks": (lambda: touching(), r"needs loads on one track; this machine has them at several stations"),
+    "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"names gravity 2 times"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_ROTORS)
+def test_wrong_rotors_motors_and_effects_say_what_is_wrong(name):
+    make, message = WRONG_ROTORS[name]
+    with pytest.raises(jv.InputError, match=message):
+        make()
+
+
+def test_effects_in_a_scene_file_say_where_they_are_wrong():
+    wrong = TEMPLATES["rotor"] + "\n[[effects.stop]]\nstiffness = 1e6\n[[effects.stop]]\nstiffness = 1e6\ngap = 0.1\n"
+    with pytest.raises(jv.InputError, match=r"effects\.stop\[0\]\.gap is missing"):
+        jv.scene_from_toml(wrong)
+    with pytest.raises(jv.InputError, match=r"effects\.static_imbalance\.moment is missing"):
+        jv.scene_from_toml(TEMPLATES["two_mass"] + "static_imbalance = true\n")
+    with pytest.raises(jv.InputError, match=r"effects\.gravity is \[\]; write true, false or a table"):
+        jv.scene_from_toml(TEMPLATES["two_mass"] + "gravity = []\n")
 
 
 def tables(**changed):

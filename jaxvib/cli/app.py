@@ -85,6 +85,8 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 _HOMES = {
     "cost": "cost",
+    "identify": "identify",
+    "whirl": "whirl",
     "criterion": "criterion",
     "modes": "modes",
     "new": "commands",

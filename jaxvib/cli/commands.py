@@ -19,14 +19,16 @@ if TYPE_CHECKING:
 
 
 @app.command("new")
-@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design"]))
+@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement"]))
 @shared
 def new(kind: str, output: Output) -> None:
-    """Print a commented scene file of that KIND of machine, or a design file."""
-    from optimize.files import TEMPLATE
+    """Print a commented scene file of that KIND of machine, a design file, or a measurement file for `identify`."""
+    from jaxvib.study.measurement import TEMPLATE as MEASUREMENT
+    from optimize.files import TEMPLATE as DESIGN
 
-    text = TEMPLATE if kind == "design" else TEMPLATES[kind.replace("-", "_")]
-    path = output.file("design.toml" if kind == "design" else "machine.toml")
+    files = {"design": DESIGN, "measurement": MEASUREMENT}
+    text = files[kind] if kind in files else TEMPLATES[kind.replace("-", "_")]
+    path = output.file(f"{kind}.toml" if kind in files else "machine.toml")
     if path is None:
         output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
         return
@@ -89,6 +91,7 @@ def simulate(
         "amplitude": run.amplitude.tolist(),
         "foundation_force": float(run.foundation_force),
         "drift": float(run.drift),
+        "regime": _regime(run.regime),
         "settled": bool(run.settled),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
@@ -102,6 +105,22 @@ def simulate(
 def _long(scene: jv.Scene, until: str) -> bool:
     """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
+
+
+def _regime(found: jv.Regime) -> dict[str, Any]:
+    """The regime and its evidence; names as in `RegimeName` and `PhasePattern`."""
+    return {
+        "name": found.label,
+        "pattern": found.pattern_label,
+        "mode": int(found.mode),
+        "resonance": int(found.resonance),
+        "resonance_speed": float(found.resonance_speed),
+        "ripple": float(found.ripple),
+        "phase": found.phase.tolist(),
+        "unbalance": float(found.unbalance),
+        "rotor_caught": bool(found.caught),
+        "change": float(found.change),
+    }
 
 
 @app.command("optimize")

@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.steady.jam_orbit import exact_mode_speeds
 
 _RPM = 30.0 / np.pi
 
@@ -80,9 +81,10 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, output: Output
 
 
 def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
-    """The exact jams that continue those of light loads, and the exact diagram's special points."""
+    """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
     light = jv.jam_modes(scene)
-    jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in light.mode_numbers()}
+    numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})
+    jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     known = {k: jam for k, jam in jams.items() if bool(np.isfinite(jam.rotor_speed))}
     diagram = jv.branches(scene, exact=True)
     picture = output.file("branches.png")

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["cost_chart", "tiers_chart"]
+__all__ = ["convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
 
 
 def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray) -> Figure:
@@ -45,4 +46,36 @@ def cost_chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], floor: float,
     axes.set_xlabel("seconds, once compiled")
     axes.set_ylabel(f"relative error of {quantity}")
     axes.legend()
+    return figure
+
+
+def convergence_chart(harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str]) -> Figure:
+    """Errors (n, w) over the highest harmonic (n,), log scale; their estimates `known` (n, w) dashed."""
+    figure, (axes,) = panels(1, size=(7.0, 4.0))
+    floor = np.finfo(float).eps
+    for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
+        axes.semilogy(harmonics, np.maximum(error[:, k], floor), "o-", color=color, ms=4.5, label=name)
+        axes.semilogy(harmonics, np.maximum(known[:, k], floor), ls=(0, (3, 2)), lw=1.0, color=color)
+    axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="estimate")
+    axes.set_xlabel("highest harmonic")
+    axes.set_ylabel("relative error of the rotor speed")
+    axes.legend(title="loads at")
+    return figure
+
+
+def stability_chart(
+    value: np.ndarray, omega: np.ndarray, stable: np.ndarray, marks: Mapping[str, np.ndarray], *, label: str
+) -> Figure:
+    """Where `stable` (n, P) over load speed `omega` (n, P) rad/s and another number (n,), with marks (k, 2) by kind."""
+    figure, (axes,) = panels(1, size=(7.5, 4.5))
+    height = np.broadcast_to(value[:, None], omega.shape)
+    if value.size > 1:
+        axes.contourf(omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])
+        axes.set_yscale("log" if value[0] > 0.0 and value[-1] > 3.0 * value[0] else "linear")
+    for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
+        axes.plot(points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
+    axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
+    axes.set_xlabel("speed of loads, rad/s")
+    axes.set_ylabel(label)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure

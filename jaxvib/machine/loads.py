@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.units import Number, count, numbers
+from jaxvib.errors import InputError
+from jaxvib.machine.units import Number, count, number, numbers, traced
 
 __all__ = ["CircularLoads", "Loads", "balls", "pendulums", "rollers"]
 
@@ -46,7 +48,8 @@ class CircularLoads(Loads):
 
     **Attributes** (scalar: shared by all loads; or (count,)): `mass` m kg; `radius` R m of the circle of the mass centres;
     `drag` b_W N s/m at that radius; `inertia` J_C kg m^2 about the mass centre (pendulums; None for the others);
-    `count` N; `kind` "ball", "roller" or "pendulum".
+    `count` N; `kind` "ball", "roller" or "pendulum"; `own_radius` r m of a ball or roller (scalar), None for loads that can
+    all be at one point. With it, collected loads lie side by side on an arc, 2 arcsin(r/R) apart.
 
     Source: the antiphase paper, equations (1), (2), (6).
     """
@@ -57,6 +60,12 @@ class CircularLoads(Loads):
     inertia: Array | None
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
+    own_radius: Array | None = None
+
+    @property
+    def alike(self) -> bool:
+        """Whether all loads share every number."""
+        return all(x is None or x.ndim == 0 for x in (self.mass, self.radius, self.drag, self.inertia))
 
     def position(self, *u: Array) -> tuple[Array, Array]:
         """R (cos phi, sin phi)."""
@@ -74,54 +83,107 @@ class CircularLoads(Loads):
         (rate_phi,) = rate
         return (self.drag * self.radius**2 * (speed - rate_phi),)
 
+    def offsets(self) -> Array:
+        """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
+        if self.own_radius is None:
+            return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
+        angle = jnp.arcsin(self.own_radius / self.radius)
+        return jnp.arange(1 - self.count, self.count, 2, dtype=angle.dtype) * angle
+
     def unbalance(self) -> Array:
-        """sum m R of all loads, kg m: the unbalance they make when they are collected at one point."""
-        return jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
+        """The unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
+        whole = jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
+        return whole if self.own_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
 
     def drag_sum(self) -> Array:
         """sum b_W R^2 of all loads, N m s: the torque that turns them, per speed difference to the rotor."""
         return jnp.sum(jnp.broadcast_to(self.drag * self.radius**2, (self.count,)))
 
 
-def _circular(kind: str, count_: int, mass: Number, radius: Number, drag: Number, inertia: Number | None) -> CircularLoads:
+def _circular(
+    kind: str,
+    count_: int,
+    mass: Number | Sequence[Number],
+    radius: Number,
+    drag: Number | Sequence[Number],
+    inertia: Number | Sequence[Number] | None,
+    own_radius: Number | None = None,
+) -> CircularLoads:
     n = count(count_, "loads.count")
 
     def each(value: Number, unit: str, name: str, open_low: bool) -> Array:
         return numbers(value, unit, f"loads.{name}", n, low=0.0, open_low=open_low, shared=True)
 
-    return CircularLoads(
+    loads = CircularLoads(
         mass=each(mass, "kg", "mass", True),
         radius=each(radius, "m", "radius", True),
         drag=each(drag, "N s/m", "drag", False),
         inertia=None if inertia is None else each(inertia, "kg m^2", "inertia", False),
         count=n,
         kind=kind,
+        own_radius=None if own_radius is None else number(own_radius, "m", "loads.own_radius", low=0.0, open_low=True),
     )
+    if loads.own_radius is not None:
+        _fit(loads, loads.own_radius)
+    return loads
 
 
-def balls(*, count: int, mass: Number | Sequence[Number], radius: Number, drag: Number | Sequence[Number]) -> CircularLoads:
+def _fit(loads: CircularLoads, r: Array) -> None:
+    """**Raises** `InputError` for loads with an own radius that have no room side by side."""
+    if not loads.alike:
+        raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
+    if not traced(r) and not traced(loads.radius):
+        most = float(loads.radius) * (1.0 if loads.count == 1 else math.sin(math.pi / loads.count))
+        if not float(r) < most:
+            raise InputError(
+                "loads.own_radius",
+                f"is {float(r):.6g} m; {loads.count} side by side on a circle of {float(loads.radius):.6g} m have room "
+                f"below {most:.6g} m",
+            )
+
+
+def balls(
+    *,
+    count: int,
+    mass: Number | Sequence[Number],
+    radius: Number,
+    drag: Number | Sequence[Number],
+    own_radius: Number | None = None,
+) -> CircularLoads:
     """Balls that roll in an annular track, kappa = 7/5.
 
-    **Arguments**: `count` N; `mass` kg, `radius` m of the circle of their centres, `drag` b_W N s/m: one number shared by
-    all, or N of them.
+    **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
+    all, or N of them; `own_radius` r m of a ball, for balls in one track, which cannot all be at one point: where jams and
+    the criterion take them as collected, they lie side by side and carry the unbalance m R sin(N arcsin(r/R)) / (r/R) in
+    place of N m R. A run in time does not see it: there nothing keeps loads from passing each other.
 
-    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, values not positive.
+    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, values not positive, balls that have
+    no room side by side.
 
     >>> import jaxvib as jv
     >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5).unbalance().round(6))
     0.288
+    >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5, own_radius="20 mm").unbalance().round(6))
+    0.277333
     """
-    return _circular("ball", count, mass, radius, drag, None)
+    return _circular("ball", count, mass, radius, drag, None, own_radius)
 
 
-def rollers(*, count: int, mass: Number | Sequence[Number], radius: Number, drag: Number | Sequence[Number]) -> CircularLoads:
+def rollers(
+    *,
+    count: int,
+    mass: Number | Sequence[Number],
+    radius: Number,
+    drag: Number | Sequence[Number],
+    own_radius: Number | None = None,
+) -> CircularLoads:
     """Cylindrical rollers that roll in an annular track, kappa = 3/2. Arguments as `balls`.
 
     >>> import jaxvib as jv
     >>> float(jv.rollers(count=2, mass=1.0, radius=0.1, drag=1.0).inertia_factor())
     1.5
     """
-    return _circular("roller", count, mass, radius, drag, None)
+    return _circular("roller", count, mass, radius, drag, None, own_radius)
 
 
 def pendulums(

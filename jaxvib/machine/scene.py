@@ -63,4 +63,6 @@ class Scene(eqx.Module):
         self.machine = machine
         self.loads = loads
         self.drive = drive
-        self.effects = effects
+        # The order has no meaning; it is the one in which a scene file names them.
+        first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
+        self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))

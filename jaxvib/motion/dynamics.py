@@ -107,7 +107,7 @@ class Dynamics(eqx.Module):
         if any(each.normal is not None for each in friction):
             # The sign of a reaction that depends on the accelerations: that of the motion without its friction.
             at_loads = self._at_loads(accelerations([each for each in friction if each.normal is None])[0])
-            friction = [_signed(each, at_loads) for each in friction]
+            friction = [each if each.normal is None else _signed(each, at_loads) for each in friction]
         a, carrier, part, spin = accelerations(friction)
         at_loads = self._at_loads(a)
         change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
@@ -128,7 +128,7 @@ class Dynamics(eqx.Module):
     def _friction(self, state: State, speed: Array) -> list[Friction]:
         g = sum(effect.g for effect in self.effects if isinstance(effect, Gravity))
         found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
-        return [each for each in found if each is not None]
+        return [_signed(each, {}) if each.normal is None else each for each in found if each is not None]
 
     def _eliminate(self, kinematics: Any, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
         loads, axes = self.loads, self.axes
@@ -170,8 +170,9 @@ class Dynamics(eqx.Module):
     ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
         """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
         if not isinstance(self.drive, Motor):
-            extra = [0.0] * len(part.reaction) if throw is None else throw[1]
-            return part.weight, [g + b for g, b in zip(part.reaction, extra, strict=True)], None
+            if throw is None:
+                return part.weight, part.reaction, None
+            return part.weight, [g + b for g, b in zip(part.reaction, throw[1], strict=True)], None
         free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
@@ -307,9 +308,9 @@ def rotor_angle(drive: Drive, t: Array, state: State) -> Array:
 
 def _signed(friction: Friction, a: dict[int, Any]) -> Friction:
     """A friction whose reaction is known to be positive or negative, so that it is linear in the accelerations."""
-    if friction.normal is None:
-        return friction
-    reaction = friction.reaction + sum(friction.normal[axis] * x for axis, x in a.items())
+    reaction = friction.reaction
+    if friction.normal is not None:
+        reaction = reaction + sum(friction.normal[axis] * x for axis, x in a.items())
     sign = jnp.where(reaction < 0.0, -1.0, 1.0)
     return Friction(friction.lever * sign, friction.reaction, friction.normal)
 

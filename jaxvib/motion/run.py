@@ -18,12 +18,16 @@ from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.observables import Measured, Trajectory
+from jaxvib.motion.regime import Regime, regime
 
 if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
 __all__ = ["Run", "RunStatus"]
+
+
+_named = eqx.filter_jit(regime)
 
 
 class RunStatus(eqx.Enumeration):
@@ -69,7 +73,8 @@ class Run(Measured):
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
         names = self.scene.machine.carrier().coordinates
-        amplitude = ", ".join(f"{n} {float(a):.4g} m" for n, a in zip(names, self.amplitude, strict=True))
+        units = ["rad" if n in ("theta", "psi") else "m" for n in names]
+        amplitude = ", ".join(f"{n} {float(a):.4g} {u}" for n, a, u in zip(names, self.amplitude, units, strict=True))
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled"
         return "\n".join(
@@ -80,8 +85,14 @@ class Run(Measured):
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
                 f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
+                f"  {self.regime.summary()}",
             ]
         )
+
+    @property
+    def regime(self) -> Regime:
+        """What kind of motion the run has come to, see `Regime`."""
+        return _named(self.scene, self.window)
 
     def _kept(self) -> Trajectory:
         return self.window if self.trajectory is None else self.trajectory

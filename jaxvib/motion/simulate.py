@@ -23,7 +23,7 @@ from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, 
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, initial_state
 
-__all__ = ["simulate"]
+__all__ = ["enough_steps", "simulate"]
 
 _MOST_STEPS = 2**31 - 1
 
@@ -120,7 +120,7 @@ def simulate(
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
     state = _whole(scene, start) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
-        max_steps = _enough_steps(scene, end)
+        max_steps = enough_steps(scene, end)
 
     def run(control: StepControl) -> Run:
         chosen = control if controller is None else controller
@@ -305,7 +305,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
     return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(min(max(float(wanted), 2000.0), 2.0**18)))
 
 
-def _enough_steps(scene: Scene, end: Array) -> int:
+def enough_steps(scene: Scene, end: Array) -> int:
     """500 steps for each turn of what moves fastest, rounded up to a power of 2 so that few numbers need few compilations."""
     turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
     if traced(turns):

@@ -53,8 +53,8 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
     def phases(value: float) -> Array:
         if angles is not None:
             return numbers(angles, "rad", "angles", n)
-        middle = jnp.full((n,), value, zero.dtype)
-        return sum((e.side_by_side(scene.loads) for e in scene.effects if isinstance(e, LoadContact)), middle)
+        touching = any(isinstance(effect, LoadContact) for effect in scene.effects)
+        return value + (scene.loads.offsets() if touching else jnp.zeros((n,), zero.dtype))  # pyright: ignore
 
     if start != "jam":
         rotor = (zero[0], zero[0]) if isinstance(scene.drive, Motor) else None

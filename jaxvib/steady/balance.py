@@ -345,7 +345,7 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray, imbalance: float) -> 
             jnp.zeros(()), balanced_motion(scene, jnp.asarray(angles), turned), imbalance_force(scene, imbalance, turned)
         )
         if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
-            problem = "disturb the balanced motion (gravity does), which then is no motion of its own; leave them out"
+            problem = "disturb the balanced motion (gravity does); leave them out, and give a static imbalance as imbalance="
             raise InputError("effects", problem)
 
 

@@ -5,37 +5,42 @@ from __future__ import annotations
 import functools
 from typing import Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
+from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.effects import Effect
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.response import circular_loads, loaded_mass, small_solve
+from jaxvib.steady.response import circular_loads, dynamic_stiffness, small_solve
 
 __all__ = [
     "Along",
-    "Body",
+    "Bodies",
     "Grid",
     "Harmonics",
     "Motion",
     "along",
-    "body",
+    "bodies",
     "circle",
+    "each_load",
     "grid_of",
     "harmonics_of",
     "has_half_turn",
     "load_torque",
     "periodic_motion",
+    "torque_of_each",
 ]
+
+Points = Array | np.ndarray
+
+Given = Literal["omega", "rotor_speed"]
 
 _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
-
-
-Points = Array | np.ndarray
 
 
 class Grid(NamedTuple):
@@ -47,7 +52,8 @@ class Grid(NamedTuple):
     **Attributes** (M points): `symmetric` whether it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
     d^2/dtheta^2 of psi; `lag_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `lag_weights` (J,): psi has the
     harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times cos
-    and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points.
+    and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis` (M, K)
+    and `synthesis` (K, M) complex: e_k = sum_l e_l analysis_lk, e_l = Re sum_k e_k synthesis_kl.
     """
 
     symmetric: bool
@@ -60,6 +66,8 @@ class Grid(NamedTuple):
     cosine: np.ndarray
     sine: np.ndarray
     pairs: np.ndarray
+    analysis: np.ndarray
+    synthesis: np.ndarray
 
 
 @functools.lru_cache(maxsize=64)
@@ -86,22 +94,37 @@ def grid_of(points: int, symmetric: bool) -> Grid:
     return Grid(
         symmetric, theta, first, second, lag_orders, weights, orders,
         2.0 / m * np.cos(distance), 2.0 / m * np.sin(distance), index[:, None] - index[None, :] + m - 1,
+        2.0 / m * np.exp(-1j * orders * theta[:, None]), np.exp(1j * orders[:, None] * theta),
     )  # fmt: skip
 
 
-class Body(NamedTuple):
-    """The collected loads as one body: `unbalance` S = sum m R, `inertia` I = sum kappa m R^2, `drag` sum b_W R^2."""
+class Bodies(NamedTuple):
+    """The loads as G bodies that do not change their shape: loads that are alike are one, each load for itself otherwise.
+
+    **Attributes**: `unbalance` S (G,) kg m, `inertia` I = sum kappa m R^2 and `drag` sum b_W R^2 (G,) of each body; `offsets`
+    (count,) rad: where each load is on its body, an angle ahead of the body's own.
+    """
 
     unbalance: Array
     inertia: Array
     drag: Array
+    offsets: Array
 
 
-def body(scene: Scene) -> Body:
-    """The collected loads of the scene as one body."""
+def bodies(scene: Scene) -> Bodies:
+    """The collected loads of the scene as bodies. **Raises** `InputError` for a rotor out of balance."""
     loads = circular_loads(scene)
+    for effect in scene.effects:
+        if effect.throws:
+            raise InputError(
+                f"effects.{effect.kind}", "shakes the machine at the rotor's own speed, so that no motion repeats; leave it out"
+            )
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
-    return Body(loads.unbalance(), jnp.sum(jnp.broadcast_to(inertia, (loads.count,))), loads.drag_sum())
+    if loads.alike:
+        n = loads.count
+        return Bodies(loads.unbalance()[None], n * inertia[None], loads.drag_sum()[None], loads.offsets())
+    each = [loads.mass * loads.radius, inertia, loads.drag * loads.radius**2]
+    return Bodies(*(jnp.broadcast_to(x, (loads.count,)) for x in each), offsets=loads.offsets())
 
 
 def has_half_turn(scene: Scene) -> bool:
@@ -109,22 +132,30 @@ def has_half_turn(scene: Scene) -> bool:
     return not scene.effects
 
 
-def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
-    """What turns the loads besides the vibration, N m: resistance and effects, summed over loads that are all at `phi` (M,).
+def each_load(scene: Scene, phi: Points, rate: Array) -> tuple[Array, Array]:
+    """Angles and rates of bodies (G, M) as those of each load (count, M)."""
+    shape = (scene.loads.count, phi.shape[1])
+    return jnp.asarray(phi) + circular_loads(scene).offsets()[:, None], jnp.broadcast_to(rate, shape)
 
-    `effects` are the scene's unless others are named; () leaves what the rotor gives.
-    """
+
+def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+    """What turns loads at angles `phi` besides the vibration, N m: resistance and effects (the scene's unless named)."""
     loads, acting = scene.loads, scene.effects if effects is None else effects
+    torque = loads.resistance((jnp.asarray(phi),), (rate,), speed)[0]
+    # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
+    forces = (effect.load_force(loads, (jnp.asarray(phi),)) for effect in acting if not isinstance(effect, LoadContact))
+    return sum((force[0] for force in forces if force is not None), torque)
 
-    def each(angle: Array, angle_rate: Array) -> Array:
-        torque = loads.resistance((angle,), (angle_rate,), speed)[0]
-        forces = (effect.load_force(loads, (angle,)) for effect in acting)
-        return sum((force[0] for force in forces if force is not None), torque)
 
-    if all(jnp.ndim(leaf) == 0 for leaf in jax.tree.leaves(loads)):
-        return loads.count * each(jnp.asarray(phi), rate)
-    spread = (loads.count,)
-    return jax.vmap(lambda p, r: jnp.sum(each(jnp.broadcast_to(p, spread), jnp.broadcast_to(r, spread))))(phi, rate)
+def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
+    """What turns the bodies at angles `phi` (G, M), see `torque_of_each`, summed over the loads of each, (G, M)."""
+    loads = circular_loads(scene)
+    if not loads.alike:
+        each = jax.vmap(lambda p, r: torque_of_each(scene, p, r, speed, effects), in_axes=1, out_axes=1)
+        return each(phi, rate)
+    if loads.own_radius is None:
+        return loads.count * torque_of_each(scene, phi, rate, speed, effects)
+    return jnp.sum(torque_of_each(scene, *each_load(scene, phi, rate), speed, effects), axis=0, keepdims=True)
 
 
 def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
@@ -134,35 +165,35 @@ def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
     return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])
 
 
-def receptance(scene: Scene, omega: Array, orders: np.ndarray) -> Array:
-    """X_k = D(k w)^-1 B^T S k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of the loads' point e.
+def receptance(scene: Scene, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+    """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
 
-    D(w) = K - w^2 (M + sum m_j B^T B) + i w C.
+    D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
     """
-    carrier = scene.machine.carrier()
-    if carrier.gyroscopic is not None:
-        raise InputError("machine.kind", f"is {scene.machine.kind!r}; exact jams hold for machines of platforms")
-    mass, push = loaded_mass(scene), circular_loads(scene).unbalance() * carrier.port.T
+    push = scene.machine.carrier().port.T.astype(complex)
 
     def at(k: Array) -> Array:
         w = k * omega
-        stiffness = carrier.stiffness - w**2 * mass + 1j * w * carrier.damping
-        return jax.vmap(lambda column: small_solve(stiffness, w**2 * column), in_axes=1, out_axes=1)(push.astype(complex))
+        return small_solve(dynamic_stiffness(scene, w, speed), w**2 * push)
 
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _feedback(scene: Scene, grid: Grid, omega: Array) -> Array:
-    """(np, np, M, M): the port's acceleration at the points, from the loads' point e at the points."""
-    orders = jnp.asarray(grid.orders, dtype=omega.dtype)
-    port = scene.machine.carrier().port
-    answer = -jnp.einsum("k,ad,kdb->abk", (orders * omega) ** 2, port, receptance(scene, omega, grid.orders))
-    by_distance = jnp.einsum("abk,dk->abd", answer.real, grid.cosine) - jnp.einsum("abk,dk->abd", answer.imag, grid.sine)
+def _answer(scene: Scene, grid: Grid, omega: Array, speed: Array) -> Array:
+    """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
+    w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
+    return -(w**2)[:, None, None] * (scene.machine.carrier().port @ receptance(scene, omega, speed, grid.orders))
+
+
+def _feedback(grid: Grid, answer: Array) -> Array:
+    """(np, np, M, M): the port's acceleration at the points, from sum_g S_g e(phi_g) at the points."""
+    by_distance = jnp.einsum("kab,dk->abd", answer.real, grid.cosine) - jnp.einsum("kab,dk->abd", answer.imag, grid.sine)
     return by_distance[:, :, grid.pairs]
 
 
 class _Balance(NamedTuple):
-    """The torques on the loads at the points: what is left over, per drag and load speed, and what its derivative needs."""
+    """The torques on the bodies at the points, per drag and load speed: what is left over (G, M), what it is judged by, and
+    what its derivative needs."""
 
     left_over: Array
     scale: Array
@@ -170,44 +201,46 @@ class _Balance(NamedTuple):
     pull: Array
 
 
-def _balance(scene: Scene, grid: Grid, feedback: Array, lag: Array, omega: Array, speed: Array) -> _Balance:
-    whole = body(scene)
-    phi, rate = grid.theta + lag, omega * (1.0 + grid.first @ lag)
+def _balance(scene: Scene, grid: Grid, answer: Array, lag: Array, omega: Array, speed: Array) -> _Balance:
+    whole = bodies(scene)
+    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
     point, moving = circle(scene, phi)
-    acceleration = jnp.einsum("abij,bj->ai", feedback, point)
-    vibration = whole.unbalance * jnp.sum(moving * acceleration, axis=0)
+    along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", whole.unbalance, point) @ grid.analysis)
+    acceleration = (along_port @ grid.synthesis).real
+    size, unit = whole.unbalance[:, None], (whole.drag * omega)[:, None]
+    vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
     torque = load_torque(scene, phi, rate, speed)
-    inertia = whole.inertia * omega**2 * (grid.second @ lag)
-    unit = whole.drag * omega
-    largest = jnp.max(jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration))
+    inertia = (whole.inertia * omega**2)[:, None] * (lag @ grid.second.T)
+    largest = jnp.max((jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration)) / unit)
     return _Balance(
         (inertia - torque + vibration) / unit,
-        1.0 + jnp.abs(speed / omega) + largest / unit,
+        1.0 + jnp.abs(speed / omega) + largest,
         moving,
-        -whole.unbalance * jnp.sum(point * acceleration, axis=0) / unit,
+        -size * jnp.einsum("agi,ai->gi", point, acceleration) / unit,
     )
 
 
-def _jacobian(scene: Scene, grid: Grid, feedback: Array, balance: _Balance, lag: Array, omega: Array, speed: Array) -> Array:
-    """d left_over / d lag (M, M)."""
-    whole = body(scene)
-    unit = whole.drag * omega
-    phi, rate = grid.theta + lag, omega * (1.0 + grid.first @ lag)
+def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: Array, omega: Array, speed: Array) -> Array:
+    """d left_over / d lag (G M, G M)."""
+    whole = bodies(scene)
+    g, m = lag.shape
+    unit = (whole.drag * omega)[:, None]
+    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
     ones = jnp.ones_like(lag)
     by_angle = jax.jvp(lambda p: load_torque(scene, p, rate, speed), (phi,), (ones,))[1] / unit
     by_rate = jax.jvp(lambda r: load_torque(scene, phi, r, speed), (rate,), (ones,))[1] / unit
-    moving = balance.moving
-    coupling = jnp.einsum("ai,abij,bj->ij", moving, feedback, moving) * (whole.unbalance / unit)
-    return (
-        whole.inertia * omega**2 / unit * grid.second
-        + jnp.diag(balance.pull - by_angle)
-        - (omega * by_rate)[:, None] * grid.first
-        + coupling
+    own = (
+        (whole.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
+        + (balance.pull - by_angle)[:, :, None] * np.eye(m)[None]
+        - (omega * by_rate)[:, :, None] * grid.first[None]
     )
+    shake = whole.unbalance[None, :, None] * balance.moving
+    coupling = jnp.einsum("agi,abij,bhj->gihj", shake / unit[None], _feedback(grid, answer), shake)
+    return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
 class Motion(NamedTuple):
-    """A periodic motion on its grid: `lag` psi (M,) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
+    """A periodic motion on its grid: `lag` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
     balance at the points, relative to the torques in it."""
 
     lag: Array
@@ -216,79 +249,128 @@ class Motion(NamedTuple):
     residual: Array
 
 
-def periodic_motion(
-    scene: Scene, grid: Grid, given: Literal["omega", "rotor_speed"], value: Array, start: Array, lag: Array | None = None
-) -> Motion:
-    """The periodic motion psi(theta) of the collected loads, phi = theta + psi, theta = Omega t, with mean psi 0.
+def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
+    """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
-        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a
-        a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T S k^2 Omega^2 e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w C
+        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n) - S_g e'(phi_g) . a
+        a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
+        D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    at the M points of `grid`, with the a_k and e_k the harmonics of the port's acceleration and of the loads' point. The
-    unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter starts from,
-    `lag` where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the residual.
+    at the M points of `grid`, with the index k for harmonics, a the port's acceleration, e the point of a load on the unit
+    circle. The unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter
+    starts from, `lag` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
+    residual.
 
-    Derivatives with respect to `value` and every number of the scene by the implicit function theorem.
+    Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
+    if lag is None:
+        lag = jnp.zeros((1 if circular_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
+    frozen = jax.lax.stop_gradient((start, lag))
+    psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
+    omega, speed = _both(given, value, x)
+    found = _balance(scene, grid, _answer(scene, grid, omega, speed), psi, omega, speed)
+    return Motion(psi, omega, speed, jnp.max(jnp.abs(found.left_over)) / found.scale)
 
-    def balance(lag: Array, x: Array, value: Array) -> tuple[Array, tuple[Array, _Balance]]:
-        omega, speed = (value, x) if given == "omega" else (x, value)
-        feedback = _feedback(scene, grid, omega) if fixed is None else fixed
-        found = _balance(scene, grid, feedback, lag, omega, speed)
-        return found.left_over, (feedback, found)
 
-    def equations(y: Array) -> Array:
-        return jnp.append(balance(y[:-1], y[-1], value)[0], jnp.mean(y[:-1]))
+def _both(given: Given, value: Array, x: Array) -> tuple[Array, Array]:
+    """Load speed and rotor speed."""
+    return (value, x) if given == "omega" else (x, value)
 
-    fixed = _feedback(scene, grid, value) if given == "omega" else None
-    m = grid.theta.shape[0]
-    tiny = 1024.0 * jnp.finfo(value.dtype).eps
 
-    def newton(_: object, y: Array) -> Array:
-        def size(left_over: Array) -> Array:
-            return jnp.sqrt(jnp.mean(left_over**2))
+class _State(NamedTuple):
+    """A step of Newton: the unknowns, the equations there with their derivative, how far the next step may go, and whether it
+    is the last one: because it needs no look at where it leads, or because there is no better one (`lost`)."""
 
-        def step(carry: tuple) -> tuple:
-            count, lag, x, length, norm, _ = carry
-            left_over, by_x, (feedback, now) = jax.jvp(
-                lambda z: balance(lag, z, value), (x,), (jnp.ones_like(x),), has_aux=True
-            )
-            omega, speed = (value, x) if given == "omega" else (x, value)
-            matrix = _pinned(_jacobian(scene, grid, feedback, now, lag, omega, speed), by_x)
-            change = -jnp.linalg.solve(matrix, jnp.append(left_over, jnp.mean(lag)))
-            # A lag changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
-            most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
-            if given == "rotor_speed":
-                most = jnp.minimum(most, 0.5 * jnp.abs(x / change[-1]))
-            take = jnp.minimum(length, most)
-            new_lag, new_x = lag + take * change[:-1], x + take * change[-1]
-            new_left_over, (_, then) = balance(new_lag, new_x, value)
-            new_norm = size(new_left_over)
-            better = new_norm < norm
-            residual = jnp.max(jnp.abs(new_left_over)) / then.scale
-            settled = (better & (residual < tiny / 8.0)) | (~better & (norm < tiny * then.scale))
-            return (
-                count + 1,
-                jnp.where(better, new_lag, lag),
-                jnp.where(better, new_x, x),
-                jnp.where(better, jnp.minimum(2.0 * length, 1.0), length / 4.0),
-                jnp.where(better, new_norm, norm),
-                settled | (length < 1e-4) | ~jnp.all(jnp.isfinite(change)),
-            )
+    steps: Array
+    lag: Array
+    x: Array
+    left_over: Array
+    matrix: Array
+    norm: Array
+    scale: Array
+    length: Array
+    settled: Array
+    lost: Array
 
-        first = size(balance(y[:-1], y[-1], value)[0])
-        carry = (0, y[:-1], y[-1], jnp.ones_like(first), first, first == 0.0)
-        carry = jax.lax.while_loop(lambda c: (c[0] < _STEPS) & ~c[-1], step, carry)
-        return jnp.append(carry[1], carry[2])
 
-    def linear(g, right: Array) -> Array:
-        return jnp.linalg.solve(jax.jacfwd(g)(jnp.zeros_like(right)), right)
+@eqx.filter_custom_jvp
+def _newton(
+    scene: Scene, value: Array, start: Array, lag: Array, *, grid: tuple[int, bool], given: Given
+) -> tuple[Array, Array]:
+    on = grid_of(*grid)
+    tiny = 128.0 * jnp.finfo(value.dtype).eps
+    # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
+    fixed = given == "omega" and scene.machine.carrier().gyroscopic is None
+    known = _answer(scene, on, value, start) if fixed else None
+    no = jnp.asarray(False)
 
-    begin = jnp.append(jnp.zeros((m,), dtype=value.dtype) if lag is None else lag, start)
-    y = jax.lax.custom_root(equations, jax.lax.stop_gradient(begin), newton, linear)
-    left_over, (_, found) = balance(y[:-1], y[-1], value)
-    omega, speed = (value, y[-1]) if given == "omega" else (y[-1], value)
-    return Motion(y[:-1], omega, speed, jnp.max(jnp.abs(left_over)) / found.scale)
+    def look(steps: Array, lag: Array, x: Array, length: Array) -> _State:
+        left_over, matrix, scale = _linearised(scene, on, given, value, lag, x, known)
+        norm = jnp.sqrt(jnp.mean(left_over[:-1] ** 2))
+        return _State(steps, lag, x, left_over, matrix, norm, scale, length, norm < tiny * scale, no)
+
+    def change_of(now: _State) -> tuple[Array, Array]:
+        """Newton's step, and the part of it that may be taken."""
+        change = -jnp.linalg.solve(now.matrix, now.left_over)
+        # A lag changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
+        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
+        if given == "rotor_speed":
+            most = jnp.minimum(most, 0.5 * jnp.abs(now.x / change[-1]))
+        return change, jnp.minimum(now.length, most)
+
+    def moved(now: _State, change: Array, take: Array) -> tuple[Array, Array]:
+        return now.lag + take * change[:-1].reshape(now.lag.shape), now.x + take * change[-1]
+
+    def step(now: _State) -> _State:
+        change, take = change_of(now)
+        then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
+        better = then.norm < now.norm
+        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look.
+        then = then._replace(settled=then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale)
+        lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
+        rounded = now.norm < 16.0 * tiny * now.scale
+        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
+
+    begin = look(jnp.asarray(0), lag, start, jnp.ones_like(start))
+    end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
+    change, take = change_of(end)
+    good = end.settled & ~end.lost
+    return moved(end, jnp.where(good, change, 0.0), jnp.where(good, take, 0.0))
+
+
+@_newton.def_jvp
+def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Given):
+    scene, value, start, lag = primals
+    lag, x = _newton(scene, value, start, lag, grid=grid, given=given)
+    on = grid_of(*grid)
+
+    def equations(scene: Scene, value: Array) -> Array:
+        omega, speed = _both(given, value, x)
+        left_over = _balance(scene, on, _answer(scene, on, omega, speed), lag, omega, speed).left_over
+        return jnp.append(left_over, 0.0)
+
+    push = eqx.filter_jvp(equations, (scene, value), tangents[:2])[1]
+    change = -jnp.linalg.solve(_linearised(scene, on, given, value, lag, x, None)[1], push)
+    return (lag, x), (change[:-1].reshape(lag.shape), change[-1])
+
+
+def _linearised(
+    scene: Scene, grid: Grid, given: Given, value: Array, lag: Array, x: Array, known: Array | None
+) -> tuple[Array, Array, Array]:
+    """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
+    if known is None:
+        answer, by_x = jax.jvp(lambda z: _answer(scene, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
+    else:
+        answer, by_x = known, jnp.zeros_like(known)
+
+    def left_over(z: Array, answer: Array) -> tuple[Array, _Balance]:
+        found = _balance(scene, grid, answer, lag, *_both(given, value, z))
+        return found.left_over.ravel(), found
+
+    at, column, found = jax.jvp(left_over, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
+    matrix = _jacobian(scene, grid, answer, found, lag, *_both(given, value, x))
+    return jnp.append(at, jnp.mean(lag)), _pinned(matrix, column), found.scale
 
 
 class Along(NamedTuple):
@@ -307,47 +389,41 @@ def along(scene: Scene, grid: Grid, motion: Motion) -> Along:
     harmonic of psi for the lag.
     """
     lag, omega, speed = motion.lag, motion.omega, motion.rotor_speed
+    _, matrix, _ = _linearised(scene, grid, "omega", omega, lag, speed, None)
 
-    def left_over(w: Array, n: Array) -> tuple[Array, tuple[Array, _Balance]]:
-        feedback = _feedback(scene, grid, w)
-        found = _balance(scene, grid, feedback, lag, w, n)
-        return found.left_over, (feedback, found)
+    def left_over(w: Array) -> Array:
+        return _balance(scene, grid, _answer(scene, grid, w, speed), lag, w, speed).left_over.ravel()
 
-    one, zero = jnp.ones_like(omega), jnp.zeros_like(omega)
-    _, by_omega, (feedback, found) = jax.jvp(left_over, (omega, speed), (one, zero), has_aux=True)
-    by_speed = jax.jvp(lambda n: _balance(scene, grid, feedback, lag, omega, n).left_over, (speed,), (one,))[1]
-    matrix = _pinned(_jacobian(scene, grid, feedback, found, lag, omega, speed), by_speed)
-
+    by_omega = jax.jvp(left_over, (omega,), (jnp.ones_like(omega),))[1]
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
     lag_k = _lag_harmonics(grid, lag)
-    there = (jnp.exp(1j * fine.theta[:, None] * grid.lag_orders) @ lag_k).real
-    between = _balance(scene, fine, _feedback(scene, fine, omega), there, omega, speed).left_over
-    low = _lag_harmonics(fine, between)[: grid.lag_orders.shape[0]]
-    seen = (jnp.exp(1j * grid.theta[:, None] * grid.lag_orders) @ low).real
-    right = jnp.stack([-jnp.append(by_omega, 0.0), jnp.append(jax.lax.stop_gradient(seen), 0.0)], axis=1)
-    answer = jnp.linalg.solve(matrix, right)
-    return Along(
-        answer[-1, 0],
-        jnp.abs(answer[-1, 1] / speed),
-        jnp.maximum(jnp.max(jnp.abs(answer[:-1, 1])), jnp.sqrt(lag_k[-1].real ** 2 + lag_k[-1].imag ** 2)),
-    )
+    there = (lag_k @ np.exp(1j * grid.lag_orders[:, None] * fine.theta)).real
+    between = _balance(scene, fine, _answer(scene, fine, omega, speed), there, omega, speed).left_over
+    low = _lag_harmonics(fine, between)[:, : grid.lag_orders.shape[0]]
+    seen = (low @ np.exp(1j * grid.lag_orders[:, None] * grid.theta)).real.ravel()
+    # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
+    slope = jnp.linalg.solve(matrix, -jnp.append(by_omega, 0.0))[-1]
+    error = jnp.linalg.solve(matrix, jnp.append(jax.lax.stop_gradient(seen), 0.0))
+    last = jnp.max(lag_k[:, -1].real ** 2 + lag_k[:, -1].imag ** 2)
+    return Along(slope, jnp.abs(error[-1] / speed), jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)))
 
 
 def _pinned(by_lag: Array, by_unknown: Array) -> Array:
-    """The whole Jacobian: the equations' derivative by psi (M, M) and by the last unknown (M,), and the row mean psi = 0."""
+    """The whole Jacobian: the equations' derivative by psi and by the last unknown, and the row mean psi = 0."""
     m = by_lag.shape[0]
     pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
     return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
 
 
 def _lag_harmonics(grid: Grid, values: Array) -> Array:
+    """(G, J) of values (G, M) at the points."""
     m = grid.theta.shape[0]
-    return (grid.lag_weights[:, None] / m * np.exp(-1j * grid.lag_orders[:, None] * grid.theta)) @ values
+    return values @ (grid.lag_weights / m * np.exp(-1j * grid.lag_orders * grid.theta[:, None]))
 
 
 class Harmonics(NamedTuple):
-    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (J,) rad; `displacement` (nd, K) m of the
-    carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (G, J) rad; `displacement` (nd, K) m of
+    the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
 
     lag: Array
     displacement: Array
@@ -358,12 +434,11 @@ class Harmonics(NamedTuple):
 def harmonics_of(scene: Scene, grid: Grid, motion: Motion) -> Harmonics:
     """The harmonics of psi and of everything that the carrier does."""
     carrier = scene.machine.carrier()
-    m = grid.theta.shape[0]
-    orders = jnp.asarray(grid.orders, dtype=motion.omega.dtype)
-    point, _ = circle(scene, grid.theta + motion.lag)
-    point_k = (2.0 / m * point) @ np.exp(-1j * grid.theta[:, None] * grid.orders)
-    displacement = jnp.einsum("kdp,pk->dk", receptance(scene, motion.omega, grid.orders), point_k)
-    w = orders * motion.omega
+    point, _ = circle(scene, grid.theta[None] + motion.lag)
+    push = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
+    answer = receptance(scene, motion.omega, motion.rotor_speed, grid.orders)
+    displacement = jnp.einsum("kdp,pk->dk", answer, push)
+    w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(
         _lag_harmonics(grid, motion.lag),
         displacement,

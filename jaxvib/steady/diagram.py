@@ -15,8 +15,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
 from jaxvib.steady.collocation import has_half_turn
-from jaxvib.steady.jam import fold_points, jam_rotor_speed
-from jaxvib.steady.orbit import OrbitStatus, orbits
+from jaxvib.steady.jam import fold_points
+from jaxvib.steady.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.steady.picture import picture
 from jaxvib.steady.stability import Floquet, steps_for
 
@@ -161,8 +161,10 @@ def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 @eqx.filter_jit
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
-    start = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
-    orbit, growth = orbits(scene, omega, start, "omega", many, jnp.max(steps_for(scene, omega)), accuracy)
+    start = jax.vmap(lambda w: light_rotor_speed(scene, w))(omega)
+    orbit, growth = orbits(
+        scene, omega, start, "omega", many, jnp.max(jax.vmap(lambda w, n: steps_for(scene, w, n))(omega, start)), accuracy
+    )
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 

@@ -125,13 +125,13 @@ class JamModes(Jam):
         return "\n".join(lines)
 
 
-def jam_rotor_speed(scene: Scene, omega: Array) -> Array:
+def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
     """The rotor's speed n (rad/s) at which the loads jam, collected, at speed `omega` (scalar, rad/s), for light loads.
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
     with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
-    `omega`, and single-valued through the folds.
+    `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -143,7 +143,7 @@ def jam_rotor_speed(scene: Scene, omega: Array) -> Array:
     """
     loads = circular_loads(scene)
     carrier = scene.machine.carrier()
-    port = carrier.port @ steady_displacement(scene, omega)
+    port = carrier.port @ steady_displacement(scene, omega, speed)
     torque = -loads.unbalance() * omega**2 * jnp.sum(jnp.conj(turning(carrier)) * port).imag / 2.0
     return omega + torque / loads.drag_sum()
 
@@ -277,7 +277,7 @@ def _pieces(scene: Scene) -> _Pieces:
     change = jnp.minimum(change, grid.shape[0] - 2)
     omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: _slope(scene, w), lo, hi))(grid[change], grid[change + 1])
     speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
-    main = _without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
+    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
     end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
     folds = Folds(
@@ -289,7 +289,15 @@ def _pieces(scene: Scene) -> _Pieces:
     low = jnp.concatenate([jnp.zeros_like(cuts[:1]), cuts])
     high = jnp.concatenate([cuts, jnp.reshape(end, (1,))])
 
-    # Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
+    return _Pieces(low, high, piece_modes(cuts, found, resonances), resonances, folds)
+
+
+def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
+    """Mode numbers (2 nd + 1,) of the pieces of a branch, which turns at load speeds `cuts` (2 nd,) where they are `found`.
+
+    Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
+    """
+    nd = resonances.shape[0]
     owners: list[Array] = []
     later = jnp.sum(found) // 2 - 1
     for k, peak in enumerate(cuts[0::2]):
@@ -300,10 +308,10 @@ def _pieces(scene: Scene) -> _Pieces:
     for k, owner in enumerate(owners):
         last = 2 * nd + 1
         mode += [jnp.where(found[2 * k], 2 * owner - 1, last), jnp.where(found[2 * k], 2 * owner, last)]
-    return _Pieces(low, high, jnp.stack([*mode, jnp.asarray(2 * nd + 1)]), resonances, folds)
+    return jnp.stack([*mode, jnp.asarray(2 * nd + 1)])
 
 
-def _without_ripples(speeds: Array, count: Array, most: int) -> Array:
+def without_ripples(speeds: Array, count: Array, most: int) -> Array:
     """Indices of the `most` folds that matter, of twice as many with rotor speeds `speeds`, of which the first `count` exist.
 
     A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
@@ -328,7 +336,10 @@ def fold_points(scene: Scene, per_side: int) -> tuple[Array, Array]:
     """
     resonances, _ = _modes(scene)
     carrier = scene.machine.carrier()
-    poles = _poles(loaded_mass(scene), carrier.damping, carrier.stiffness)
+    damping = carrier.damping
+    if carrier.gyroscopic is not None:
+        damping = damping + scene.drive.speed * carrier.gyroscopic
+    poles = _poles(loaded_mass(scene), damping, carrier.stiffness)
     top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]

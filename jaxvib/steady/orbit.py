@@ -1,8 +1,6 @@
-"""Exact jams: the periodic motions of the full equations in which collected loads are stuck."""
+"""Exact jams: what is known of a periodic motion of the full equations in which collected loads are stuck."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -10,28 +8,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, number, traced
 from jaxvib.steady.collocation import (
+    Given,
     Grid,
     Harmonics,
     Motion,
     along,
+    bodies,
+    circle,
+    each_load,
     grid_of,
     harmonics_of,
     has_half_turn,
     load_torque,
     periodic_motion,
+    torque_of_each,
 )
-from jaxvib.steady.jam import jam_modes, jam_rotor_speed
+from jaxvib.steady.jam import jam_rotor_speed
 from jaxvib.steady.response import circular_loads
-from jaxvib.steady.stability import Floquet, floquet, steps_for
+from jaxvib.steady.roots import bracketed_root
+from jaxvib.steady.stability import Floquet, floquet
 
-__all__ = ["Orbit", "OrbitStatus", "jam_orbit", "orbits"]
-
-_POINTS = (16, 32, 64, 128)
-"""Points on half a period, tried in turn until the asked accuracy holds."""
+__all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
 
 
 class OrbitStatus(eqx.Enumeration):
@@ -41,7 +40,7 @@ class OrbitStatus(eqx.Enumeration):
     absent = "this mode does not exist at this rotor speed"
     not_converged = "no periodic motion was found: the torque balance could not be met"
     coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
-    held = "the loads differ and would part: this is their motion as one body, which nothing holds together"
+    held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
 
 
@@ -60,8 +59,9 @@ class Orbit(eqx.Module):
     - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
       Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
       the multiplier that is 1, as computed
-    - `lag_harmonics` (J,) rad, `displacement_harmonics` (nd, K) m, `force_harmonics` (nb, K) N: the c_k
-    - `lag_orders`, `orders`: the k they belong to; `count`: how many loads
+    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, `force_harmonics` (nb, K) N: the c_k; loads that share
+      every number have one lag (G = 1), else each has its own (G = count)
+    - `lag_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
     """
 
     status: OrbitStatus
@@ -80,9 +80,9 @@ class Orbit(eqx.Module):
     lag_harmonics: Array
     displacement_harmonics: Array
     force_harmonics: Array
+    offsets: Array
     lag_orders: tuple[int, ...] = eqx.field(static=True)
     orders: tuple[int, ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
 
     @property
     def message(self) -> str:
@@ -106,8 +106,8 @@ class Orbit(eqx.Module):
         return (
             (self.displacement_harmonics @ wave).real,
             self.omega * (self.displacement_harmonics @ (1j * k * wave)).real,
-            (jnp.full((self.count,), phi),),
-            (jnp.full((self.count,), rate),),
+            (self.offsets + phi,),
+            (jnp.broadcast_to(rate, self.offsets.shape),),
         )
 
     def summary(self) -> str:
@@ -122,170 +122,73 @@ class Orbit(eqx.Module):
         )
 
 
-def jam_orbit(
-    scene: Scene,
-    *,
-    mode: int | None = None,
-    omega: Number | None = None,
-    near: Number | None = None,
-    accuracy: float = 1e-9,
-    points: int | None = None,
-    throw: bool = True,
-) -> Orbit:
-    """The exact motion in which collected loads jam: no assumption that they are light.
+def light_rotor_speed(scene: Scene, omega: Array) -> Array:
+    """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
 
-        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a,      a = B q''
-        D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w C
-
-    with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
-    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
-    stay together by themselves where kappa R and b_W R/m of each are the same, their masses may differ; else their motion as
-    one body is returned, never `stable`, with the status `held`.
-
-    **Arguments**, one of the first three
-
-    - `mode`: the number of a jam mode, see `jam_modes`: the motion at the scene's rotor speed that continues it
-    - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
-    - `near`: a load speed to start from: a motion at the scene's rotor speed
-    - `accuracy`: harmonics are added until the estimated relative error is below it
-    - `points`: a fixed number of collocation points (on half a period without effects, else on a period) in place of that.
-      Under `jit` and `vmap` shapes cannot follow numbers: there it is 16 (33) unless said otherwise, the status tells
-    - `throw`: raise where there is no such motion; else, and under a JAX transformation, the status says so
-
-    **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function
-    theorem, forward and reverse.
-
-    **Raises** `InputError` for wrong arguments, loads without drag or a machine that is not of platforms;
-    `ComputationError` with the status "absent" or "not_converged".
-
-    >>> import jaxvib as jv
-    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
-    ...                         rho=1.0, eps=0.05, beta=1.0, speed=3.0)
-    >>> orbit = jv.jam_orbit(form.scene(), mode=3)
-    >>> round(float(orbit.omega), 6), bool(orbit.stable)
-    (0.972666, True)
-
-    Source: the antiphase paper, equations (2) and (21), solved without its expansion in eps.
+    Where the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
+    it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
     """
-    named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
-    if len(named) != 1:
-        given = " and ".join(named) if named else "none"
-        raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
-    scene = jax.tree.map(jnp.asarray, scene)
-    frozen = jax.lax.stop_gradient(scene)
-    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
-    floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    if not accuracy >= floor:
-        raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    drag = circular_loads(frozen).drag_sum()
-    if not traced(drag) and not float(drag) > 0.0:
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+    if scene.machine.carrier().gyroscopic is None:
+        return jam_rotor_speed(scene, omega)
 
-    exists, direction, start = jnp.asarray(True), jnp.asarray(0.0), frozen.drive.speed
-    if mode is not None:
-        direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
-        jam = jam_modes(frozen).select(mode, throw=throw)
-        exists = jnp.isfinite(jam.omega)
-        start = jnp.where(exists, jam.omega, frozen.drive.speed)
-    elif near is not None:
-        start = number(near, "rad/s", "near", low=0.0, open_low=True)
-    which: Literal["omega", "rotor_speed"] = "rotor_speed"
-    value = scene.drive.speed
-    if omega is not None:
-        value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
-        which, start = "omega", jam_rotor_speed(frozen, jax.lax.stop_gradient(value))
+    def left_over(n: Array) -> Array:
+        return n - jam_rotor_speed(scene, omega, n)
 
-    half = has_half_turn(scene)
-    if points is None and not concrete:
-        points = 16 if half else 33
-    tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
-    speed = jax.lax.stop_gradient(value) if which == "omega" else start
-    # Reverse-mode derivatives ask for a number of steps that is part of the program.
-    steps = steps_for(frozen, speed)
-    static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
-    differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
-    many, found = tried[0], None
-    for many in tried if concrete else ():
-        found = _orbit(frozen, jax.lax.stop_gradient(value), start, exists, direction, which, many, steps, accuracy)
-        if not float(found.error) > accuracy:
-            break
-    if found is None or differentiated:
-        found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy)
-    elif throw:
-        for status in ("absent", "not_converged"):
-            if bool(found.status == getattr(OrbitStatus, status)):
-                raise ComputationError(status, OrbitStatus[getattr(OrbitStatus, status)])
-    return found
-
-
-@eqx.filter_jit
-def _orbit(
-    scene: Scene,
-    value: Array,
-    start: Array,
-    exists: Array,
-    direction: Array,
-    given: Literal["omega", "rotor_speed"],
-    points: int,
-    steps: int | Array,
-    accuracy: float,
-) -> Orbit:
-    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy)
-    orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
-    # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
-    there = exists & ~(orbit.slope * direction < 0.0)
-    orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
-    status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
-    return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))
+    speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
+    above = jax.vmap(left_over)(speeds) > 0.0
+    first = jnp.maximum(jnp.argmax(above), 1)
+    return bracketed_root(left_over, speeds[first - 1], speeds[first])
 
 
 def orbits(
     scene: Scene,
     value: Array,
     start: Array,
-    given: Literal["omega", "rotor_speed"],
+    given: Given,
     points: int,
     steps: int | Array,
     accuracy: float,
+    lag: Array | None = None,
 ) -> tuple[Orbit, Floquet]:
-    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from.
+    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from, `lag`
+    (P, G, M) where psi does.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
     grid = grid_of(points, has_half_turn(scene))
 
-    def one(v: Array, s: Array) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
-        motion = periodic_motion(scene, grid, given, v, s)
+    def one(v: Array, s: Array, lag: Array | None) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
+        motion = periodic_motion(scene, grid, given, v, s, lag)
         harmonics = harmonics_of(scene, grid, motion)
         return motion, harmonics, _measured(scene, grid, motion, harmonics)
 
-    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start)
+    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, lag)
     growth = floquet(scene, grid, motion, harmonics, steps)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
     largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
 
-    slope, speed_error, lag_error, amplitude, force, power = measured
+    slope, speed_error, lag_error, amplitude, force, power, push = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = motion.residual < 4096.0 * tiny
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), lag_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
-    parts = _part(scene)
+    parts = push < 0.0
 
-    def status(is_met: Array, is_flat: Array, is_good: Array) -> OrbitStatus:
+    def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
         known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
         known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
-        known = OrbitStatus.where(parts, OrbitStatus.held, known)
+        known = OrbitStatus.where(pulls, OrbitStatus.held, known)
         return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
 
     def or_nan(values: Array) -> Array:
         return jnp.moveaxis(jnp.where(met, values, jnp.nan), -1, 0)
 
     orbit = Orbit(
-        status=jax.vmap(status)(met, flat, error <= accuracy),
+        status=jax.vmap(status)(met, flat, error <= accuracy, parts),
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
@@ -303,30 +206,36 @@ def orbits(
         force_harmonics=or_nan(harmonics.force),
         lag_orders=tuple(map(int, grid.lag_orders)),
         orders=tuple(map(int, grid.orders)),
-        count=scene.loads.count,
+        offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
     )
     return orbit, growth
 
 
-def _part(scene: Scene) -> Array:
-    """Whether the loads' own equations differ, kappa R phi'' + (b_W R/m) (phi' - n) + e'(phi) . a = 0 of each."""
-    loads = circular_loads(scene)
-
-    def differs(value: Array) -> Array:
-        each = jnp.broadcast_to(value, (loads.count,))
-        return jnp.max(each) - jnp.min(each) > 1e3 * jnp.finfo(each.dtype).eps * jnp.max(each)
-
-    return differs(loads.inertia_factor() * loads.radius) | differs(loads.drag * loads.radius / loads.mass)
-
-
 def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
-    """Slope, the two errors, amplitude, foundation force and power of one motion."""
+    """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
     branch = along(scene, grid, motion)
-    rate = motion.omega * (1.0 + grid.first @ motion.lag)
-    drive = load_torque(scene, grid.theta + motion.lag, rate, motion.rotor_speed, effects=())
+    phi, rate = grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T)
+    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, effects=()), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
-    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * jnp.mean(drive))
+    push = _least_push(scene, grid, motion, harmonics)
+    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
+
+
+def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> Array:
+    """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
+
+    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
+    vibration that holds a jam presses the loads together at every instant.
+    """
+    loads = circular_loads(scene)
+    if loads.own_radius is None or loads.count == 1:
+        return jnp.zeros_like(motion.omega)
+    phi, rate = each_load(scene, grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T))
+    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, phi)[1], acceleration)
+    needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed), axis=1)
+    return jnp.min(-jnp.cumsum(needed)[:-1])
 
 
 def _swing(grid: Grid, harmonics: Array) -> Array:

@@ -18,10 +18,13 @@ __all__ = ["dynamic_stiffness", "loaded_mass", "magnitude", "natural_frequencies
 
 
 def loaded_mass(scene: Scene) -> Array:
-    """M + sum_j m_j B^T B (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port."""
+    """M + sum_j m_j B_j^T B_j (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port or their stations."""
     carrier = scene.machine.carrier()
-    mass = jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
-    return carrier.mass + mass * carrier.port.T @ carrier.port
+    each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
+    if carrier.stations is None:
+        return carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
+    rows = jax.vmap(carrier.port_at)(carrier.stations)
+    return carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
 
 
 def natural_frequencies(scene: Scene) -> Array:
@@ -142,13 +145,19 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 
 def circular_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on a circle only."""
+    """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
+    loads = turning_loads(scene)
+    if scene.machine.carrier().stations is not None:
+        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
+    return loads
+
+
+def turning_loads(scene: Scene) -> CircularLoads:
+    """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if not isinstance(scene.loads, CircularLoads):
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
-    if scene.machine.carrier().stations is not None:
-        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
     if not isinstance(scene.drive, IdealDrive):
         raise InputError(
             "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
@@ -164,30 +173,32 @@ def turning(carrier: Carrier) -> Array:
     return jnp.asarray([(1.0, -1.0j)[axis] for axis in carrier.axes])
 
 
-def dynamic_stiffness(scene: Scene, omega: Array) -> Array:
-    """K - w^2 (M + sum m_j B^T B) + i w (C + w G) (nd, nd) complex: force per displacement at speed `omega` (scalar).
+def dynamic_stiffness(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
+    """K - w^2 (M + sum m_j B^T B) + i w (C + n G) (nd, nd) complex: force per displacement at frequency `omega` (scalar).
 
-    Loads and rotor turn together at w = `omega` rad/s, which is the speed that the gyroscopic matrix G takes.
+    n is the rotor's `speed`, rad/s; if None, loads and rotor turn together at w.
     """
     carrier = scene.machine.carrier()
-    damping = carrier.damping if carrier.gyroscopic is None else carrier.damping + omega * carrier.gyroscopic
+    n = omega if speed is None else speed
+    damping = carrier.damping if carrier.gyroscopic is None else carrier.damping + n * carrier.gyroscopic
     return carrier.stiffness - omega**2 * loaded_mass(scene) + 1j * omega * damping
 
 
-def steady_displacement(scene: Scene, omega: Array) -> Array:
+def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
     """Complex amplitudes Y (nd,) m of the carrier under loads that turn together at `omega` (scalar, rad/s).
 
-        (K - w^2 (M + sum m_j B^T B) + i w C) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
+        (K - w^2 (M + sum m_j B^T B) + i w (C + n G)) Y = S w^2 B^T e,     q(t) = Re(Y exp(i w t)),    S = sum m_j R_j
 
-    the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam.
+    the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam. The rotor's `speed` n, rad/s, is asked
+    for where the carrier has a gyroscopic matrix G.
 
     Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
     """
     carrier = scene.machine.carrier()
-    if carrier.gyroscopic is not None:
+    if carrier.gyroscopic is not None and speed is None:
         raise InputError("machine.kind", f"is {scene.machine.kind!r}; leading-order jams hold for machines of platforms")
     force = circular_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
-    return small_solve(dynamic_stiffness(scene, omega), force)
+    return small_solve(dynamic_stiffness(scene, omega, speed), force)
 
 
 def magnitude(value: Array) -> Array:

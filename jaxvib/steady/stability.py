@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.collocation import Grid, Harmonics, Motion, body, circle, has_half_turn, load_torque
-from jaxvib.steady.response import loaded_mass, natural_frequencies
+from jaxvib.steady.collocation import Grid, Harmonics, Motion, bodies, circle, has_half_turn, load_torque
+from jaxvib.steady.response import circular_loads, loaded_mass, natural_frequencies
 
 __all__ = ["Floquet", "floquet", "steps_for"]
 
@@ -29,7 +29,7 @@ _WEIGHTS = _TABLEAU.b_sol[:-1]
 class Floquet(NamedTuple):
     """How small disturbances of a periodic jam grow, trailing axis over the orbits.
 
-    **Attributes**: `roots` (2 nd + 1, P) complex: growth over a turn of the grid, that is half a period followed by the
+    **Attributes**: `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, that is half a period followed by the
     half-turn where the motion has that symmetry (multipliers are their squares), else a period (they are the multipliers);
     the trivial one, a shift in time, is taken out. `inner` (2, P): the same for two loads that part while the others
     stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
@@ -40,18 +40,20 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-def steps_for(scene: Scene, omega: Array) -> Array:
-    """How many integration steps a turn of the grid asks for at the load speed `omega` (rad/s)."""
+def steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
+    """How many integration steps a turn of the grid asks for at the load speed `omega` and the rotor's `speed` (rad/s)."""
     carrier = scene.machine.carrier()
     half = jnp.linalg.inv(jnp.linalg.cholesky(loaded_mass(scene)))
     decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
     fastest = jnp.maximum(jnp.max(natural_frequencies(scene)), decay)
+    if carrier.gyroscopic is not None:
+        fastest = fastest + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
     turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
     return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
 
 
 class _Coefficients(NamedTuple):
-    """What of the orbit enters the linear equations at one angle; (np, P) and (P,)."""
+    """What of the orbit enters the linear equations at one angle: s e', its derivatives (np, G, P); the rest (G, P)."""
 
     moving: Array
     moving1: Array
@@ -63,72 +65,89 @@ class _Coefficients(NamedTuple):
 def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, steps: int | Array) -> Floquet:
     """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
 
-    With Q = q + P t d, P = M^-1 B^T S, t = e'(phi), d the disturbance of the loads and ' = d/dtheta:
+    With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
 
-        Q'' = - M^-1 C/Omega q' - M^-1 K/Omega^2 q,                                          q = Q - P t d
-        I Omega^2 d'' = T_rate Omega d' + (T_phi + S e.a) d - S Omega^2 t.B q''
+        Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
+        I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - S_g Omega^2 t_g.B q''
 
-    and for loads that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last term.
+    and for loads of one body that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last
+    term. Loads that lie side by side are pressed together, and do not part.
     Fixed steps of Dormand and Prince's order 8, of the same length for all orbits.
 
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
     derivatives exist) or a scalar array.
     """
-    carrier, whole = scene.machine.carrier(), body(scene)
+    carrier, whole = scene.machine.carrier(), bodies(scene)
     mass = loaded_mass(scene)
-    nd = mass.shape[0]
+    nd, count = mass.shape[0], whole.inertia.shape[0]
     inverse = jnp.linalg.inv(mass)
     stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping
-    shift = inverse @ carrier.port.T * whole.unbalance
+    gyroscopic = None if carrier.gyroscopic is None else inverse @ carrier.gyroscopic
+    total = jnp.sum(whole.unbalance)
+    share = whole.unbalance / total
+    shift = inverse @ carrier.port.T * total
     length = jnp.max(jnp.abs(shift))
     shift = shift / length
     port = carrier.port * length
     mobility = port @ shift
+    # What a body of loads gives way with, per share of the unbalance.
+    lever = (total / whole.inertia)[None, :, None, None]
     omega, speed = motion.omega, motion.rotor_speed
-    lanes, w = omega.shape[0], omega[None, None]
+    lanes, w, n = omega.shape[0], omega[None, None], speed[None, None]
     turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
     h = turn / steps
 
     def coefficients(theta: Array) -> _Coefficients:
         lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
-        phi, rate = theta[:, None] + lag, 1.0 + lag1
+        phi, rate = theta[None, :, None] + lag, 1.0 + lag1
         point, moving = circle(scene, phi)
-        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)[:, None]
         torque = jax.vmap(lambda p, r, w, n: load_torque(scene, p, w * r, n), in_axes=-1, out_axes=-1)
         ones = jnp.ones_like(phi)
         by_angle = jax.jvp(lambda p: torque(p, rate, omega, speed), (phi,), (ones,))[1]
         by_rate = jax.jvp(lambda r: torque(phi, r, omega, speed), (rate,), (ones,))[1]
-        stiff = by_angle + whole.unbalance * jnp.sum(point * acceleration, axis=0)
+        stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration, axis=0)
         moving2 = -point * lag2[None] - moving * rate[None] ** 2
-        return _Coefficients(moving, -point * rate[None], moving2, stiff / omega[None] ** 2, by_rate / omega[None] ** 2)
+        s = share[None, :, None, None]
+        unit = whole.inertia[:, None, None] * omega[None, None] ** 2
+        return _Coefficients(s * moving, -s * point * rate[None], s * moving2, stiff / unit, by_rate / unit)
+
+    def damped(q1: Array, w: Array, n: Array) -> Array:
+        answer = _times(damping, q1) / w
+        return answer if gyroscopic is None else answer + n * _times(gyroscopic, q1) / w
 
     def full(c: _Coefficients, x: Array) -> Array:
-        q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[None, 2 * nd], x[None, 2 * nd + 1]
-        t, t1, t2 = (v[:, None, :] for v in (c.moving, c.moving1, c.moving2))
-        below = q - _times(shift, t * d)
-        below1 = q1 - _times(shift, t * d1 + t1 * d)
-        q2 = -_times(damping, below1) / w - _times(stiffness, below) / w**2
-        pushed = _times(port, q2) - _times(mobility, 2.0 * t1 * d1 + t2 * d)
-        inertia = whole.inertia - whole.unbalance * jnp.sum(t * _times(mobility, t), axis=0, keepdims=True)
-        vibration = whole.unbalance * jnp.sum(t * pushed, axis=0, keepdims=True)
-        torque = c.by_rate[None, None] * d1 + c.by_angle[None, None] * d - vibration
-        return jnp.concatenate([q1, q2, d1, torque / inertia])
+        q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[2 * nd : 2 * nd + count], x[2 * nd + count :]
+        t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
+        below = q - _times(shift, jnp.sum(t * d[None], axis=1))
+        below1 = q1 - _times(shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
+        q2 = -damped(below1, w, n) - _times(stiffness, below) / w**2
+        pushed = _times(port, q2) - _times(mobility, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
+        torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
+        # The port's acceleration with the bodies giving way to it: an equation for each of its directions.
+        answers = lever * t
+        weight = jnp.sum(t[:, None] * answers[None], axis=2)
+        acceleration = _small_solve(_times(mobility, weight), pushed - _times(mobility, jnp.sum(t * torque[None], axis=1)))
+        return jnp.concatenate([q1, q2, d1, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
 
     def apart(c: _Coefficients, x: Array) -> Array:
-        return jnp.stack([x[1], (c.by_rate[None] * x[1] + c.by_angle[None] * x[0]) / whole.inertia])
+        return jnp.stack([x[1], c.by_rate * x[1] + c.by_angle * x[0]])
 
     def start(n: int) -> Array:
         return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
 
-    fields = (full, apart) if scene.loads.count > 1 else (full,)
-    begin = tuple(start(n) for n in (2 * nd + 2, 2)[: len(fields)])
+    loads = circular_loads(scene)
+    parting = loads.alike and loads.count > 1 and loads.own_radius is None
+    sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
+    fields = (full, apart)[: len(sizes)]
+    begin = tuple(start(n) for n in sizes)
 
     def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         at = coefficients((k + _NODES) * h)
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
         def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
-            c = _Coefficients(at.moving[:, i], at.moving1[:, i], at.moving2[:, i], at.by_angle[i], at.by_rate[i])
+            c = _Coefficients(at.moving[:, :, i], at.moving1[:, :, i], at.moving2[:, :, i], at.by_angle[:, i], at.by_rate[:, i])
             return tuple(
                 rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
                 for field, x, rate in zip(fields, state, rates, strict=True)
@@ -140,7 +159,7 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
 
     rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
     end = jax.lax.fori_loop(0, steps, step, begin)
-    flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), [1.0, 1.0]])
+    flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), np.ones(2 * count)])
     monodromy = flip[:, None, None] * end[0]
 
     # A shift in time: q' and phi' along the orbit itself.
@@ -149,10 +168,10 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, zero, k) for k in range(3))
     _, moving = circle(scene, lag)
     along = jnp.concatenate([
-        at1 + _times(shift, moving * (1.0 + lag1)[None]),
-        -_times(damping, at1) / w - _times(stiffness, at) / w**2,
-        1.0 + lag1[None],
-        lag2[None],
+        at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + lag1)[None], axis=1)),
+        -damped(at1, w, n) - _times(stiffness, at) / w**2,
+        1.0 + lag1,
+        lag2,
     ])[:, 0]  # fmt: skip
     trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
     roots = jnp.linalg.eigvals(rest).T
@@ -173,6 +192,15 @@ def _times(matrix: Array, vectors: Array) -> Array:
     if a * b > 16:
         return jnp.tensordot(matrix, vectors, 1)
     return jnp.stack([sum(matrix[i, k] * vectors[k] for k in range(b)) for i in range(a)])
+
+
+def _small_solve(weight: Array, right: Array) -> Array:
+    """x (np, ...) of (1 - weight) x = right, np = 1 or 2 written out, weight (np, np, ...)."""
+    a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
+    if weight.shape[0] == 1:
+        return right / a[0]
+    det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    return jnp.stack([a[1, 1] * right[0] - a[0, 1] * right[1], a[0, 0] * right[1] - a[1, 0] * right[0]]) / det[None]
 
 
 def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:

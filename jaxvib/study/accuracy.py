@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.machine.effects import Gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number
+from jaxvib.motion.envelope import envelope
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
 from jaxvib.steady.jam import jam_modes
-from jaxvib.steady.orbit import jam_orbit
+from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.response import natural_frequencies
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 _SOLVERS: dict[str, Any] = {"written out, order 8": None, "Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
 _POINTS = (8, 16)
+_AVERAGED = (1e-3, 1e-6)
 
 
 class CostRow(NamedTuple):
@@ -89,8 +92,8 @@ def accuracy(
 ) -> Cost:
     """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
 
-    - "amplitude", "foundation_force": of a jam mode; tiers leading order, exact orbit, full integration from the leading
-      order's motion to `until`. The reference is the exact orbit with 32 points, its own error the difference to 24.
+    - "amplitude", "foundation_force": of a jam mode; tiers leading order, exact orbit, averaged equations, and full
+      integration from the leading order's motion to `until`. The reference is the exact orbit with 32 points, its own error the difference to 24.
     - "final_state": of the full equations at `until`; every solver, in double and in single precision. The reference is a
       run to a tolerance of 1e-13, its own error estimated as every run's.
     - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
@@ -158,6 +161,13 @@ def _steady(scene: Scene, quantity: str, mode: int, end: float, tolerances: Sequ
     for points in _POINTS:
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
         rows.append(_row("exact orbit", "", f"{points} points", call, reference, repeats))
+    if all(isinstance(effect, Gravity) for effect in scene.effects):
+        for tolerance in _AVERAGED:
+
+            def averaged(tolerance: float = tolerance) -> Any:
+                return read(envelope(scene, end, start="jam", mode=mode, save="window", tolerance=tolerance, throw=False))
+
+            rows.append(_row("envelope", "averaged equations", f"{tolerance:.0e}", averaged, reference, repeats))
     for tolerance in tolerances:
         run = _run_to(scene, end, tolerance, None, mode)
         rows.append(_row("full", "written out, order 8", f"{tolerance:.0e}", lambda run=run: read(run()), reference, repeats))

@@ -11,7 +11,8 @@ import numpy as np
 
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jam import Jam, jam_modes
-from jaxvib.steady.orbit import Orbit, jam_orbit
+from jaxvib.steady.jam_orbit import jam_orbit
+from jaxvib.steady.orbit import Orbit
 from jaxvib.steady.response import circular_loads
 
 if TYPE_CHECKING:

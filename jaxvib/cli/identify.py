@@ -1,0 +1,109 @@
+"""jaxvib identify."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.machine.files import read_toml
+from jaxvib.study.measurement import measurement_from_tables
+
+_NAMED = (
+    ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),
+    ("length", "pendulum", "From the bearing's axis to the mass centre, such as '25 cm'."),
+    ("inertia", "pendulum", "About the mass centre, kg m^2 [0: a point mass]."),
+    ("bearing", "pendulum", "Diameter of the bearing, for --dry, such as '20 mm'."),
+    ("g", "pendulum", "Gravity [9.81 m/s^2]."),
+    ("angle-unit", "record", "Unit of the angle, such as deg, in place of the header's."),
+    ("from", "record", "Leave out what was before this time."),
+    ("until", "record", "Leave out what was after this time."),
+    ("instrument", "identify", "Relative uncertainty of the moment of inertia, such as 0.03, for the intervals."),
+)
+
+
+def _named(command: Any) -> Any:
+    for name, section, text in reversed(_NAMED):
+        command = click.option(f"--{name}", f"{section}__{name.replace('-', '_')}", help=text)(command)
+    return command
+
+
+@app.command("identify")
+@click.argument("record", type=click.Path(path_type=Path))
+@_named
+@click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
+@click.option("--dry/--no-dry", "identify__dry", default=None, help="Find mu2 of dry friction as well as mu1, or not.")
+@shared
+def identify(record: Path, output: Output, **given: Any) -> None:
+    """Friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a measurement
+    file (TOML) that names one; options replace what the file says. --out adds the picture and the fit (fit.csv)."""
+    is_file = record.suffix.lower() == ".toml"
+    tables: dict[str, Any] = read_toml(record) if is_file else {"record": {"file": record.name}}
+    for name, value in given.items():
+        section, _, field = name.partition("__")
+        if value is not None:
+            value = value.split(",") if field == "columns" else value
+            old = tables.get(section, {})
+            tables[section] = {**old, field: value} if isinstance(old, dict) else old
+    pendulum, swing, dry, instrument = measurement_from_tables(tables, record.parent)
+    found = jv.identify(pendulum, swing, dry=dry, instrument=instrument)
+    picture, data = output.file("record.png"), output.file("fit.csv")
+    if picture is not None and data is not None:
+        found.plot().savefig(picture)
+        columns = np.stack([swing.time, swing.angle, found.fitted], axis=1)
+        np.savetxt(data, columns, fmt="%.9g", delimiter=",", header="time (s),angle (rad),fit (rad)", comments="")
+    ten = found.decrement
+    document = {
+        "status": found.status_name,
+        "message": found.message,
+        "notes": list(found.notes),
+        "viscous": found.viscous._asdict(),
+        "dry": None if found.dry is None else found.dry._asdict(),
+        "correlation": found.correlation,
+        "decrement": None
+        if ten is None
+        else {
+            "viscous": ten.viscous._asdict(),
+            "scatter": ten.scatter,
+            "drift": ten.drift,
+            "period": ten.period,
+            "periods": ten.periods,
+            "pairs": len(ten.estimates),
+        },
+        "frequency": found.frequency._asdict(),
+        "offset": found.offset._asdict(),
+        "inertia": float(pendulum.total_inertia),
+        "inertia_by_frequency": found.inertia,
+        "noise": found.noise,
+        "pattern": found.pattern,
+        "stopped_at": found.stopped_at,
+        "samples": swing.samples,
+        "instrument": instrument,
+    }
+
+    def text() -> str:
+        rows = [_row("mu1, N m s", found.viscous)]
+        if found.dry is not None:
+            rows.append(_row("mu2", found.dry))
+        if ten is not None:
+            rows.append(_row(f"mu1 by the formula of {ten.periods} periods, N m s", ten.viscous))
+        rows.append(_row("frequency of small swings, rad/s", found.frequency))
+        rows.append(_row("zero of the record, rad", found.offset))
+        lines = [
+            f"{swing.name}: {swing.samples} samples, noise {found.noise:.3g} rad",
+            f"{found.status_name}: {found.message}",
+            table("friction of the bearing; an interval holds the number with 95 %", ["", "value", "from", "to"], rows),
+        ]
+        if found.dry is not None:
+            lines.append(f"errors of mu1 and mu2 are correlated by {found.correlation:.3f}")
+        return "\n".join([*lines, *found.notes])
+
+    output.done(document, text, "identify")
+
+
+def _row(name: str, estimate: jv.Estimate) -> list[str]:
+    return [name, f"{estimate.value:.6g}", f"{estimate.low:.6g}", f"{estimate.high:.6g}"]

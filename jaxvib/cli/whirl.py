@@ -1,0 +1,56 @@
+"""jaxvib whirl."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.machine.units import to_float
+
+_RPM = 30.0 / np.pi
+
+
+@app.command("whirl")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--speed", help="Rotor speed, such as '3000 rpm' [the drive's].")
+@click.option(
+    "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Whether the loads' masses count."
+)
+@shared
+def whirl(scene: Path, speed: str | None, loads: Any, output: Output) -> None:
+    """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
+    loaded = jv.load_scene(scene)
+    rotor_speed = float(loaded.drive.speed) if speed is None else float(to_float(speed, "rad/s", "--speed"))
+    found = jv.whirl(loaded, [rotor_speed], loads=loads)
+    critical = [
+        {"speed": float(w), "forward": bool(f)}
+        for w, f in zip(found.critical.speed, found.critical.forward, strict=True)
+        if np.isfinite(w)
+    ]
+    whirls = [
+        {"speed": float(w), "decay": float(d), "forward": bool(f)}
+        for w, d, f in zip(found.speed[0], found.decay[0], found.forward[0], strict=True)
+    ]
+    picture = output.file("campbell.png")
+    if picture is not None:
+        top = 1.3 * max(rotor_speed, *(each["speed"] for each in critical))
+        jv.whirl(loaded, np.linspace(0.0, top, 161), loads=loads).plot().savefig(picture)
+    document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}
+
+    def text() -> str:
+        sense = {True: "forward", False: "backward"}
+        rows = [[sense[w["forward"]], f"{w['speed']:.6g}", f"{_RPM * w['speed']:.5g}"] for w in critical]
+        moving = [[sense[w["forward"]], f"{w['speed']:.6g}", f"{_RPM * w['speed']:.5g}", f"{w['decay']:.4g}"] for w in whirls]
+        return "\n".join(
+            [
+                table("critical speeds: the whirl turns with the rotor", ["", "rad/s", "rpm"], rows),
+                table(f"whirl at {rotor_speed:.5g} rad/s", ["", "rad/s", "rpm", "decay, 1/s"], moving),
+            ]
+        )
+
+    output.done(document, text, "whirl")

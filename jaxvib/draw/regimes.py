@@ -1,0 +1,38 @@
+"""Which kinds of motion loads come to, over their drag."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxvib.draw.style import COLORS, panels
+
+__all__ = ["regime_chart"]
+
+
+def regime_chart(drag: np.ndarray, shares: Mapping[str, np.ndarray], omega: np.ndarray, rotor_speed: float) -> Figure:
+    """Shares (nd,) of the kinds of motion as stacked areas, and speeds of the loads (nd, ns) rad/s, over drag (nd,) N s/m.
+
+    >>> import numpy as np
+    >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)
+    >>> len(figure.axes)
+    2
+    """
+    figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True)
+    width = 0.9 * np.min(np.diff(np.log(drag))) if len(drag) > 1 else 0.1
+    low = np.zeros(len(drag))
+    for k, (kind, share) in enumerate(shares.items()):
+        top.bar(drag, share, bottom=low, width=drag * width, color=COLORS[k % len(COLORS)], label=kind)
+        low = low + share
+    top.set_ylabel("share of the starts")
+    top.set_ylim(0.0, 1.0)
+    top.legend(ncols=len(shares), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    bottom.plot(np.repeat(drag, omega.shape[1]), omega.ravel(), ".", color=COLORS[0], ms=4.0, alpha=0.6)
+    bottom.axhline(rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
+    bottom.set_ylabel("speed of loads, rad/s")
+    bottom.set_xlabel("drag, N s/m")
+    bottom.set_xscale("log")
+    bottom.legend(loc="best")
+    return figure

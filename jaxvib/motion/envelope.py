@@ -1,0 +1,386 @@
+"""Time integration of the averaged equations: steps of many turns."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.drive import ConstantSpeed, IdealDrive, SpinUp
+from jaxvib.machine.effects import Gravity
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import Number, count, number, traced
+from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field
+from jaxvib.motion.dynamics import State
+from jaxvib.motion.observables import Measured
+from jaxvib.motion.rosenbrock import Rodas4
+from jaxvib.motion.simulate import _whole
+from jaxvib.motion.start import Start, initial_state
+from jaxvib.steady.response import circular_loads, magnitude, natural_frequencies
+
+__all__ = ["Envelope", "EnvelopeStatus", "Envelopes", "envelope"]
+
+_WINDOW = 512
+"""Samples in the window at the end over which is measured: 25 in a beat of the slowest resonance."""
+
+_LONGEST = 256
+"""Turns of the rotor that the window is long at most, as in `simulate`."""
+
+
+class EnvelopeStatus(eqx.Enumeration):
+    """How an averaged run ended; the members are the sentences a user reads."""
+
+    done = "the averaged run reached its end"
+    max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
+    not_finite = "the motion grew beyond all bounds"
+    no_start = "the state to start from does not exist or is not finite"
+    not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
+
+
+class Envelopes(eqx.Module):
+    """Averaged motion at some times.
+
+    **Attributes** (nt times): `time` (nt,) s; `displacement` (nt, nd) m and `velocity` (nt, nd) m/s, complex amplitudes at the
+    loads' mean angle; `amplitude` (nt, nd) m and `foundation_force` (nt, nb) N, zero to peak; `omega` (nt,) mean speed of the
+    loads and `load_speed` (nt, count), rad/s; `phase` (nt, count) of each load relative to the mean angle, rad;
+    `rotor_speed` (nt,) rad/s; `ripple` (nt, count) rad, see `Envelope`.
+    """
+
+    time: Array
+    displacement: Array
+    velocity: Array
+    amplitude: Array
+    foundation_force: Array
+    omega: Array
+    load_speed: Array
+    phase: Array
+    rotor_speed: Array
+    ripple: Array
+
+
+class Envelope(Measured):
+    """An averaged run of a scene: the quantities of `Measured` over the last turns, and the averaged motion.
+
+    **Attributes**: those of `Measured`; `status` an `EnvelopeStatus`; `ripple` (count,) rad, by how much the vibration that
+    averaging leaves out shakes each load's angle, largest over the window: amplitudes and speeds are off by a share of about
+    this size; `trajectory` and `window` as `Envelopes`, the former None where only the window was asked for; `steps`,
+    `rejected`; `scene`.
+    """
+
+    ripple: Array
+    status: EnvelopeStatus
+    trajectory: Envelopes | None
+    window: Envelopes
+    steps: Array
+    rejected: Array
+    scene: Scene
+
+    @property
+    def message(self) -> str:
+        """How the run ended, a sentence."""
+        return EnvelopeStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
+    def summary(self) -> str:
+        """What happened, for a person to read; amplitudes zero to peak."""
+        names = self.scene.machine.carrier().coordinates
+        amplitude = ", ".join(f"{n} {float(a):.4g} m" for n, a in zip(names, self.amplitude, strict=True))
+        speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
+        state = "settled" if bool(self.settled) else "not settled"
+        return "\n".join(
+            [
+                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
+                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
+                f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
+                f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
+                f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
+            ]
+        )
+
+
+class _Tolerance(diffrax.AbstractStepSizeController):
+    """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
+
+    inner: diffrax.AbstractStepSizeController
+    blocks: tuple[int, ...] = eqx.field(static=True)
+
+    def wrap(self, direction: Any) -> _Tolerance:
+        return _Tolerance(self.inner.wrap(direction), self.blocks)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+        return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
+    ) -> Any:
+        def sizes(y: Array) -> Array:
+            parts = jnp.split(jnp.abs(y), np.cumsum(self.blocks)[:-1])
+            # An angle grows without end; its error is never relative.
+            return jnp.concatenate([*(jnp.broadcast_to(jnp.max(x), x.shape) for x in parts[:-1]), jnp.zeros_like(parts[-1])])
+
+        return self.inner.adapt_step_size(t0, t1, sizes(y0), sizes(y1_candidate), args, y_error, error_order, controller_state)
+
+
+class _Units(eqx.Module):
+    """What counts as 1: the throw S/M of the loads, that times the rotor's speed, the rotor's speed; 1 rad."""
+
+    length: Array
+    speed: Array
+
+    def pack(self, state: Amplitudes) -> Array:
+        y, v = state.displacement / self.length, state.velocity / (self.length * self.speed)
+        return jnp.concatenate([y.real, y.imag, v.real, v.imag, state.rate / self.speed, state.phase])
+
+    def unpack(self, flat: Array, nd: int) -> Amplitudes:
+        loads = (flat.shape[-1] - 4 * nd) // 2
+        y0, y1, v0, v1, rate, phase = jnp.split(flat, np.cumsum([nd, nd, nd, nd, loads]), axis=-1)
+        speed = self.length * self.speed
+        return Amplitudes((y0 + 1j * y1) * self.length, (v0 + 1j * v1) * speed, rate * self.speed, phase)
+
+
+def envelope(
+    scene: Scene,
+    until: Number,
+    *,
+    start: Start | State = "rest",
+    mode: int | None = None,
+    spin_up: Number | None = None,
+    save: Literal["all", "window"] = "all",
+    samples: int = 256,
+    turns: int = 20,
+    tolerance: float = 1e-4,
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 2**16,
+    throw: bool = True,
+) -> Envelope:
+    """Integrates the averaged equations of `scene` from 0 to `until`: amplitudes and load speeds in place of vibrations.
+
+    A run-up through resonances, a capture or a passage takes steps of many turns. What it answers is the limit of light
+    loads: its relative error is of first order in their share of the mass times the dynamic magnification, and about as large
+    as the result's `ripple`; its equilibria are those of `jam_modes`. `averaged_field` has the equations.
+
+    Near the line between capture and passage the smallest difference decides: there ask `simulate`.
+
+    **Arguments**
+
+    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `controller`, `throw`: as `simulate`
+    - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
+    - `tolerance`: error a step may make, relative to the largest amplitude, and absolute in natural units: the throw S/M of the
+      loads for displacements, that times the rotor's speed for velocities, that speed for rates, 1 rad for phases
+    - `solver`: diffrax's, for stiff systems; `Rodas4` unless said otherwise
+    - `max_steps`: the run fails after so many steps
+
+    Gravity has no mean torque on a load that turns; where one turns too slowly against it, or its drag does not lift it from
+    the bottom of its track, the status is `not_turning`. Effects other than gravity are refused.
+
+    **Returns** `Envelope`. Gradients, forward and reverse, go through all of it; `jit` and `vmap` too.
+
+    **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish or is
+    `not_turning`.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> run = jv.envelope(scene, 60.0, start="spin_up")
+    >>> bool(run.settled), round(float(run.omega), 1), int(run.steps) < 200      # caught below the resonance at 28.1 rad/s
+    (True, 27.4, True)
+
+    Source: see `averaged_field`.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    circular_loads(scene)
+    for index, effect in enumerate(scene.effects):
+        if not isinstance(effect, Gravity):
+            raise InputError(f"effects[{index}]", f"is {effect.kind!r}; only gravity is averaged, use simulate for this scene")
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    if save not in ("all", "window"):
+        raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
+    count(samples, "samples", low=2)
+    count(turns, "turns")
+    precision = float(jnp.finfo(end.dtype).eps)
+    if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
+        raise InputError(
+            "tolerance", f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and below 1"
+        )
+    if spin_up is not None and start != "spin_up":
+        raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
+    if isinstance(start, str) and start == "spin_up":
+        if not isinstance(scene.drive, ConstantSpeed):
+            raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
+        drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
+        if not traced(end - drive.duration) and drive.duration > end:
+            raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
+        scene = eqx.tree_at(lambda s: s.drive, scene, drive)
+    if isinstance(start, State):
+        if mode is not None:
+            raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
+        state = _whole(scene, start)
+    else:
+        # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
+        known = start in ("rest", "spin_up") and mode is None
+        state = None if known else initial_state(scene, start, mode=mode)
+    run = _run(
+        scene,
+        end,
+        state,
+        Rodas4() if solver is None else solver,
+        diffrax.PIDController(rtol=tolerance, atol=tolerance) if controller is None else controller,
+        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        samples if save == "all" else 0,
+        turns,
+        count(max_steps, "max_steps"),
+    )
+    if throw and not traced(run.steps):
+        _raise_if_failed(run, max_steps)
+    return run
+
+
+@eqx.filter_jit
+def _run(
+    scene: Scene,
+    end: Array,
+    state: State | None,
+    solver: diffrax.AbstractSolver,
+    controller: diffrax.AbstractStepSizeController,
+    adjoint: diffrax.AbstractAdjoint,
+    samples: int,
+    turns: int,
+    max_steps: int,
+) -> Envelope:
+    begin = amplitudes_of(scene, initial_state(scene) if state is None else state)
+    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    exists = _finite(begin)
+    begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
+    field, nd = averaged_field(scene), begin.displacement.shape[0]
+    frozen = jax.lax.stop_gradient(scene)
+    units = _units(frozen)
+    speed, frequencies = frozen.drive.speed, natural_frequencies(frozen)
+    slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
+    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _LONGEST / speed)
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
+    if samples:
+        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+
+    def term(t: Any, y: Array, args: Averaged) -> Array:
+        return units.pack(args(t, units.unpack(y, nd)))
+
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(term),
+        solver,
+        t0=jnp.zeros_like(end),
+        t1=end,
+        dt0=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
+        y0=units.pack(begin),
+        args=field,
+        saveat=diffrax.SaveAt(subs=saves),
+        stepsize_controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+    )
+    assert solution.ts is not None and solution.ys is not None
+
+    def envelopes(times: Array, flat: Array) -> Envelopes:
+        return jax.vmap(lambda t, y: _at(scene, field, t, units.unpack(y, nd)))(times, flat)
+
+    kept = envelopes(solution.ts[0], solution.ys[0])
+    finite = _finite(kept)
+    turning = _turning(scene, field, begin, kept)
+    finished = solution.result == diffrax.RESULTS.successful
+    status = EnvelopeStatus.where(turning, EnvelopeStatus.done, EnvelopeStatus.not_turning)
+    status = EnvelopeStatus.where(finite, status, EnvelopeStatus.not_finite)
+    status = EnvelopeStatus.where(finished, status, EnvelopeStatus.max_steps_reached)
+    status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
+    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), _measure(kept))
+    return Envelope(
+        **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
+        ripple=jnp.max(kept.ripple, axis=0),
+        status=status,
+        trajectory=envelopes(solution.ts[1], solution.ys[1]) if samples else None,
+        window=kept,
+        steps=solution.stats["num_steps"],
+        rejected=solution.stats["num_rejected_steps"],
+        scene=scene,
+    )
+
+
+def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
+    carrier = scene.machine.carrier()
+    assert isinstance(scene.drive, IdealDrive)
+    return Envelopes(
+        time=t,
+        displacement=state.displacement,
+        velocity=state.velocity,
+        amplitude=magnitude(state.displacement),
+        foundation_force=magnitude(carrier.bed_stiffness @ state.displacement + carrier.bed_damping @ state.velocity),
+        omega=jnp.mean(state.rate),
+        load_speed=state.rate,
+        phase=state.phase,
+        rotor_speed=scene.drive.speed_at(t),
+        ripple=field.ripple(state),
+    )
+
+
+def _measure(window: Envelopes) -> Measured:
+    """The window in the numbers of `Measured`: means of speeds, the greatest of each amplitude."""
+    half = window.time.shape[0] // 2
+    amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
+    speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
+    change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
+    top, omega = jnp.max(amplitude), jnp.mean(speeds)
+    drift = jnp.max(change) / jnp.where(top > 0.0, top, 1.0)
+    speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
+    return Measured(
+        omega=omega,
+        load_speed=speeds,
+        amplitude=amplitude,
+        foundation_force=force[0] if force.shape[0] == 1 else jnp.sqrt(jnp.sum(force**2)),
+        drift=jnp.maximum(drift, speed_drift),
+    )
+
+
+def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
+    """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
+    and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
+    loads, pulling = scene.loads, [effect for effect in scene.effects if isinstance(effect, Gravity)]
+    if not pulling:
+        return jnp.asarray(True)
+    angles = jnp.linspace(0.0, 2.0 * jnp.pi, 64, endpoint=False)
+    around = [jnp.broadcast_to(angle, (loads.count,)) for angle in angles]
+    height = jnp.stack([sum(effect.load_potential(loads, (u,)) for effect in pulling) for u in around])
+    slope = jax.vmap(jax.grad(lambda u: sum(jnp.sum(effect.load_potential(loads, (u,))) for effect in pulling)))
+    torque = slope(jnp.stack(around))
+    passes = (jnp.max(height, axis=0) - jnp.min(height, axis=0)) / field.inertia
+    lifted = field.drag * jnp.max(window.rotor_speed) > jnp.max(jnp.abs(torque), axis=0)
+    return jnp.all((jnp.min(window.load_speed**2, axis=0) > passes) & (lifted | (begin.rate**2 > passes)))
+
+
+def _units(scene: Scene) -> _Units:
+    mass = jnp.mean(jnp.diagonal(scene.machine.carrier().mass))
+    return _Units(circular_loads(scene).unbalance() / mass, scene.drive.speed)
+
+
+def _finite(tree: Any) -> Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+def _raise_if_failed(run: Envelope, max_steps: int) -> None:
+    if bool(run.status == EnvelopeStatus.done):
+        return
+    names = ("max_steps_reached", "not_finite", "no_start", "not_turning")
+    name = next(name for name in names if bool(run.status == getattr(EnvelopeStatus, name)))
+    hint = {
+        "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
+        "not_turning": "; integrate the full equations with simulate",
+    }
+    raise ComputationError(name, run.message + hint.get(name, ""))

@@ -1,0 +1,225 @@
+"""What kind of motion a run has come to, with the evidence."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.drive import Motor
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.dynamics import rotor_angle
+from jaxvib.motion.observables import Trajectory
+from jaxvib.steady.response import natural_frequencies
+from jaxvib.steady.whirl import whirl
+
+__all__ = ["PhasePattern", "Regime", "RegimeName", "phase_pattern", "regime"]
+
+_SAME_SPEED = 3e-3
+"""Speeds of two loads, of a load and the rotor, or of one load early and late, that differ by less count as one."""
+
+_LOCKED = 0.1
+"""Relative phases that move by less than this between two halves of the window count as fixed, rad."""
+
+_BALANCED = 0.02
+"""What may be left out of balance, relative to what the loads would make together."""
+
+
+class RegimeName(eqx.Enumeration):
+    """Kinds of motion; the members are the sentences a user reads."""
+
+    swinging = "the loads swing and do not go round"
+    jammed = "the loads are jammed: they turn together, slower than the rotor"
+    unbalanced = "the loads turn with the rotor, which is not balanced"
+    balanced = "the loads turn with the rotor and balance it"
+    parted = "the loads have parted: they turn at different speeds that no longer change"
+    unsettled = "the loads have not come to a steady motion"
+
+
+class PhasePattern(eqx.Enumeration):
+    """How loads that turn at one speed stand to each other; the members are the words a user reads."""
+
+    together = "all together"
+    opposite = "in two opposite groups"
+    spread = "spread so that they cancel each other"
+    other = "at other phases"
+
+
+class Regime(eqx.Module):
+    """The kind of motion over a stretch, and what it was judged by.
+
+    **Attributes**
+
+    - `name`: a `RegimeName`; `pattern`: a `PhasePattern` of the loads
+    - `load_speed` (count,) mean speeds and `rotor_speed`, rad/s; `ripple` half of peak to peak of the loads' speed, the largest
+    - `phase` (count,) rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
+    - `unbalance`: what loads and rotor together leave out of balance in the rotor's frame, relative to the loads' own together
+    - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed` rad/s
+    - `mode`: the jam mode that rises to it (2 resonance - 1) or falls from it (2 resonance), 0 where the loads are not jammed
+    - `caught`: whether the rotor itself is held at a resonance, below the speed that its motor would give it without a load
+    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's
+    """
+
+    name: RegimeName
+    pattern: PhasePattern
+    load_speed: Array
+    rotor_speed: Array
+    ripple: Array
+    phase: Array
+    unbalance: Array
+    resonance: Array
+    resonance_speed: Array
+    mode: Array
+    caught: Array
+    change: Array
+
+    @property
+    def label(self) -> str:
+        """The name's own word: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
+        words = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
+        return next(word for word in words if bool(self.name == getattr(RegimeName, word)))
+
+    @property
+    def pattern_label(self) -> str:
+        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        words = ("together", "opposite", "spread", "other")
+        return next(word for word in words if bool(self.pattern == getattr(PhasePattern, word)))
+
+    def summary(self) -> str:
+        """The name and its evidence, for a person to read."""
+        sentence = RegimeName[self.name]  # pyright: ignore[reportInvalidTypeArguments]
+        pattern = PhasePattern[self.pattern]  # pyright: ignore[reportInvalidTypeArguments]
+        speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
+        evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
+        if bool(self.name == RegimeName.jammed):
+            near = f"by resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
+            evidence += [near, pattern]
+        if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
+            evidence.append(f"{100.0 * float(self.unbalance):.2g} % of the loads' unbalance is left, {pattern}")
+        if bool(self.caught):
+            evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
+        evidence.append(f"speeds change by {float(self.change):.1e}")
+        return f"{sentence} ({'; '.join(evidence)})"
+
+
+def phase_pattern(phase: Array) -> PhasePattern:
+    """The pattern of phases (count,) rad: by their resultants |mean exp(i k phase)| for k = 1 and 2.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> bool(jv.phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)
+    True
+    """
+    first, second = (jnp.abs(jnp.mean(jnp.exp(1j * k * phase))) for k in (1, 2))
+    pattern = PhasePattern.where(first < 0.1, PhasePattern.spread, PhasePattern.other)
+    pattern = PhasePattern.where((first < 0.25) & (second > 0.9), PhasePattern.opposite, pattern)
+    return PhasePattern.where(first > 0.9, PhasePattern.together, pattern)
+
+
+def regime(scene: Scene, stretch: Trajectory) -> Regime:
+    """Names the motion over a stretch of a run of `scene`, such as `run.window`.
+
+    Loads that go round by less than a turn swing. Loads whose mean speed differs from the rotor's by less than 0.3 % turn with
+    it, balanced where loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about the tilts
+    where there are stations). Loads at one other speed, their relative phases fixed, are jammed. A speed that changes by more
+    than 0.3 % of the rotor's from one half of the stretch to the other is not steady.
+
+    **Returns** `Regime`; `jit` and `vmap` go through it.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> run = jv.simulate(scene, 10.0, start="jam", mode=1)
+    >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
+    (True, 1)
+    """
+    times, state = stretch.time, stretch.state
+    phi, rate = state.angle[0], state.rate[0]
+    half = times.shape[0] // 2
+    turn = jax.vmap(lambda t, s: rotor_angle(scene.drive, t, s))(times, state)
+
+    def mean_speed(part: slice, angle: Array) -> Array:
+        t = times[part]
+        return (angle[part][-1] - angle[part][0]) / (t[-1] - t[0])
+
+    early, late, whole = slice(0, half), slice(half, None), slice(None)
+    speed, rotor = mean_speed(whole, phi), mean_speed(whole, turn)
+    reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
+    change = jnp.max(jnp.abs(mean_speed(late, phi) - mean_speed(early, phi))) / reference
+    steady = change < _SAME_SPEED
+    swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
+    with_rotor = jnp.abs(speed - rotor) < _SAME_SPEED * reference
+    # Relative to the first load: exp(i k (phi_j - phi_1)), averaged; how far apart the halves' averages are says whether fixed.
+    to_first, moved = _relative(phi - phi[:, :1], half)
+    to_rotor, slid = _relative(phi - turn[:, None], half)
+    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED)
+
+    unbalance = _unbalance(scene, to_rotor, turn)
+    name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
+    name = RegimeName.where(steady & one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
+    name = RegimeName.where(
+        steady & jnp.all(with_rotor),
+        RegimeName.where(unbalance < _BALANCED, RegimeName.balanced, RegimeName.unbalanced),
+        name,
+    )
+    name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
+
+    natural = _resonances(scene, rotor)
+    mean = jnp.mean(speed)
+    nearest = jnp.argmin(jnp.abs(natural - mean))
+    mode = jnp.where(mean < natural[nearest], 2 * nearest + 1, 2 * nearest + 2)
+    turning = jnp.all(with_rotor)
+    return Regime(
+        name=name,
+        pattern=phase_pattern(jnp.where(turning, to_rotor, to_first)),
+        load_speed=speed,
+        rotor_speed=rotor,
+        ripple=jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0,
+        phase=jnp.where(turning, to_rotor, to_first),
+        unbalance=unbalance,
+        resonance=nearest + 1,
+        resonance_speed=natural[nearest],
+        mode=jnp.where(name == RegimeName.jammed, mode, 0),
+        caught=_caught(scene, natural, rotor),
+        change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
+    )
+
+
+def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
+    """Whether a motor's rotor hangs at a resonance: less than 15 % below one, and more than 5 % below the motor's own speed."""
+    if not isinstance(scene.drive, Motor):
+        return jnp.zeros((), bool)
+    return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
+
+
+def _relative(angle: Array, half: int) -> tuple[Array, Array]:
+    """Mean direction (count,) rad of angles (nt, count), and how far it moved from the first to the second half."""
+    point = jnp.exp(1j * angle)
+    early, late = jnp.mean(point[:half], axis=0), jnp.mean(point[half:], axis=0)
+    return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
+
+
+def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
+    """What is left out of balance when loads stand at `phase` to the rotor, relative to all of them at one angle."""
+    carrier, loads = scene.machine.carrier(), scene.loads
+    across, up = loads.position(*(jnp.zeros((loads.count,), phase.dtype),))
+    each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
+    origin = jnp.zeros_like(turn[0])
+    thrown = [throw for throw in (effect.throw(origin) for effect in scene.effects) if throw is not None]
+    static = sum((throw.static[0] + 1j * throw.static[1] for throw in thrown), jnp.sum(each))
+    left = jnp.abs(static) / jnp.sum(jnp.abs(each))
+    if carrier.stations is None:
+        return left
+    lean = sum((throw.lean[0] + 1j * throw.lean[1] for throw in thrown), jnp.sum(carrier.stations * each))
+    whole = jnp.sum(jnp.abs(carrier.stations * each))
+    return jnp.maximum(left, jnp.where(whole > 0.0, jnp.abs(lean) / jnp.where(whole > 0.0, whole, 1.0), 0.0))
+
+
+def _resonances(scene: Scene, rotor_speed: Array) -> Array:
+    """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
+    carrier = scene.machine.carrier()
+    if carrier.gyroscopic is None:
+        return natural_frequencies(scene)
+    found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
+    return jnp.sort(jnp.where(found.forward[0], found.speed[0], jnp.inf))

@@ -1,0 +1,174 @@
+"""Whirl of a rotor: natural motions that go round, with the rotor or against it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.draw.whirl import campbell_diagram
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.units import Number, numbers
+from jaxvib.steady.response import hermitian_modes, loaded_mass, relative_to
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CriticalSpeeds", "Whirl", "critical_speeds", "whirl"]
+
+Weights = Literal["fixed", "none"]
+
+_TIE = 1e-9
+"""Size of the coupling that tells two whirls of one speed apart, relative to the machine's own matrices."""
+
+
+class CriticalSpeeds(eqx.Module):
+    """Rotor speeds at which a whirl turns as fast as the rotor, no damping.
+
+    **Attributes**: `speed` (nd,) rad/s, ascending, inf where there is none (a thin disc has no second forward one); `forward`
+    (nd,) whether the whirl goes round with the rotor; only then does an imbalance excite it where supports are alike both ways.
+    """
+
+    speed: Array
+    forward: Array
+
+
+class Whirl(eqx.Module):
+    """Natural motions of a turning rotor over rotor speeds: the Campbell diagram.
+
+    **Attributes** (ns rotor speeds, nd natural motions each, ascending): `rotor_speed` (ns,) rad/s; `speed` (ns, nd) rad/s
+    of the whirl, 0 where damping allows no oscillation; `decay` (ns, nd) 1/s, negative where the motion grows; `forward`
+    (ns, nd) whether it goes round with the rotor; `critical` the synchronous speeds.
+    """
+
+    rotor_speed: Array
+    speed: Array
+    decay: Array
+    forward: Array
+    critical: CriticalSpeeds
+
+    def plot(self) -> Figure:
+        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line."""
+        return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)))
+
+
+def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "fixed") -> Whirl:
+    """Whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
+
+        (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
+
+    The eigenvalues are those of the first-order form; n is the rotor's speed.
+
+    **Arguments**: `rotor_speed` rad/s, one or a list (the drive's unless said otherwise); `loads` "fixed" counts the loads'
+    masses where they run, "none" leaves them out.
+
+    **Returns** `Whirl`. Gradients go through speeds and decays where no two are equal.
+
+    **Raises** `InputError` for a machine that does not move in two directions, and for values that are not allowed.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
+    >>> scene = jv.Scene(machine, jv.pendulums(count=1, mass=0.5, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))
+    >>> [round(float(w), 2) for w in jv.whirl(scene).speed[0]]
+    [175.88, 175.88]
+
+    Source: Artyunin 2013, section IV; free motion of equation (1).
+    """
+    carrier = _two_directions(scene)
+    speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None)
+    speeds = jnp.atleast_1d(speeds)
+    mass = _mass(scene, loads)
+    nd = mass.shape[0]
+    gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
+    part = _TIE * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
+
+    def first_order(n: Array, coupling: Array) -> Array:
+        resisting = carrier.damping + n * gyroscopic + coupling
+        flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
+        return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
+
+    def one_of_each(values: Array) -> tuple[Array, Array]:
+        # Of each conjugate pair the one that turns forward in time; real ones, where damping is heavy, come last in pairs.
+        scale = jnp.max(jnp.abs(values))
+        oscillates = jnp.abs(values.imag) > 1e-12 * scale
+        order = jnp.argsort(jnp.where(oscillates, jnp.where(values.imag > 0.0, values.imag, jnp.inf), 0.0))
+        heavy = jnp.sum(~oscillates)
+        # Real eigenvalues come first in this order; every other one of them stands for a pair.
+        picks = jnp.where(jnp.arange(nd) < heavy // 2, 2 * jnp.arange(nd), jnp.arange(nd) + heavy - heavy // 2)
+        return order[picks], oscillates
+
+    def at(n: Array) -> tuple[Array, Array, Array]:
+        values = jnp.linalg.eigvals(first_order(n, jnp.zeros_like(mass)))
+        chosen, oscillates = one_of_each(values)
+        speed = jnp.where(oscillates[chosen], values.imag[chosen], 0.0)
+        # Two whirls of one speed are told apart by a coupling too small to be seen in the speeds.
+        apart, shapes = jnp.linalg.eig(jax.lax.stop_gradient(first_order(n, part)))
+        return speed, -values.real[chosen], _sense(carrier, shapes[:nd, one_of_each(apart)[0]]) > 0.0
+
+    whirls = jax.vmap(at)(speeds)
+    return Whirl(speeds, *whirls, critical=critical_speeds(scene, loads=loads))
+
+
+def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
+    """Synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
+
+    The eigenproblem is Hermitian. On supports that are alike both ways, a forward tilt has the inertia A - C, a backward one
+    A + C.
+
+    **Arguments** as `whirl`. **Returns** `CriticalSpeeds`. **Raises** `InputError` as `whirl`.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
+    >>> scene = jv.Scene(machine, jv.pendulums(count=1, mass=0.5, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))
+    >>> [round(float(w), 2) for w in jv.critical_speeds(scene, loads="none").speed]
+    [177.06, 177.06]
+
+    Source: Artyunin 2013, section V.
+    """
+    carrier = _two_directions(scene)
+    mass = _mass(scene, loads)
+    inertia = mass if carrier.gyroscopic is None else mass - 1j * carrier.gyroscopic
+    part = 1j * _TIE * jnp.trace(mass) * _sense_matrix(carrier)
+    values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
+    square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
+    shapes = inverse.T @ hermitian_modes(square)[1]
+    values, shapes = values[::-1], shapes[:, ::-1]
+    there = values > 1e-14 * jnp.max(values)
+    speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
+    return CriticalSpeeds(speed, _sense(carrier, shapes) > 0.0)
+
+
+def _two_directions(scene: Scene) -> Carrier:
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    carrier = scene.machine.carrier()
+    if carrier.axes != (0, 1):
+        raise InputError(
+            "machine.kind",
+            f"is {scene.machine.kind!r}, which moves up and down only; whirl needs a rotor such as rotor(...)",
+        )
+    return carrier
+
+
+def _mass(scene: Scene, loads: Weights) -> Array:
+    if loads not in ("fixed", "none"):
+        raise InputError("loads", f"is {loads!r}; allowed: fixed, none")
+    return loaded_mass(scene) if loads == "fixed" else scene.machine.carrier().mass
+
+
+def _sense_matrix(carrier: Carrier) -> Array:
+    """A gyroscopic matrix (nd, nd) that tells whirls of one speed apart by their sense."""
+    rows = [carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt]
+    return sum(jnp.outer(r[0], r[1]) - jnp.outer(r[1], r[0]) for r in rows)  # pyright: ignore[reportReturnType]
+
+
+def _sense(carrier: Carrier, shapes: Array) -> Array:
+    """Twice the area that shapes (nd, k) sweep in a turn at the port and of its tilts: positive with the rotor's sense."""
+    rows = [carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt]
+    return sum(jnp.imag((row[0] @ shapes) * jnp.conj(row[1] @ shapes)) for row in (r.astype(shapes.dtype) for r in rows))  # pyright: ignore[reportReturnType]
