@@ -93,7 +93,8 @@ def accuracy(
     """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
 
     - "amplitude", "foundation_force": of a jam mode; tiers leading order, exact orbit, averaged equations, and full
-      integration from the leading order's motion to `until`. The reference is the exact orbit with 32 points, its own error the difference to 24.
+      integration from the leading order's motion to `until`. The reference is the exact orbit with 32 points, its own error
+      the difference to 24.
     - "final_state": of the full equations at `until`; every solver, in double and in single precision. The reference is a
       run to a tolerance of 1e-13, its own error estimated as every run's.
     - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
