@@ -45,7 +45,7 @@ def cost_chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], floor: float,
     axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([*errors, 1e-2]))
     axes.set_xlabel("seconds, once compiled")
     axes.set_ylabel(f"relative error of {quantity}")
-    axes.legend()
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
