@@ -5,6 +5,10 @@ import pathlib
 import jax
 import matplotlib
 
+from jaxvib.backend import prepare_cpu
+
+# Each worker is a process of its own: what is set here is heard.
+prepare_cpu()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Workers share what they compile, and a second run of the tests finds it.

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.draw.charts import before_after, convergence
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
@@ -114,10 +113,14 @@ class Synthesis:
 
     def plot(self) -> Figure:
         """Every quantity after the search against before. **Returns** a matplotlib figure."""
+        from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
+
         return before_after(_flat(self.before), _flat(self.after), title=f"search for {wanted(self.objective)}")
 
     def plot_convergence(self) -> Figure:
         """The objective of every start over the iterations. **Returns** a matplotlib figure."""
+        from jaxvib.draw.charts import convergence
+
         return convergence(self.history, best=int(np.argmin(self.values)), label=f"{self.objective}, {self.unit}".rstrip(", "))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import sys
@@ -10,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.table import Table
 
 from jaxvib.errors import ComputationError, InputError
 
@@ -70,6 +69,9 @@ def _plain(value: Any) -> Any:
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right."""
+    from rich.console import Console  # slow to import, and --json needs none of it
+    from rich.table import Table
+
     drawn = Table(title=title, title_justify="left")
     for k, name in enumerate(columns):
         drawn.add_column(name, justify="left" if k == 0 else "right")
@@ -81,7 +83,32 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     return capture.get().rstrip()
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
+_HOMES = {
+    "cost": "cost",
+    "identify": "identify",
+    "whirl": "whirl",
+    "criterion": "criterion",
+    "modes": "modes",
+    "new": "commands",
+    "optimize": "commands",
+    "simulate": "commands",
+}
+"""The module of `jaxvib.cli` that holds each command."""
+
+
+class _Lazy(click.Group):
+    """Commands whose modules are imported when they are called, or when help lists them all."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(_HOMES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name in _HOMES:
+            importlib.import_module(f"jaxvib.cli.{_HOMES[cmd_name]}")
+        return super().get_command(ctx, cmd_name)
+
+
+@click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
 @click.version_option(package_name="jaxvib")
 def app() -> None:
     """Simulate and design vibration machines that work on the Sommerfeld effect.
@@ -107,8 +134,6 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 def run(arguments: list[str]) -> int:
     """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
-    from jaxvib.cli import commands, criterion, identify, modes, whirl  # noqa: F401 - registers the commands
-
     wants_json = "--json" in arguments
     try:
         app.main(args=arguments, prog_name="jaxvib", standalone_mode=False)

@@ -4,32 +4,31 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.study import measurement
-from optimize import Outcome, Synthesis, load_design, synthesize
-from optimize.files import TEMPLATE
-from optimize.synthesize import wanted
+from jaxvib.machine.units import number
 
-_FILES = {"design": TEMPLATE, "measurement": measurement.TEMPLATE}
-"""The files besides scenes that a command reads."""
+if TYPE_CHECKING:
+    from optimize import Outcome, Synthesis
 
 
 @app.command("new")
-@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), *_FILES]))
+@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement"]))
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of that KIND of machine, a design file, or a measurement file for `identify`."""
-    text = _FILES[kind] if kind in _FILES else TEMPLATES[kind.replace("-", "_")]
-    path = output.file(f"{kind}.toml" if kind in _FILES else "machine.toml")
+    from jaxvib.study.measurement import TEMPLATE as MEASUREMENT
+    from optimize.files import TEMPLATE as DESIGN
+
+    files = {"design": DESIGN, "measurement": MEASUREMENT}
+    text = files[kind] if kind in files else TEMPLATES[kind.replace("-", "_")]
+    path = output.file(f"{kind}.toml" if kind in files else "machine.toml")
     if path is None:
         output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
         return
@@ -47,7 +46,8 @@ def new(kind: str, output: Output) -> None:
 )
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
-@click.option("--tolerance", type=float, default=1e-8, show_default=True, help="Error a step may make.")
+@click.option("--tolerance", type=float, help="Error a step may make [1e-8].")
+@click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Fail after so many steps.")
 @click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
 @shared
@@ -57,22 +57,25 @@ def simulate(
     start: Any,
     mode: int | None,
     spin_up: str | None,
-    tolerance: float,
+    tolerance: float | None,
+    accuracy: float | None,
     max_steps: int | None,
     window: bool,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    loaded = jv.load_scene(scene)
     run = jv.simulate(
-        jv.load_scene(scene),
+        loaded,
         until,
         start=start,
         mode=mode,
         spin_up=spin_up,
         tolerance=tolerance,
+        accuracy=accuracy,
         max_steps=max_steps,
         save="window" if window else "all",
-        progress=sys.stderr.isatty(),
+        progress=sys.stderr.isatty() and _long(loaded, until),
     )
     picture, data = output.file("history.png"), output.file("run.npz")
     if picture is not None and data is not None:
@@ -92,8 +95,16 @@ def simulate(
         "settled": bool(run.settled),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
+        "error": float(run.error),
+        "evaluations": int(run.evaluations),
+        "seconds": float(run.seconds),
     }
     output.done(document, run.summary, "simulate")
+
+
+def _long(scene: jv.Scene, until: str) -> bool:
+    """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
+    return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
 
 
 def _regime(found: jv.Regime) -> dict[str, Any]:
@@ -120,6 +131,11 @@ def _regime(found: jv.Regime) -> dict[str, Any]:
 @shared
 def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool, output: Output) -> None:
     """Search the machine that DESIGN asks for; --out keeps its scene file, the pictures and the motion it was checked by."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from optimize import load_design, synthesize
+
     loaded = load_design(design)
     given = {"starts": starts, "seed": seed}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
@@ -166,6 +182,8 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
 
 
 def _outcomes(best: Synthesis) -> str:
+    from optimize.synthesize import wanted
+
     columns: list[tuple[str, Outcome]] = [("before", best.before), ("after", best.after)]
     if best.verified is not None:
         columns.append(("verified", best.verified))

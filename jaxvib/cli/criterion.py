@@ -12,8 +12,6 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.draw.criterion import pull_chart
-from jaxvib.draw.style import panels
 
 _RPM = 30.0 / np.pi
 
@@ -35,6 +33,9 @@ def criterion(scene: Path, check: bool, output: Output) -> None:
         document["exact_up_to"] = top
     picture = output.file("criterion.png")
     if picture is not None:
+        from jaxvib.draw.criterion import pull_chart
+        from jaxvib.draw.style import panels
+
         crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: jv.criterion_functional(loaded, w))(jnp.asarray(speeds))

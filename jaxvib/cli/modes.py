@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import jax
 import numpy as np
 
 import jaxvib as jv
@@ -36,7 +37,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
     if phases or loaded.machine.carrier().axes != (1,):
         _phases(loaded, output)
         return
-    found = jv.jam_modes(loaded)
+    found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
     picture = output.file("branches.png")
     if picture is not None:
         jv.branches(loaded).plot(unit=unit).savefig(picture)

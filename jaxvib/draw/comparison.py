@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["convergence_chart", "stability_chart", "tiers_chart"]
+__all__ = ["convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
 
 
 def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray) -> Figure:
@@ -23,6 +23,29 @@ def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable:
     axes.set_xlabel("mass of a load, kg")
     axes.set_ylabel("leading order against exact, relative")
     axes.legend()
+    return figure
+
+
+def cost_chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], floor: float, quantity: str) -> Figure:
+    """Relative error over seconds, a line of (seconds, error) for each name; below `floor` the reference itself may be wrong.
+
+    >>> figure = cost_chart({"exact": (np.array([1e-3, 2e-3]), np.array([1e-4, 1e-8]))}, 1e-9, "amplitude")
+    >>> figure.axes[0].get_ylabel()
+    'relative error of amplitude'
+    """
+    figure, (axes,) = panels(1, size=(7.5, 4.5))
+    for k, (name, (seconds, error)) in enumerate(lines.items()):
+        there = np.isfinite(error)
+        shape = "os^Dv*P"[k % 7]
+        axes.loglog(
+            seconds[there], np.maximum(error[there], 1e-16), f"{shape}-", color=COLORS[k % len(COLORS)], ms=5, label=name
+        )
+    axes.axhspan(1e-17, max(floor, 1e-17), color="#eeeeee", label="the reference's own error")
+    errors = np.concatenate([error[np.isfinite(error)] for _, error in lines.values()])
+    axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([*errors, 1e-2]))
+    axes.set_xlabel("seconds, once compiled")
+    axes.set_ylabel(f"relative error of {quantity}")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
@@ -190,6 +189,8 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
 
 def scene_to_toml(scene: Scene) -> str:
     """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit."""
+    import tomli_w  # only where a file is written
+
     tables: dict[str, Any] = {}
     for name, kinds in _SECTIONS.items():
         part = getattr(scene, name)

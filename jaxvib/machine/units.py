@@ -162,12 +162,16 @@ def numbers(
         if not all(isinstance(part, jax.Array) for part in parts):
             for i, part in enumerate(parts):
                 _array(part, unit, f"{field}[{i}]", (), low, open_low)
-        stacked = jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
+        known = not any(isinstance(part, jax.Array) for part in parts)
+        stacked = np.asarray(parts, dtype=float) if known else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
         return _array(stacked, unit, field, stacked.shape, low, open_low)
     magnitude = to_float(value, unit, field)
     if np.ndim(magnitude) == 0:
         scalar = _array(magnitude, unit, field, (), low, open_low)
-        return scalar if shared or length is None else jnp.broadcast_to(scalar, (length,))
+        if shared or length is None:
+            return scalar
+        known = not isinstance(magnitude, jax.Array)
+        return jnp.asarray(np.full(length, magnitude), dtype=float) if known else jnp.broadcast_to(scalar, (length,))
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
         raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
     return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)
@@ -175,7 +179,8 @@ def numbers(
 
 def _array(value: Any, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
     try:
-        array = jnp.asarray(value, dtype=float)
+        # What JAX does not hold yet NumPy converts: no program need be compiled for it.
+        array = jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype=float), dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}") from error
     if array.shape != shape:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
-from rich.console import Console
-from rich.progress import Progress
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 __all__ = ["ProgressBar"]
 
@@ -18,6 +19,9 @@ _open: list[Progress] = []
 
 def _show(fraction: Array) -> None:
     if not _open:
+        from rich.console import Console
+        from rich.progress import Progress
+
         bar = Progress(console=Console(stderr=True), transient=True)
         bar.add_task("simulating", total=1.0)
         bar.start()

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.charts import time_histories
 from jaxvib.errors import InputError
+from jaxvib.machine.drive import Motor
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State
@@ -36,6 +36,7 @@ class RunStatus(eqx.Enumeration):
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
+    not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
     no_start = "the state to start from does not exist or is not finite"
 
 
@@ -44,14 +45,24 @@ class Run(Measured):
 
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
-    were `rejected`; `scene` that ran.
+    were `rejected`; `evaluations` of the vector field (0 where the method does not say); `seconds` it took, compiling
+    included where the program was new, NaN under a JAX transformation; `error` estimated, NaN where none was asked for; `scene`
+    that ran.
+
+    The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles
+    in rad, speeds of loads relative to the rotor's. It is what is left of the difference to a run with larger steps, of which
+    not all is counted on to vanish with smaller ones. A motion that forgets its phase has a large error and may have exact
+    amplitudes all the same.
     """
 
     status: RunStatus
     trajectory: Trajectory | None
     window: Trajectory
+    error: Array
     steps: Array
     rejected: Array
+    evaluations: Array
+    seconds: Array
     scene: Scene
 
     @property
@@ -70,6 +81,7 @@ class Run(Measured):
             [
                 f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
+                f"  estimated error {float(self.error):.1e}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
                 f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
@@ -90,6 +102,8 @@ class Run(Measured):
 
         **Returns** a matplotlib figure.
         """
+        from jaxvib.draw.charts import time_histories  # slow to import: only who draws pays
+
         kept = self._kept()
         return time_histories(
             np.asarray(kept.time),
@@ -133,6 +147,7 @@ class Run(Measured):
                 "omega": float(self.omega),
                 "amplitude": np.asarray(self.amplitude).tolist(),
                 "foundation_force_amplitude": float(self.foundation_force),
+                "error": float(self.error),
                 "steps": int(self.steps),
             },
         )
@@ -161,9 +176,10 @@ class Run(Measured):
                 kept_all = bool(archive["kept_all"])
                 leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
                 zero = jnp.zeros(())
-                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,)), zero, zero)
+                rotor = (zero, zero) if isinstance(scene.drive, Motor) else None
+                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,), rotor), zero, zero)
                 kept = motion if kept_all else None
-                shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, scene)
+                shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, zero, zero, zero, scene)
                 dynamic, static = eqx.partition(shape, eqx.is_array)
                 return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)
         except FileNotFoundError as error:

@@ -62,7 +62,7 @@ def settle(
     slowest = float(jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
     state = start if isinstance(start, State) else initial_state(scene, start, mode=mode, angles=_parted(scene, start))
     stretch = 2.0 * math.pi * periods / slowest
-    run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, throw=throw)
+    run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
     for _ in range(count(stretches, "stretches") - 1):
         if float(run.drift) < drift:
             break
@@ -70,7 +70,7 @@ def settle(
         # Only where the loads are within a turn matters; kept small, an angle keeps its digits.
         turns = jnp.floor(state.angle[0] / (2.0 * jnp.pi))
         state = State(state.displacement, state.velocity, (state.angle[0] - 2.0 * jnp.pi * turns,), state.rate)
-        run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, throw=throw)
+        run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
     if throw and not float(run.drift) < drift:
         raise ComputationError(
             "not_settled",

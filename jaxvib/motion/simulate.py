@@ -3,89 +3,38 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+import time
+from collections.abc import Callable
+from typing import Any, Literal, cast
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed, IdealDrive, Motor, SpinUp
+from jaxvib.machine.drive import ConstantSpeed, Motor, SpinUp
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
-from jaxvib.motion.dynamics import Dynamics, State, vector_field
-from jaxvib.motion.observables import measure, trajectory
-from jaxvib.motion.progress import ProgressBar
+from jaxvib.motion.dynamics import State
+from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, initial_state
-from jaxvib.steady.response import natural_frequencies
 
 __all__ = ["enough_steps", "simulate"]
 
-_WINDOW = 4096
-"""Samples in the window over which amplitudes and speeds are measured."""
-
-_PER_TURN = 16
-"""Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
-
 _MOST_STEPS = 2**31 - 1
 
+_COARSER = 100.0
+"""The run whose difference to the run itself is its error estimate makes steps to so many times the tolerance."""
 
-class _Tolerance(diffrax.AbstractAdaptiveStepSizeController):
-    """A step size controller that measures every part of the state in its own unit, and angles absolutely.
+_ATTEMPTS = 6
+"""Runs that an `accuracy` may take before it is given up."""
 
-    An angle grows without end; an error relative to it would let a long run lose its phase.
-    """
-
-    inner: diffrax.AbstractStepSizeController
-    unit: State
-    rtol: Any
-    atol: Any
-    norm: Any = optimistix.rms_norm
-
-    def wrap(self, direction: Any) -> _Tolerance:
-        return eqx.tree_at(lambda c: c.inner, self, self.inner.wrap(direction))
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
-        return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
-
-    def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
-        def scaled(y: State) -> State:
-            return jax.tree.map(lambda leaf, unit: leaf / unit, y, self.unit)
-
-        def absolute(y: State) -> State:
-            y = scaled(y)
-            rotor = None if y.rotor is None else (jnp.zeros_like(y.rotor[0]), y.rotor[1])
-            return State(y.displacement, y.velocity, jax.tree.map(jnp.zeros_like, y.angle), y.rate, rotor)
-
-        return self.inner.adapt_step_size(
-            t0, t1, absolute(y0), absolute(y1_candidate), args, scaled(y_error), error_order, controller_state
-        )
-
-
-def _units(scene: Scene) -> State:
-    """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
-    carrier, loads = scene.machine.carrier(), scene.loads
-    throw = jnp.mean(loads.mass) * jnp.sqrt(sum(jnp.mean(jnp.square(x)) for x in loads.position(jnp.zeros(loads.count))))
-    length = loads.count * throw / jnp.mean(jnp.diagonal(carrier.mass))
-    speed = scene.drive.speed
-    one = jnp.ones_like(speed)
-    rotor = (one, speed) if isinstance(scene.drive, Motor) else None
-    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
+_STRETCH = 2.0e4
+"""Turns after which single precision no longer resolves time; longer runs are cut into stretches."""
 
 
 def simulate(
@@ -98,7 +47,10 @@ def simulate(
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
     turns: int = 20,
-    tolerance: float = 1e-8,
+    tolerance: float | None = None,
+    accuracy: float | None = None,
+    steps: int | None = None,
+    estimate: bool | None = None,
     solver: diffrax.AbstractSolver | None = None,
     controller: diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -118,14 +70,22 @@ def simulate(
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
       and 256 turns of the rotor)
     - `tolerance`: error a step may make, relative, and absolute in natural units: the throw S/M of the loads for
-      displacements, that times the rotor's speed for velocities, 1 rad for angles, whose error is never relative
-    - `solver`, `controller`, `adjoint`: diffrax's, passed through; Tsit5, a PI controller to `tolerance`, and checkpointed
-      reverse mode unless said otherwise. For forward mode give `diffrax.ForwardMode()`
+      displacements, that times the rotor's speed for velocities, 1 rad for angles, whose error is never relative (1e-8 unless
+      said otherwise, in single precision 1e-5)
+    - `accuracy`: in place of a tolerance, the `error` the result may have; runs are repeated with smaller tolerances until
+      their estimated error is below it, 6 of them at most, or the run says `not_accurate`
+    - `steps`: in place of a tolerance, so many equal steps
+    - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
+      unless said otherwise it is where numbers are known, and not under a JAX transformation
+    - `solver`, `controller`, `adjoint`: diffrax's, passed through; `WrittenOut`, a PI controller to `tolerance`, and
+      checkpointed reverse mode unless said otherwise. For forward mode give `diffrax.ForwardMode()`
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
     - `progress`: shows a bar on the error stream
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
 
-    **Returns** `Run`. Gradients, forward and reverse, go through all of it; `jit` and `vmap` too.
+    **Returns** `Run`, which carries its estimated `error` and its cost. Gradients, forward and reverse, go through all of it;
+    `jit` and `vmap` too. In single precision angles are kept within a turn while time is integrated, and runs of more than
+    20,000 turns under a constant speed that keep a window only are cut into stretches, so that they do not lose phase.
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
@@ -137,7 +97,7 @@ def simulate(
     >>> bool(run.settled), round(float(run.omega), 2)      # caught just below the resonance at 28.1 rad/s
     (True, 27.41)
 
-    Source: the antiphase paper, section 5.3; the method is an embedded Runge-Kutta pair, see diffrax.
+    Source: the antiphase paper, section 5.3; for the method `WrittenOut`.
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
@@ -146,13 +106,7 @@ def simulate(
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
-    precision = float(jnp.finfo(end.dtype).eps)
-    if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
-        raise InputError(
-            "tolerance",
-            f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and less than 1"
-            + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
-        )
+    control = _control(end, tolerance, accuracy, steps, controller)
     if spin_up is not None and start != "spin_up":
         raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
     if isinstance(start, str) and start == "spin_up":
@@ -167,34 +121,167 @@ def simulate(
     state = _whole(scene, start) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
         max_steps = enough_steps(scene, end)
-    if controller is None:
-        steps = diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
-        controller = _Tolerance(inner=_on_kinks(scene, steps), unit=_units(scene), rtol=tolerance, atol=tolerance)
+
+    def run(control: StepControl) -> Run:
+        chosen = control if controller is None else controller
+        kept = samples if save == "all" else 0
+        allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
+        way = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+        stretches = _stretches(scene, end, state, save)
+        if stretches > 1:
+            return _in_stretches(scene, end / stretches, stretches, state, solver, chosen, way, turns, allowed)
+        begun = time.perf_counter()
+        found = integrate(scene, end, state, solver, chosen, way, kept, turns, allowed, progress)
+        if traced(found.steps):
+            return found
+        jax.block_until_ready(found.steps)
+        return _with(found, seconds=time.perf_counter() - begun)
+
+    known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
+    if accuracy is not None:
+        if not known:
+            raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a tolerance")
+        found = _to_accuracy(scene, run, control, accuracy)
+    elif controller is not None or not (known if estimate is None else estimate):
+        found = run(control)
     else:
-        controller = _on_kinks(scene, controller)
-    run = _run(
-        scene,
-        end,
-        state,
-        diffrax.Tsit5() if solver is None else solver,
-        controller,
-        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-        samples if save == "all" else 0,
-        turns,
-        min(count(max_steps, "max_steps"), _MOST_STEPS),
-        progress,
-    )
-    if throw and not traced(run.steps):
-        _raise_if_failed(run, max_steps)
-    return run
+        coarse = run(_coarser(control))
+        found = run(control)
+        found = _with(found, error=_difference(scene, found, coarse) * _shrink(control, _coarser(control)))
+    if throw and not traced(found.steps):
+        _raise_if_failed(found, max_steps, accuracy)
+    return found
 
 
-def _on_kinks(scene: Scene, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractStepSizeController:
-    """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
-    kinks = scene.drive.kinks() if isinstance(scene.drive, IdealDrive) else ()
-    if not kinks or not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        return controller
-    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(kinks)))
+def _control(end: Array, tolerance: Any, accuracy: Any, steps: Any, controller: Any) -> StepControl:
+    """What was asked for, checked: at most one of the ways to choose steps, and none the dtype cannot deliver."""
+    given = {"tolerance": tolerance, "accuracy": accuracy, "steps": steps, "controller": controller}
+    named = [name for name, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise InputError(named[1], f"is given together with {named[0]}; give one of them")
+    precision = float(jnp.finfo(end.dtype).eps)
+    for name, value, low in (("tolerance", tolerance, 10.0 * precision), ("accuracy", accuracy, 1e3 * precision)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value < 1.0):
+            raise InputError(
+                name,
+                f"is {value!r}; in {end.dtype} it must be at least {low:.1g} and less than 1"
+                + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
+            )
+    if steps is not None:
+        return StepControl(steps=jnp.asarray(count(steps, "steps"), end.dtype))
+    if accuracy is not None:
+        tolerance = max(1e-2 * accuracy, 10.0 * precision)
+    if tolerance is None:
+        tolerance = 1e-8 if precision < 1e-10 else 1e-5
+    return StepControl(tolerance=jnp.asarray(tolerance, end.dtype))
+
+
+def _coarser(control: StepControl) -> StepControl:
+    if control.steps is not None:
+        return StepControl(steps=jnp.ceil(control.steps / 2.0))
+    assert control.tolerance is not None
+    return StepControl(tolerance=jnp.minimum(_COARSER * control.tolerance, 0.1))
+
+
+def _shrink(fine: StepControl, coarse: StepControl) -> Array:
+    """What share of the difference between two runs is the error of the finer one: for a method of order 8 the error falls with
+    the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.6 and 3, so that the estimate errs upward."""
+    if fine.steps is not None and coarse.steps is not None:
+        return (coarse.steps / fine.steps) ** 3
+    assert fine.tolerance is not None and coarse.tolerance is not None
+    return (fine.tolerance / coarse.tolerance) ** 0.6
+
+
+def _difference(scene: Scene, fine: Run, coarse: Run) -> Array:
+    """How far two runs are apart over the window at their end: displacements and velocities relative to the largest, angles in
+    rad, speeds relative to the rotor's."""
+    xp = jnp if traced(fine.steps) else np
+    a, b = fine.window.state, coarse.window.state
+    unit, speed = natural_units(scene), xp.asarray(scene.drive.speed)
+
+    def apart(x: Any, y: Any, scale: Any) -> Any:
+        return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / scale
+
+    parts = [
+        apart(a.displacement, b.displacement, xp.maximum(xp.max(xp.abs(xp.asarray(a.displacement))), unit.displacement)),
+        apart(a.velocity, b.velocity, xp.maximum(xp.max(xp.abs(xp.asarray(a.velocity))), unit.velocity)),
+        *(apart(x, y, 1.0) for x, y in zip(a.angle, b.angle, strict=True)),
+        *(apart(x, y, speed) for x, y in zip(a.rate, b.rate, strict=True)),
+    ]
+    if a.rotor is not None and b.rotor is not None:
+        parts += [apart(a.rotor[0], b.rotor[0], 1.0), apart(a.rotor[1], b.rotor[1], speed)]
+    return jnp.asarray(xp.max(xp.stack(parts)), fine.error.dtype)
+
+
+def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
+    """Runs with ever smaller tolerances until the estimated error is small enough."""
+    floor = 10.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+    before, coarse = run(_coarser(control)), _coarser(control)
+    found = before
+    for _ in range(_ATTEMPTS - 1):
+        found = run(control)
+        if not bool(found.status == RunStatus.done):
+            return found
+        found = _with(found, error=_difference(scene, found, before) * _shrink(control, coarse))
+        tolerance = float(cast(Array, control.tolerance))
+        if float(found.error) <= accuracy:
+            return found
+        if tolerance <= floor:
+            break
+        # A little more than what is missing, for the error shrinks a little slower than the tolerance.
+        share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
+        before, coarse = found, control
+        control = StepControl(tolerance=jnp.asarray(max(share * tolerance, floor), found.error.dtype))
+    return eqx.tree_at(lambda r: r.status, found, RunStatus.not_accurate)
+
+
+def _with(run: Run, **values: Any) -> Run:
+    names = list(values)
+    new = [jnp.asarray(values[name], run.error.dtype) for name in names]
+    return eqx.tree_at(lambda r: [getattr(r, name) for name in names], run, new)
+
+
+def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
+    """Into how many stretches a run is cut: more than one in single precision, where time would lose its digits."""
+    if state.displacement.dtype.itemsize >= 8 or save != "window" or not isinstance(scene.drive, ConstantSpeed):
+        return 1
+    turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
+    return 1 if traced(turns) else max(1, math.ceil(float(turns) / _STRETCH))
+
+
+def _in_stretches(
+    scene: Scene,
+    length: Array,
+    number: int,
+    state: State,
+    solver: Any,
+    controller: Any,
+    adjoint: Any,
+    turns: int,
+    max_steps: int,
+) -> Run:
+    """The run of the last of several stretches, each starting at time 0 with angles within a turn."""
+    begun = time.perf_counter()
+    if isinstance(controller, StepControl) and controller.steps is not None:
+        controller = StepControl(steps=jnp.ceil(controller.steps / number))
+    _, together = wraps(scene, length.dtype)
+    taken, rejected, evaluations = 0, 0, 0
+    found = None
+    for _ in range(number):
+        found = integrate(scene, length, state, solver, controller, adjoint, 0, turns, max_steps, False)
+        last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), found.window.state)
+        first = np.ravel(last.angle[0])[0]
+        inside = tuple(np.asarray(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi))) for x in last.angle)
+        state = jax.tree.map(jnp.asarray, eqx.tree_at(lambda y: y.angle, last, inside))
+        taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
+        evaluations += int(found.evaluations)
+        if not bool(found.status == RunStatus.done):
+            break
+    assert found is not None
+    counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
+    found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
+    found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
+    return _with(found, seconds=time.perf_counter() - begun)
 
 
 def _whole(scene: Scene, state: State) -> State:
@@ -214,14 +301,13 @@ def _whole(scene: Scene, state: State) -> State:
 
 def _enough_samples(scene: Scene, end: Array) -> int:
     """So many that a picture shows the vibration and no beat of it with the samples; a power of 2: few compilations."""
-    wanted = _PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
+    wanted = PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
     return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(min(max(float(wanted), 2000.0), 2.0**18)))
 
 
 def enough_steps(scene: Scene, end: Array) -> int:
     """500 steps for each turn of what moves fastest, rounded up to a power of 2 so that few numbers need few compilations."""
-    fastest = jnp.maximum(scene.drive.speed, jnp.max(natural_frequencies(scene)))
-    turns = end * fastest / (2.0 * jnp.pi)
+    turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
     if traced(turns):
         return 2**20
     steps = 4096 + 500 * float(turns)
@@ -230,78 +316,10 @@ def enough_steps(scene: Scene, end: Array) -> int:
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
 
-@eqx.filter_jit
-def _run(
-    scene: Scene,
-    end: Array,
-    state: State,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractStepSizeController,
-    adjoint: diffrax.AbstractAdjoint,
-    samples: int,
-    turns: int,
-    max_steps: int,
-    progress: bool,
-) -> Run:
-    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
-    exists = _finite(state)
-    state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
-    field = vector_field(scene)
-    frequencies = natural_frequencies(jax.lax.stop_gradient(scene))
-    slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, jax.lax.stop_gradient(scene.drive.speed)))
-    longest = 2.0 * jnp.pi * _WINDOW / (_PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
-    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, _WINDOW))]
-    if samples:
-        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
-    fastest = jnp.maximum(jax.lax.stop_gradient(scene.drive.speed), jnp.max(frequencies))
-
-    def term(t: Any, y: State, args: Dynamics) -> State:
-        return args(t, y)
-
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(term),
-        solver,
-        t0=jnp.zeros_like(end),
-        t1=end,
-        dt0=0.05 / fastest,
-        y0=state,
-        args=field,
-        saveat=diffrax.SaveAt(subs=saves),
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=ProgressBar() if progress else diffrax.NoProgressMeter(),
-    )
-    assert solution.ts is not None and solution.ys is not None
-    times, states = solution.ts[0], solution.ys[0]
-    measured = measure(scene, field, times, states)
-    finished = solution.result == diffrax.RESULTS.successful
-    status = RunStatus.where(
-        finished, RunStatus.where(_finite(states), RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached
-    )
-    status = RunStatus.where(exists, status, RunStatus.no_start)
-    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), measured)
-    return Run(
-        status=status,
-        trajectory=trajectory(scene, solution.ts[1], solution.ys[1]) if samples else None,
-        window=trajectory(scene, times, states),
-        **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
-        steps=solution.stats["num_steps"],
-        rejected=solution.stats["num_rejected_steps"],
-        scene=scene,
-    )
-
-
-def _finite(state: State) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
-
-
-def _raise_if_failed(run: Run, max_steps: int) -> None:
+def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
     if bool(run.status == RunStatus.done):
         return
-    names = ("max_steps_reached", "not_finite", "no_start")
+    names = ("max_steps_reached", "not_finite", "no_start", "not_accurate")
     name = next(name for name in names if bool(run.status == getattr(RunStatus, name)))
     reached = np.asarray(run.window.time)
     reached = reached[np.isfinite(reached)]
@@ -309,4 +327,6 @@ def _raise_if_failed(run: Run, max_steps: int) -> None:
     hint = f"{run.message}{where}"
     if name == "max_steps_reached":
         hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
+    if name == "not_accurate":
+        hint += f" ({float(run.error):.1e}, asked for {accuracy:.1e}); give a larger accuracy, or a shorter run"
     raise ComputationError(name, hint)

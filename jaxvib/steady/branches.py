@@ -14,12 +14,13 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
-from jaxvib.steady.diagram import ExactBranches, exact_branches
 from jaxvib.steady.jam import Folds, Jam, branch_points, fold_points
 from jaxvib.steady.picture import picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from jaxvib.steady.diagram import ExactBranches
 
 __all__ = ["Branches", "branches"]
 
@@ -98,6 +99,8 @@ def branches(
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
     if exact:
+        from jaxvib.steady.diagram import exact_branches  # needs the time integrator: only who asks pays
+
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
         raise InputError("least", "goes with exact=True only; light loads have a branch down to speed 0")

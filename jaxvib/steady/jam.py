@@ -14,6 +14,7 @@ from jax import Array
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import traced
+from jaxvib.programs import kept
 from jaxvib.steady.response import (
     _modes,
     circular_loads,
@@ -170,13 +171,13 @@ def jam_modes(scene: Scene) -> JamModes:
 
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
-    drag = circular_loads(scene).drag_sum()
-    if not traced(drag) and not float(drag) > 0.0:
+    drag = circular_loads(scene).drag
+    if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
     return _jam_modes(scene)
 
 
-@eqx.filter_jit
+@kept
 def _jam_modes(scene: Scene) -> JamModes:
     n = scene.drive.speed
     pieces = _pieces(scene)

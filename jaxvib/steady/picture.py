@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.charts import branch_diagram
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.response import natural_frequencies
@@ -42,6 +41,8 @@ def picture(
     """
     if unit not in ("rad/s", "rpm"):
         raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
+    from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
+
     at = float(branch.scene.drive.speed)
     top = 4.0 / 3.0 * at if most is None else most
     kinds = sorted({kind for kind, _, _ in marks})

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.draw.comparison import tiers_chart
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jam import Jam, jam_modes
 from jaxvib.steady.jam_orbit import jam_orbit
@@ -46,6 +45,8 @@ class Tiers(NamedTuple):
             "amplitude": np.max(np.abs(self.leading.amplitude / self.exact.amplitude - 1.0), axis=1),
             "foundation force": np.abs(self.leading.foundation_force / self.exact.foundation_force - 1.0),
         }
+        from jaxvib.draw.comparison import tiers_chart  # slow to import: only who draws pays
+
         return tiers_chart(self.mass, differences, self.exact.stable)
 
 

@@ -1,0 +1,213 @@
+"""A vector field and a state in the form in which they are integrated fastest: as single numbers, where there are few."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.motion.dynamics import Dynamics, State
+from jaxvib.motion.scalars import Unwritten, on_numbers, split
+
+__all__ = ["Motion", "Tolerance"]
+
+_TURN = 2.0 * math.pi
+
+_MOST_NUMBERS = 8
+"""Above so many numbers in a state, a step written out on each of them takes too long to compile for what it saves."""
+
+
+class Motion(eqx.Module):
+    """Translates between a `State` and what the integrator holds: a tuple of numbers, or the state itself where it is large.
+
+    Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
+    single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
+
+    **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
+    the same turns, so that their differences stay.
+
+    **Attributes**: `few` whether numbers are held; `args` the arguments of `term`.
+    """
+
+    args: Any
+    few: bool = eqx.field(static=True)
+    like: Any = eqx.field(static=True)
+    shapes: Any = eqx.field(static=True)
+    wrapped: bool = eqx.field(static=True)
+    together: bool = eqx.field(static=True)
+
+    def __init__(self, field: Dynamics, state: State, *, wrapped: bool = False, together: bool = False):
+        self.wrapped, self.together = wrapped, together
+        leaves, self.like = jax.tree.flatten(state)
+        self.shapes = tuple(leaf.shape for leaf in leaves)
+        self.few = sum(leaf.size for leaf in leaves) <= _MOST_NUMBERS
+        self.args = field
+        if self.few:
+            try:
+                on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
+            except Unwritten:
+                self.few = False
+        if self.few:
+            # Entry by entry already here, so that the time loop has no arrays to take apart.
+            self.args = (field, [[leaf[i] for i in np.ndindex(*leaf.shape)] for leaf in jax.tree.leaves(field)])
+
+    @property
+    def term(self) -> diffrax.ODETerm:
+        """The equations of motion on what the integrator holds."""
+        return diffrax.ODETerm(self._rates)
+
+    def held(self, state: State) -> Any:
+        """A state (or a tree like it) as the integrator holds it."""
+        y = _numbers(jax.tree.map(split, state)) if self.few else state
+        return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
+
+    def states(self, held: Any) -> tuple[State, State]:
+        """States along a leading axis, from what the integrator held then; and the same, angles counted from the first."""
+        if not self.wrapped:
+            state = self._state(held)
+            return state, state
+        y, turns = held
+        since = jax.tree.map(lambda n: n - n[:1], turns)
+        return self._state(self._turned(y, turns, 1.0)), self._state(self._turned(y, since, 1.0))
+
+    @property
+    def wrap(self) -> Callable[[Any], Any] | None:
+        """Takes whole turns out of the angles and counts them; None where angles are not wrapped."""
+        return self._wrap if self.wrapped else None
+
+    def _wrap(self, held: Any) -> Any:
+        y, turns = held
+        angles = self._angles(y)
+        first = jnp.ravel(angles[0])[0]
+        done = [
+            jnp.round((first if self.together and k < len(angles) - self._rotors else x) / _TURN) for k, x in enumerate(angles)
+        ]
+        done = [jnp.broadcast_to(n, x.shape) for n, x in zip(done, angles, strict=True)]
+        return self._turned(y, done, -1.0), [n + more for n, more in zip(turns, done, strict=True)]
+
+    @property
+    def _rotors(self) -> int:
+        return int(jax.tree.unflatten(self.like, self.shapes).rotor is not None)
+
+    def _places(self) -> list[int]:
+        """Where the angles are among the leaves of what is held."""
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])
+        numbered = jax.tree.unflatten(
+            self.like, [range(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
+        )
+        leaves = jax.tree.unflatten(self.like, range(len(self.shapes)))
+        chosen = numbered if self.few else jax.tree.map(lambda k: [k], leaves)
+        rotor = [] if chosen.rotor is None else [chosen.rotor[0]]
+        return [place for places in (*chosen.angle, *rotor) for place in places]
+
+    def _angles(self, y: Any) -> list[Array]:
+        leaves = jax.tree.leaves(y)
+        return [leaves[place] for place in self._places()]
+
+    def _turned(self, y: Any, turns: list[Array], sign: float) -> Any:
+        """Angles changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
+        leaves, rest = jax.tree.flatten(y)
+        for place, n in zip(self._places(), turns, strict=True):
+            high = np.asarray(_TURN, leaves[place].dtype)
+            low = np.asarray(_TURN - float(high), leaves[place].dtype)
+            leaves[place] = (leaves[place] + sign * n * high) + sign * n * low
+        return jax.tree.unflatten(rest, leaves)
+
+    def _state(self, y: Any) -> State:
+        if not self.few:
+            return y
+        rows = iter(y)
+        parts = []
+        for shape in self.shapes:
+            entries = [next(rows) for _ in np.ndindex(*shape)]
+            parts.append(jnp.stack(entries, axis=-1).reshape(*entries[0].shape, *shape))
+        return jax.tree.unflatten(self.like, parts)
+
+    def _rates(self, t: Any, y: Any, args: Any) -> Any:
+        if self.wrapped:
+            y, turns = y
+            return self._plain_rates(t, y, args), jax.tree.map(jnp.zeros_like, turns)
+        return self._plain_rates(t, y, args)
+
+    def _plain_rates(self, t: Any, y: Any, args: Any) -> Any:
+        if not self.few:
+            return args(t, y)
+        field, numbers = args
+        leaves, rest = jax.tree.flatten(field)
+        cells = jax.tree.unflatten(rest, [_arranged(n, leaf.shape) for n, leaf in zip(numbers, leaves, strict=True)])
+        rows = iter(y)
+        state = jax.tree.unflatten(self.like, [_arranged([next(rows) for _ in np.ndindex(*s)], s) for s in self.shapes])
+        dtype = y[0].dtype
+        like = jax.tree.map(lambda c: jax.ShapeDtypeStruct(c.shape, dtype), state, is_leaf=_is_cells)
+        written = on_numbers(lambda t, y, f: f(t, y), jax.ShapeDtypeStruct((), dtype), like, field)
+        return tuple(jnp.asarray(x, dtype) for x in _numbers(written(_arranged([jnp.asarray(t, dtype)], ()), state, cells)))
+
+
+def _is_cells(x: Any) -> bool:
+    return isinstance(x, np.ndarray)
+
+
+def _numbers(cells: Any) -> tuple[Any, ...]:
+    return tuple(leaf[i] for leaf in jax.tree.leaves(cells, is_leaf=_is_cells) for i in np.ndindex(*leaf.shape))
+
+
+def _arranged(entries: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    cells = np.empty(shape, dtype=object)
+    for index, entry in zip(np.ndindex(*shape), entries, strict=True):
+        cells[index] = entry
+    return cells
+
+
+class Tolerance(diffrax.AbstractStepSizeController):
+    """Chooses steps whose error, in each part of the state's own unit, stays below a tolerance.
+
+        e = max |error| / (tolerance (unit + relative |y|)),    next step = 0.9 e_before^(1/16) / e^(3/32) times this one
+
+    a PI controller for a method of order 8, its powers made of square roots. A step with e > 1 is taken again.
+    An angle grows without end; an error relative to it would let a long run lose its phase: `relative` is 0 there.
+
+    **Attributes**: `tolerance` scalar; `unit`, `relative` trees like the integrator's state.
+    """
+
+    tolerance: Array
+    unit: Any
+    relative: Any
+
+    def wrap(self, direction: Any) -> Tolerance:
+        """Time runs forward only."""
+        return self
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+        """The first step ends at t0 + dt0."""
+        return t0 + dt0, jnp.ones_like(self.tolerance)
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
+    ) -> Any:
+        """Whether the step is kept, and where the next one ends."""
+
+        def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
+            size = self.tolerance * (unit + relative * jnp.maximum(jnp.abs(a), jnp.abs(b)))
+            return jnp.max(jnp.abs(error) / size)
+
+        ratios = jax.tree.leaves(jax.tree.map(ratio, y_error, y0, y1_candidate, self.unit, self.relative))
+        e = ratios[0]
+        for other in ratios[1:]:
+            e = jnp.maximum(e, other)
+        e = jax.lax.stop_gradient(jnp.clip(e, 1e-8, 1e8))
+        root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
+        keep = e <= 1.0
+        cube = root * root * root
+        factor = 0.9 * jnp.where(keep, controller_state * controller_state, 1.0 / root) / cube
+        factor = jnp.clip(factor, 0.2, jnp.where(keep, 5.0, 0.9))
+        start = jnp.where(keep, t1, t0)
+        end = start + factor * (t1 - t0)
+        before = jnp.where(keep, root, controller_state)
+        return keep, start, end, False, before, diffrax.RESULTS.successful

@@ -1,0 +1,174 @@
+"""One time integration, compiled: what `simulate` and ensembles call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.contact import LoadContact
+from jaxvib.machine.drive import IdealDrive, Motor
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.dynamics import State, vector_field
+from jaxvib.motion.engine import Motion, Tolerance
+from jaxvib.motion.observables import measure, trajectory
+from jaxvib.motion.progress import ProgressBar
+from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.solver import WrittenOut
+from jaxvib.programs import kept
+from jaxvib.steady.response import natural_frequencies
+
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
+
+WINDOW = 4096
+"""Samples in the window over which amplitudes and speeds are measured."""
+
+PER_TURN = 16
+"""Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
+
+
+class StepControl(eqx.Module):
+    """How steps are chosen: to `tolerance`, or so many of them, all equal, if `steps` is given (a scalar each)."""
+
+    tolerance: Array | None = None
+    steps: Array | None = None
+
+
+def natural_units(scene: Scene) -> State:
+    """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
+    carrier, loads = scene.machine.carrier(), scene.loads
+    throw = jnp.mean(loads.mass) * jnp.sqrt(sum(jnp.mean(jnp.square(x)) for x in loads.position(jnp.zeros(loads.count))))
+    length = loads.count * throw / jnp.mean(jnp.diagonal(carrier.mass))
+    speed = scene.drive.speed
+    one = jnp.ones_like(speed)
+    rotor = (one, speed) if isinstance(scene.drive, Motor) else None
+    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
+
+
+def _controller(scene: Scene, motion: Motion, state: State, control: StepControl) -> diffrax.AbstractStepSizeController:
+    if control.steps is not None:
+        return diffrax.ConstantStepSize()
+    assert control.tolerance is not None
+    natural = natural_units(scene)
+    # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
+    rotor = None if state.rotor is None else (jnp.zeros(()), jnp.ones(()))
+    relative = State(jnp.ones(()), jnp.ones(()), (jnp.zeros(()),) * len(state.angle), (jnp.ones(()),) * len(state.rate), rotor)
+    angles, rates = natural.angle * len(state.angle), natural.rate * len(state.rate)
+    unit = State(natural.displacement, natural.velocity, angles, rates, natural.rotor)
+    dtype = state.displacement.dtype
+
+    def spread(tree: State) -> State:
+        return jax.tree.map(lambda value, leaf: jnp.full(leaf.shape, value, dtype), tree, state)
+
+    tolerance = jnp.asarray(control.tolerance, dtype)
+    units = motion.held(spread(unit))
+    if motion.wrapped:  # the count of turns has no error, and any unit
+        units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
+    return Tolerance(tolerance, units, motion.held(spread(relative)))
+
+
+def on_kinks(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
+    """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
+    kinks = scene.drive.kinks() if isinstance(scene.drive, IdealDrive) else ()
+    if not kinks or isinstance(controller, diffrax.ConstantStepSize):
+        return controller
+    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(kinks)))
+
+
+@kept
+def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
+    """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count."""
+    scene = jax.lax.stop_gradient(scene)
+    frequencies, speed = natural_frequencies(scene), scene.drive.speed
+    return jnp.maximum(speed, jnp.max(frequencies)), jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
+
+
+def wraps(scene: Scene, dtype: Any) -> tuple[bool, bool]:
+    """Whether angles are kept within a turn, and all loads' by the same turns: single precision, loads that touch."""
+    return jnp.dtype(dtype).itemsize < 8, any(isinstance(effect, LoadContact) for effect in scene.effects)
+
+
+@kept
+def integrate(
+    scene: Scene,
+    end: Array,
+    state: State,
+    solver: diffrax.AbstractSolver | None,
+    controller: diffrax.AbstractStepSizeController | StepControl,
+    adjoint: diffrax.AbstractAdjoint,
+    samples: int,
+    turns: int,
+    max_steps: int,
+    progress: bool,
+) -> Run:
+    """A run from 0 to `end`, measured over a window at its end; see `simulate` for the arguments."""
+    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    exists = is_finite(state)
+    state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
+    field = vector_field(scene)
+    fastest, slowest = fastest_and_slowest(scene)
+    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
+    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
+    if samples:
+        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+    single, together = wraps(scene, state.displacement.dtype)
+    motion = Motion(field, state, wrapped=single and solver is None, together=together)
+    first = 0.05 / fastest
+    if isinstance(controller, StepControl):
+        if controller.steps is not None:
+            first = end / controller.steps
+        controller = _controller(scene, motion, state, controller)
+    solution = diffrax.diffeqsolve(
+        motion.term,
+        WrittenOut(wrap=motion.wrap) if solver is None else solver,
+        t0=jnp.zeros_like(end),
+        t1=end,
+        dt0=first,
+        y0=motion.held(state),
+        args=motion.args,
+        saveat=diffrax.SaveAt(subs=saves),
+        stepsize_controller=on_kinks(scene, controller),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+        progress_meter=ProgressBar() if progress else diffrax.NoProgressMeter(),
+    )
+    assert solution.ts is not None and solution.ys is not None
+    times, (states, since) = solution.ts[0], motion.states(solution.ys[0])
+    measured = measure(scene, field, times, since)
+    finished = solution.result == diffrax.RESULTS.successful
+    status = RunStatus.where(
+        finished, RunStatus.where(is_finite(states), RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached
+    )
+    status = RunStatus.where(exists, status, RunStatus.no_start)
+    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), measured)
+    steps = solution.stats["num_steps"]
+    unknown = jnp.full_like(end, jnp.nan)
+    return Run(
+        status=status,
+        trajectory=trajectory(scene, solution.ts[1], motion.states(solution.ys[1])[0]) if samples else None,
+        window=trajectory(scene, times, states),
+        **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
+        error=unknown,
+        steps=steps,
+        rejected=solution.stats["num_rejected_steps"],
+        evaluations=steps * _stages(solver),
+        seconds=unknown,
+        scene=scene,
+    )
+
+
+def _stages(solver: diffrax.AbstractSolver | None) -> int:
+    """Evaluations of the vector field in a step; 0 for a method that does not say."""
+    tableau = getattr(WrittenOut if solver is None else solver, "tableau", None)
+    return 0 if tableau is None else tableau.num_stages - tableau.fsal
+
+
+def is_finite(state: State) -> Array:
+    """Whether every number of a state is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
