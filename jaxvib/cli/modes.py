@@ -12,7 +12,6 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
-from jaxvib.steady.jam_orbit import exact_mode_speeds
 
 _RPM = 30.0 / np.pi
 
@@ -129,6 +128,8 @@ def _phases(scene: jv.Scene, output: Output) -> None:
 
 def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
     """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
+    from jaxvib.steady.jam_orbit import exact_mode_speeds  # needs the time integrator: only who asks pays
+
     light = jv.jam_modes(scene)
     numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
