@@ -14,16 +14,18 @@ passed, and carriers that are coupled by the rotor's speed are followed as they 
 **Averaged loads.** The load's equation, with I_j = kappa_j m_j R_j^2 and D_j = b_Wj R_j^2, holds the product of two quantities
 that turn with theta. Its slow part is kept, the part at twice the speed is dropped:
 
-    I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a),     psi_j' = w_j - Omega,     a = e^H B A
+    I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a_j),     psi_j' = w_j - Omega,     a_j = e^H B_j A
 
-Only a, the forward circular part of the port's acceleration, drives loads; the backward part averages to zero. As A contains
-w_j', the loads' own reaction, the w_j' are implicit; with p = e^H B M^-1 B^T e, s_j = S_j^2/(2 I_j) and
-f_j = D_j (n - w_j)/I_j they follow from one complex number a:
+Only a_j, the forward circular part of the acceleration where the load runs, drives it; the backward part averages to zero.
+Loads at one port feel one number a; where they run at stations s_j of their own, B_j = B + s_j T, it is a_j = a_1 + s_j a_2.
+As A contains w_j', the loads' own reaction, these numbers are implicit: with the levers g_j = 1 or (1, s_j),
+P = e^H B M^-1 B^T e of those one or two rows, h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j
 
-    (1 - p sum_j s_j/2) a + (p/2) sum_j s_j e^{2 i psi_j} conj(a) = e^H B M^-1(...) + p sum_j S_j e^{i psi_j} (w_j^2 - i f_j)
+    (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)
+        = - e^H B M^-1 ((C + n G) V + K Y) + P sum_j g_j S_j e^{i psi_j} (w_j^2 - i f_j)
 
 **What is lost.** The dropped torque shakes the loads' angles at twice their speed by
-r_j = S_j |e^T B A| / (2 I_j (2 w_j)^2) rad, and r_j is what the relative error is made of: it is of first order in
+r_j = S_j |e^T B_j A| / (2 I_j (2 w_j)^2) rad, and r_j is what the relative error is made of: it is of first order in
 eps = S/(M R), the loads' share of the mass, times the dynamic magnification. Where the carrier answers circularly to a circling
 force (two equal directions), e^T B A = 0 and the averaged equations are exact.
 
@@ -41,12 +43,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.errors import InputError
 from jaxvib.machine.drive import IdealDrive
+from jaxvib.machine.effects import Gravity
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State
-from jaxvib.steady.response import _modes, circular_loads, loaded_mass
+from jaxvib.motion.rosenbrock import written_inverse
+from jaxvib.steady.response import _modes, loaded_mass, magnitude, turning_loads
 
-__all__ = ["Amplitudes", "Averaged", "amplitudes_of", "averaged_field"]
+__all__ = ["Amplitudes", "Averaged", "amplitudes_of", "averaged_field", "averaged_loads"]
 
 _CIRCLE = (1.0, -1.0j)
 
@@ -70,7 +76,8 @@ class Averaged(eqx.Module):
     """The averaged equations of a scene, ready for time integration; a pure function of time (s) and `Amplitudes`.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), M with the loads' masses
-    - `push` M^-1 B^T (nd, np), `port` B (np, nd)
+    - `port` (levers, np, nd): B and, where loads have stations, T; `push` M^-1 of their transposes, (levers, np, nd)
+    - `levers` g (levers, count): 1 and, where loads have stations, s_j m
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s, all (count,)
     """
 
@@ -79,6 +86,7 @@ class Averaged(eqx.Module):
     gyroscopic: Array | None
     push: Array
     port: Array
+    levers: Array
     unbalance: Array
     inertia: Array
     drag: Array
@@ -94,18 +102,21 @@ class Averaged(eqx.Module):
         if self.gyroscopic is not None:
             unforced = unforced - n * _times(self.gyroscopic, state.velocity)
 
-        circle = self._circle()
-        push = _times(self.push, circle)
-        mobility = jnp.sum(jnp.conj(circle) * _times(self.port, push)).real
-        share = 0.5 * mobility * self.unbalance**2 / (2.0 * self.inertia)
-        alone, mirrored = 1.0 - jnp.sum(share), jnp.sum(share * at**2)
-        right = jnp.sum(jnp.conj(circle) * _times(self.port, unforced))
-        right = right + mobility * jnp.sum(self.unbalance * at * (state.rate**2 - 1j * free))
-        felt = alone * right - mirrored * jnp.conj(right)
-        felt = felt / (alone**2 - mirrored.real**2 - mirrored.imag**2)
+        circle, levers = self._circle(), self.levers
+        push = jnp.sum(self.push * circle, axis=1)
+        listen = jnp.sum(self.port * jnp.conj(circle), axis=1)
+        mobility = jnp.sum(listen[:, None, :] * push[None, :, :], axis=-1)
 
+        def pushes(rate: Array) -> Array:
+            return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
+
+        share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
+        alone = jnp.eye(levers.shape[0]) - _product(mobility, jnp.sum(share, axis=-1))
+        mirrored = _product(mobility, jnp.sum(share * (at**2)[None, None, :], axis=-1))
+        felt = _with_conjugate(alone, mirrored, _times(listen, unforced) + _times(mobility, pushes(free)))
+        felt = jnp.sum(levers * felt[:, None], axis=0)
         rate = free - self.unbalance * (jnp.conj(at) * felt).imag / (2.0 * self.inertia)
-        acceleration = unforced + push * jnp.sum(self.unbalance * at * (state.rate**2 - 1j * rate))
+        acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
         turn = 1j * jnp.mean(state.rate)
         return Amplitudes(
             displacement=state.velocity - turn * state.displacement,
@@ -116,21 +127,32 @@ class Averaged(eqx.Module):
 
     def ripple(self, state: Amplitudes) -> Array:
         """By how much the dropped torque shakes each load's angle, (count,) rad: S |e^T B i Omega V| / (2 I (2 Omega)^2)."""
-        backward = jnp.sum(self._circle() * _times(self.port, state.velocity))
-        size = jnp.hypot(backward.real, backward.imag)
+        backward = _times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
+        backward = jnp.sum(self.levers * backward[:, None], axis=0)
+        size = magnitude(backward)
         omega = jnp.abs(jnp.mean(state.rate))
         turning = omega > 0.0
         return jnp.where(turning, self.unbalance * size / (8.0 * self.inertia * jnp.where(turning, omega, 1.0)), 0.0)
 
     def _circle(self) -> Array:
-        return jnp.asarray([_CIRCLE[axis] for axis in self.axes])
+        """e, a row for each direction of the port."""
+        return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
+
+
+def averaged_loads(scene: Scene) -> CircularLoads:
+    """The scene's loads, where the scene holds nothing that is not averaged here."""
+    loads = turning_loads(scene)
+    for effect in scene.effects:
+        if not isinstance(effect, Gravity):
+            raise InputError(f"effects.{effect.kind}", "is not averaged; leave it out here, or simulate")
+    return loads
 
 
 def averaged_field(scene: Scene) -> Averaged:
     """The averaged equations of `scene`, see the module's page for what they are and what they leave out.
 
     **Returns** `Averaged`; `jit`, `vmap` and `grad` go through it and through the scene. **Raises** `InputError` for loads
-    that do not move on a circle.
+    that do not move on a circle, motors that loads slow down, and effects other than gravity, whose mean torque is 0.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -141,12 +163,16 @@ def averaged_field(scene: Scene) -> Averaged:
     >>> bool(jnp.abs(jv.averaged_field(scene)(0.0, state).rate[0]) < 1e-10)     # a jam is an equilibrium
     True
     """
-    carrier, loads = scene.machine.carrier(), circular_loads(scene)
+    carrier, loads = scene.machine.carrier(), averaged_loads(scene)
     assert isinstance(scene.drive, IdealDrive)
-    parts = [carrier.stiffness, carrier.damping, carrier.port.T]
+    port, levers = carrier.port[None], jnp.ones((1, loads.count), dtype=carrier.port.dtype)
+    if carrier.stations is not None and carrier.tilt is not None:
+        port, levers = jnp.stack([carrier.port, carrier.tilt]), jnp.stack([levers[0], carrier.stations])
+    n = carrier.mass.shape[0]
+    parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
     parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
     solved = jnp.linalg.solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))
-    n, p = carrier.mass.shape[0], carrier.port.shape[0]
+    p = port.shape[0] * port.shape[1]
 
     def each(value: Array) -> Array:
         return jnp.broadcast_to(value, (loads.count,))
@@ -155,8 +181,9 @@ def averaged_field(scene: Scene) -> Averaged:
         stiffness=solved[:, :n],
         damping=solved[:, n : 2 * n],
         gyroscopic=None if carrier.gyroscopic is None else solved[:, 2 * n + p :],
-        push=solved[:, 2 * n : 2 * n + p],
-        port=carrier.port,
+        push=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
+        port=port,
+        levers=levers,
         unbalance=each(loads.mass * loads.radius),
         inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
         drag=each(loads.drag * loads.radius**2),
@@ -188,3 +215,19 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
 
 def _times(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector[None, :], axis=-1)
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
+
+
+def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
+    """x of a x + b conj(x) = right: written out for one number, otherwise as real equations of twice the number."""
+    if right.shape[0] == 1:
+        a, b = a[0], b[0]
+        return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)
+    top = jnp.concatenate([a.real + b.real, b.imag - a.imag], axis=1)
+    bottom = jnp.concatenate([a.imag + b.imag, a.real - b.real], axis=1)
+    x = _times(written_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
+    n = right.shape[0]
+    return x[:n] + 1j * x[n:]

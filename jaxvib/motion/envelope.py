@@ -16,13 +16,13 @@ from jaxvib.machine.drive import ConstantSpeed, IdealDrive, SpinUp
 from jaxvib.machine.effects import Gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
-from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field
+from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.observables import Measured
 from jaxvib.motion.rosenbrock import Rodas4
 from jaxvib.motion.simulate import _whole
 from jaxvib.motion.start import Start, initial_state
-from jaxvib.steady.response import circular_loads, magnitude, natural_frequencies
+from jaxvib.steady.response import magnitude, natural_frequencies
 
 __all__ = ["Envelope", "EnvelopeStatus", "Envelopes", "envelope"]
 
@@ -198,10 +198,7 @@ def envelope(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
-    circular_loads(scene)
-    for index, effect in enumerate(scene.effects):
-        if not isinstance(effect, Gravity):
-            raise InputError(f"effects[{index}]", f"is {effect.kind!r}; only gravity is averaged, use simulate for this scene")
+    averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
@@ -367,7 +364,7 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
 
 def _units(scene: Scene) -> _Units:
     mass = jnp.mean(jnp.diagonal(scene.machine.carrier().mass))
-    return _Units(circular_loads(scene).unbalance() / mass, scene.drive.speed)
+    return _Units(averaged_loads(scene).unbalance() / mass, scene.drive.speed)
 
 
 def _finite(tree: Any) -> Array:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["Rodas4"]
+__all__ = ["Rodas4", "written_inverse"]
 
 _A = (
     (),
@@ -39,12 +39,12 @@ _DENSE = (
 
 
 @jax.custom_jvp
-def _inverse(matrix: Array) -> Array:
-    """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the time
-    loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
+def written_inverse(matrix: Array) -> Array:
+    """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the
+    time loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
 
-    There is no search for pivots: what is inverted is 1/(gamma h) - J, whose diagonal outweighs the rest where h is small, and
-    a step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
+    There is no search for pivots. It is for matrices whose diagonal outweighs the rest: 1/(gamma h) - J does where h is
+    small, and a step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
     """
     for i in range(matrix.shape[0]):
         here = np.arange(matrix.shape[0]) == i
@@ -55,9 +55,9 @@ def _inverse(matrix: Array) -> Array:
     return matrix
 
 
-@_inverse.defjvp
+@written_inverse.defjvp
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    inverse = _inverse(*primals)
+    inverse = written_inverse(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
@@ -118,7 +118,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         _, along = jax.linearize(lambda t, y: terms.vf(t, y, args), t0, y0)
         jacobian = jax.vmap(lambda v: along(jnp.zeros_like(t0), v), out_axes=1)(columns)
         change = along(jnp.ones_like(t0), jnp.zeros_like(y0))
-        inverse = _inverse(per_step / _GAMMA * columns - jacobian)
+        inverse = written_inverse(per_step / _GAMMA * columns - jacobian)
 
         stages: list[Array] = []
         for a, c, node, slope in zip(_A, _C, _NODES, _SLOPES, strict=True):
