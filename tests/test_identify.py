@@ -115,15 +115,13 @@ def test_derivatives_of_the_swing():
         return jv.swing(ROD, t, **given).angle
 
     forward = jax.jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
+    steps = 1e-4 * jnp.diag(at)
+    around = jax.jit(jax.vmap(angles))(jnp.concatenate([at + steps, at - steps]))
+    difference = (around[:4] - around[4:]) / (2.0 * jnp.diagonal(steps)[:, None])
     for k in range(4):
-        step = jnp.zeros(4).at[k].set(1e-4 * at[k])
-        difference = (angles(at + step) - angles(at - step)) / (2.0 * step[k])
-        np.testing.assert_allclose(forward[:, k], difference, atol=3e-5 * np.max(np.abs(difference)))
+        np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])))
     weights = jnp.cos(jnp.arange(60.0))
-    reverse = jax.grad(lambda x: weights @ angles(x))(at)
-    np.testing.assert_allclose(reverse, weights @ forward, rtol=1e-5)
-    several = jax.vmap(angles)(jnp.stack([at, 1.1 * at]))
-    np.testing.assert_allclose(several[1], angles(1.1 * at), atol=1e-9)
+    np.testing.assert_allclose(jax.grad(lambda x: weights @ angles(x))(at), weights @ forward, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -264,14 +262,6 @@ def test_identification_holds_mu1_in_its_interval():
     ((held, spread),) = coverage(many(records, t, False), truth, ["viscous"], t.size)
     assert 184 <= held <= 197
     assert 0.85 < spread < 1.15
-
-
-def test_both_frictions_are_found_together():
-    t = T
-    records, truth = trials(12, t, np.random.default_rng(3), 2e-3, 0.02)
-    fit = many(records, t, True)
-    for held, spread in coverage(fit, truth, ["viscous", "dry"], t.size):
-        assert held >= 10 and 0.4 < spread < 1.6
 
 
 @pytest.mark.slow

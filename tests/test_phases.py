@@ -86,13 +86,20 @@ def test_closed_forms_of_the_rotor(mu, b3, start, phase, pattern):
 
 def test_the_papers_jams_of_the_rotor():
     """All phases equal: 169.6 at 9.2e-4, gone above 9.5e-4; opposite pairs: 271.1; no first jam with c2 as printed."""
-    (first,) = stable(jv.phase_jams(rotor(9.2e-4)))
+    (first,) = stable(jv.phase_jams(rotor(9.2e-4), starts=8))
     assert bool(first.pattern == jv.PhasePattern.together) and abs(float(first.omega) - 169.6) < 0.05
-    assert stable(jv.phase_jams(rotor(9.6e-4))) == []
+    assert stable(jv.phase_jams(rotor(9.6e-4), starts=8)) == []
     for scene in (rotor(1.24e-2, 0.0, 21.56), rotor(1.02e-2, 13635.0)):
-        (second,) = stable(jv.phase_jams(scene))
+        (second,) = stable(jv.phase_jams(scene, starts=8))
         assert bool(second.pattern == jv.PhasePattern.opposite) and abs(float(second.omega) - 271.1) < 0.1
-    assert stable(jv.phase_jams(rotor(9.2e-4, 13635.0))) == []
+    assert stable(jv.phase_jams(rotor(9.2e-4, 13635.0), starts=8)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mu", "c2", "b3"), [(9.2e-4, 0.0, 10.41), (1.24e-2, 0.0, 21.56), (1.02e-2, 13635.0, 10.41)])
+def test_other_and_more_starts_find_the_same_jams(mu, c2, b3):
+    usual, more = jv.phase_jams(rotor(mu, c2, b3)), jv.phase_jams(rotor(mu, c2, b3), starts=300, seed=7)
+    np.testing.assert_allclose(usual.omega, more.omega, rtol=1e-8)
 
 
 def turning_frame(scene, jam):
@@ -109,7 +116,7 @@ def turning_frame(scene, jam):
 
     rest = (jam.displacement.real, (1j * w * jam.displacement).real, jam.phase, jnp.full(n, w))
     at = jnp.concatenate(rest)
-    return flow(at), jax.jacfwd(flow)(at)
+    return jax.jit(lambda x: (flow(x), jax.jacfwd(flow)(x)))(at)
 
 
 @pytest.mark.parametrize("which", ["rotor together", "rotor opposite", "rotor unequal", "planar heavy"])
@@ -130,10 +137,9 @@ def test_on_supports_alike_both_ways_jams_and_stability_are_exact(which):
     assert bool(jam.stable) == (np.max(others.real) < 0.0)
 
 
-@pytest.mark.parametrize("machine", ["two_mass", "three_mass"])
-def test_equal_phases_on_platforms_are_the_jam_modes(machine):
-    scene = jv.Scene(machines()[machine], jv.balls(count=2, mass=0.02, radius=0.12, drag=2e-3), jv.ConstantSpeed(80.0))
-    modes, jams = jv.jam_modes(scene), jv.phase_jams(scene)
+def test_equal_phases_on_platforms_are_the_jam_modes():
+    scene = jv.Scene(machines()["two_mass"], jv.balls(count=2, mass=0.02, radius=0.12, drag=2e-3), jv.ConstantSpeed(80.0))
+    modes, jams = jv.jam_modes(scene), jv.phase_jams(scene, starts=8)
     spread = np.max(np.abs(np.exp(1j * np.asarray(jams.phase)) - 1.0), axis=1)
     together = [k for k in range(spread.size) if spread[k] < 1e-6]
     numbers = modes.mode_numbers()[::-1]
@@ -216,7 +222,7 @@ def test_wrong_questions():
         jv.phase_jam(planar(), 100.0, jnp.zeros(3))
     with pytest.raises(jv.InputError, match="starts is 0"):
         jv.phase_jams(planar(), starts=0)
-    jams = jv.phase_jams(planar())
+    jams = jv.phase_jams(planar(), starts=8)
     assert "stable" in jams.summary() and "all together" in jams.summary()
     with pytest.raises(jv.InputError, match="index is 3; there are 3 jams, counted from 0"):
         jams.select(3)

@@ -30,8 +30,11 @@ from jaxvib.steady.phases import (
 
 __all__ = ["PhaseBranch", "PhaseJams", "phase_branch", "phase_jams"]
 
-_GRID = 160
-"""Load speeds at which phases are looked for, before the speed is solved for too."""
+_GRID = 240
+"""Load speeds at which phases are looked for, besides those near resonances."""
+
+_HALVINGS = 6
+"""Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
 
 
 class PhaseJams(PhaseJam):
@@ -60,15 +63,16 @@ class PhaseJams(PhaseJam):
         return "\n".join(lines) or "no jam"
 
 
-def phase_jams(scene: Scene, *, starts: int = 48, seed: int = 0) -> PhaseJams:
+def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
     """Every way in which the scene's light loads can jam at its rotor speed, whatever their phases.
 
     At each of many load speeds, closer together near resonances, phases are looked for at which all loads need the same
-    multiple of their drag, from `starts` random sets of phases and some regular ones; where that multiple is near 1, the
-    speed is solved for as well (`phase_jam`). What differs by a common turn, or by which of several equal loads stands
-    where, is one jam. Loads that turn with the rotor and balance it are left out.
+    multiple of their drag, from `starts` random sets of phases and some regular ones; where that multiple passes 1 from one
+    load speed to the next, the speed is solved for as well (`phase_jam`). What differs by a common turn, or by which of
+    several equal loads stands where, is one jam. Loads that turn with the rotor and balance it are left out.
 
-    **Arguments**: `starts`: random sets of phases at each load speed; `seed` which.
+    **Arguments**: `starts`: random sets of phases at each load speed; `seed` which. Stable jams are found with a few; unstable
+    ones close to where patterns part from each other take many.
 
     **Returns** `PhaseJams`. **Raises** `InputError` for loads without drag, drives without a given speed, and effects that
     this theory leaves out.
@@ -90,9 +94,9 @@ def phase_jams(scene: Scene, *, starts: int = 48, seed: int = 0) -> PhaseJams:
     sets = [rng.uniform(-np.pi, np.pi, (number, loads.count)), _regular(parts)]
     phases = np.concatenate(sets)
     factor, angles, good = _phases_at(parts, jnp.asarray(speeds), jnp.asarray(phases))
-    chosen = _near(np.asarray(factor), np.asarray(good))
-    rows, columns = np.unravel_index(chosen, good.shape)
-    omega, phase = (np.asarray(x) for x in _many(parts, jnp.asarray(speeds[rows]), angles[rows, columns]))
+    omega, phase = _starts(parts, speeds, np.asarray(factor), np.asarray(angles), np.asarray(good))
+    many = _power_of_2(omega.size)
+    omega, phase = (np.asarray(x)[: omega.size] for x in _many(parts, jnp.asarray(omega[many]), jnp.asarray(phase[many])))
     groups = _equal_loads(parts)
     unique: list[tuple[float, np.ndarray]] = []
     reached: list[int] = []
@@ -116,23 +120,59 @@ def phase_jams(scene: Scene, *, starts: int = 48, seed: int = 0) -> PhaseJams:
     return PhaseJams(**fields, starts=jnp.asarray([reached[k] for k in keep], dtype=int))
 
 
-def _near(factor: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """Which places (flat) of a table of drag multiples (no, ns) to start from: those near 1, four of a kind at most.
+def _starts(
+    parts: Parts, speeds: np.ndarray, factor: np.ndarray, phase: np.ndarray, good: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speeds and phases to solve from, given the drag multiples (no, ns) of phases (no, ns, count) at load `speeds` (no,).
 
-    A power of 2 of them, so that few scenes compile anew; they start over where there are fewer.
+    Where a pattern, followed to the next load speed up or down, passes the multiple 1 there is a jam between the two, which is
+    narrowed down by halving. Points whose own multiple is near 1 are starts too.
     """
-    near = good & (np.abs(np.log(np.where(good, factor, 1.0))) < np.log(3.0))
-    places = np.flatnonzero(near)
-    kinds = np.stack([places // good.shape[1], np.round(1e4 * np.log(factor.ravel()[places])).astype(int)], axis=1)
-    _, which = np.unique(kinds, axis=0, return_inverse=True)
-    seen: dict[int, int] = {}
-    kept = []
-    for place, kind in zip(places, which.ravel(), strict=True):
-        seen[int(kind)] = seen.get(int(kind), 0) + 1
-        if seen[int(kind)] <= 4:
-            kept.append(place)
-    kept = kept or [0]
-    return np.resize(np.asarray(kept), 2 ** int(np.ceil(np.log2(max(len(kept), 256)))))
+    places = np.flatnonzero(good)
+    if places.size == 0:
+        return speeds[:1], phase[:1, 0]
+    row, size = places // good.shape[1], np.log(factor.ravel()[places])
+    angles = phase.reshape(-1, phase.shape[-1])[places]
+    digits = [1e4 * size[:, None], 1e3 * np.cos(angles), 1e3 * np.sin(angles)]
+    kinds = np.concatenate([row[:, None], *(np.round(d).astype(int) for d in digits)], axis=1)
+    once = np.unique(kinds, axis=0, return_index=True)[1]
+    row, size, angles = row[once], size[once], angles[once]
+    near = np.abs(size) < np.log(3.0)
+    omega, phases = [speeds[row[near]]], [angles[near]]
+    for side in (-1, 1):
+        beside = speeds[np.clip(row + side, 0, speeds.size - 1)]
+        there, _, found = _follow(parts, beside, angles)
+        low, high, held = (x[found & (size * there < 0.0)] for x in (speeds[row], beside, np.arange(row.size)))
+        at, sign = angles[held], np.sign(size[held])
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2.0
+            there, turned, found = _follow(parts, middle, at)
+            same = found & (there * sign > 0.0)
+            low, high, at = np.where(same, middle, low), np.where(same, high, middle), np.where(same[:, None], turned, at)
+        omega.append(low)
+        phases.append(at)
+    return np.concatenate(omega), np.concatenate(phases)
+
+
+def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`_phases` at each of some load speeds (n,) from its own start (n, count), with the logarithm of the drag's multiple."""
+    if omega.size == 0:
+        return omega, phase, omega > 0.0
+    many = _power_of_2(omega.size)
+    factor, angles, good = (
+        np.asarray(x)[: omega.size] for x in _followed_phases(parts, jnp.asarray(omega[many]), jnp.asarray(phase[many]))
+    )
+    return np.log(np.where(good, factor, 1.0)), angles, good
+
+
+@eqx.filter_jit
+def _followed_phases(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
+    return jax.vmap(lambda w, start: _phases(parts, influence_of(parts, w)[0], w, start))(omega, phase)
+
+
+def _power_of_2(n: int) -> np.ndarray:
+    """Places 0 .. n - 1, starting over until there is a power of 2 of them, so that few scenes compile anew."""
+    return np.resize(np.arange(n), 2 ** int(np.ceil(np.log2(max(n, 1024)))))
 
 
 _many = eqx.filter_jit(eqx.filter_vmap(balanced, in_axes=(None, 0, 0)))
@@ -230,7 +270,7 @@ def _load_speeds(parts: Parts) -> np.ndarray:
     poles = np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
     speed = float(parts.speed)
     centres = np.unique(np.abs(poles[np.abs(poles.imag) > 0.0].imag))
-    apart = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 24)])
+    apart = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
     crowd = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
     top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
     speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, _GRID) * speed, top, *crowd]))

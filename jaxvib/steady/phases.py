@@ -124,9 +124,13 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
     """
+    return _phase_torques(scene, jnp.asarray(omega, dtype=scene.drive.speed.dtype), jnp.asarray(phase))
+
+
+@eqx.filter_jit
+def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     parts = parts_of(scene)
-    omega = jnp.asarray(omega, dtype=parts.speed.dtype)
-    return torques_at(parts, influence_of(parts, omega)[0], omega, jnp.asarray(phase))
+    return torques_at(parts, influence_of(parts, omega)[0], omega, phase)
 
 
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
