@@ -169,19 +169,19 @@ def two(eps, speed, damping=0.1):
 
 
 @pytest.mark.parametrize(
-    ("make", "speed", "slow_time", "parts"),
+    ("make", "speed", "slow_time", "masses", "parts"),
     [
-        pytest.param(two, 1.5, 8.0, slice(None), id="caught"),
+        pytest.param(two, 1.5, 8.0, (0.02, 0.01), slice(None), id="caught"),
         # The exciter's amplitude is off by 2e-3 eps there, less than the next order and the tolerance leave.
-        pytest.param(two, 6.0, 8.0, [0, 1, 3], id="passed"),
-        # On the way up: the speed of the loads, which everything that happened before decides.
-        pytest.param(one, 4.0, 2.0, slice(1), id="on the way", marks=pytest.mark.slow),
+        pytest.param(two, 6.0, 8.0, (0.02, 0.01), [0, 1, 3], id="passed"),
+        # On the way up: the speed of the loads, which everything that happened before decides; the window is short then.
+        pytest.param(one, 4.0, 2.0, (5e-3, 2.5e-3), slice(1), id="on the way", marks=pytest.mark.slow),
     ],
 )
-def test_error_is_of_first_order_in_the_mass_of_the_loads(make, speed, slow_time, parts):
+def test_error_is_of_first_order_in_the_mass_of_the_loads(make, speed, slow_time, masses, parts):
     """After the same slow time, half the mass, half the error."""
     errors = []
-    for eps in (0.02, 0.01):
+    for eps in masses:
         full, slow = both(make(eps, speed), speed, slow_time / eps)
         errors.append(np.abs(measured(slow) / measured(full) - 1.0)[parts])
         assert np.max(errors[-1]) < 5.0 * eps
@@ -190,12 +190,14 @@ def test_error_is_of_first_order_in_the_mass_of_the_loads(make, speed, slow_time
     np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.15)
 
 
-@pytest.mark.parametrize("make", [two, pytest.param(functools.partial(one, damping=0.05), marks=pytest.mark.slow)])
-def test_capture_and_passage_are_those_of_the_full_equations(make):
+@pytest.mark.parametrize(
+    ("make", "passing"), [(two, 6.0), pytest.param(functools.partial(one, damping=0.05), 9.0, marks=pytest.mark.slow)]
+)
+def test_capture_and_passage_are_those_of_the_full_equations(make, passing):
     """The same run-up to a lower and a higher speed: the loads are caught or pass, with 1 % error in the greatest amplitude
     on the way, in the amplitudes at the end, in the speed, in the force; in steps of many turns."""
     end = 4000.0
-    for speed, caught in ((1.4, True), (6.0, False)):
+    for speed, caught in ((1.4, True), (passing, False)):
         s = make(2e-3, speed)
         full, slow = both(s, speed, end)
         resonance = float(jv.natural_frequencies(s)[-1])

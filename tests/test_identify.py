@@ -116,7 +116,7 @@ def test_derivatives_of_the_swing():
 
     forward = jax.jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
     steps = 1e-4 * jnp.diag(at)
-    around = jax.jit(jax.vmap(angles))(jnp.concatenate([at + steps, at - steps]))
+    around = jax.jit(jax.vmap(angles))(jnp.concatenate([at[None, :] + steps, at[None, :] - steps]))
     difference = (around[:4] - around[4:]) / (2.0 * jnp.diagonal(steps)[:, None])
     for k in range(4):
         np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])))
