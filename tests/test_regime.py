@@ -127,6 +127,11 @@ def test_published_rotor_at_three_frictions():
     assert found.kind[:, 0].tolist() == ["jammed", "jammed"]
     np.testing.assert_allclose(found.omega[:, 0], [169.6, 271.15], atol=0.1)
     np.testing.assert_allclose(found.regime.ripple[0, 0], 3.1, atol=0.1)
+    # The torque balance at unequal phases, started from the phases of the run, gives the speed the run has locked to.
+    for k, mu in enumerate(first.mu):
+        jam = jv.phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
+        assert bool(jam.stable)
+        np.testing.assert_allclose(jam.omega, found.omega[k, 0], atol=0.1)
     assert "together" in first.said("uncoupled, both dampers", 0)
     assert "opposite" in first.said("uncoupled, both dampers", 1)
     assert "169.6" in first.summary()

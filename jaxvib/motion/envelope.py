@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import diffrax
 import equinox as eqx
@@ -23,6 +23,9 @@ from jaxvib.motion.rosenbrock import Rodas4
 from jaxvib.motion.simulate import _whole
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.steady.response import magnitude, natural_frequencies
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Envelope", "EnvelopeStatus", "Envelopes", "envelope"]
 
@@ -101,6 +104,16 @@ class Envelope(Measured):
                 f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
+        )
+
+    def plot(self) -> Figure:
+        """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time. **Returns** a figure."""
+        from jaxvib.draw.charts import time_histories
+
+        kept = self.window if self.trajectory is None else self.trajectory
+        return time_histories(
+            *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
+            names=self.scene.machine.carrier().coordinates,
         )
 
 
