@@ -11,10 +11,12 @@ from jax import Array
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number, traced
-from jaxvib.steady.collocation import Given, along, grid_of, has_half_turn, periodic_motion
+from jaxvib.steady.bodies import has_half_turn
+from jaxvib.steady.collocation import Given, along, periodic_motion
+from jaxvib.steady.grid import grid_of
 from jaxvib.steady.jam import fold_points, jam_modes, piece_modes, without_ripples
 from jaxvib.steady.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
-from jaxvib.steady.response import circular_loads
+from jaxvib.steady.response import jammed_loads
 from jaxvib.steady.stability import steps_for
 
 __all__ = ["exact_mode_speeds", "jam_orbit"]
@@ -87,7 +89,7 @@ def jam_orbit(
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    drag = circular_loads(frozen).drag_sum()
+    drag = jammed_loads(frozen).drag_sum()
     if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
