@@ -112,7 +112,7 @@ class Motion(NamedTuple):
 def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
-        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n) - S_g e'(phi_g) . a
+        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
         a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
         D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 

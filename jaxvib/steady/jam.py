@@ -159,7 +159,7 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
 
 def jam_modes(scene: Scene) -> JamModes:
-    """Every way in which light, collected loads can jam at the scene's rotor speed.
+    """Every way in which light, collected loads can jam at the scene's rotor speed, held back by drag and dry friction.
 
     The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that reaches
     the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls
