@@ -185,8 +185,10 @@ def _newton(
         change, take = change_of(now)
         then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
         better = then.norm < now.norm
-        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look.
-        then = then._replace(settled=then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale)
+        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
+        # first step gains, from psi = 0, says nothing of that yet.
+        sure = then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale
+        then = then._replace(settled=sure & (then.steps > 1))
         lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
         rounded = now.norm < 16.0 * tiny * now.scale
         stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
