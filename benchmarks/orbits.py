@@ -23,7 +23,8 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxvib as jv  # noqa: E402
-from jaxvib.steady.collocation import grid_of, harmonics_of, periodic_motion  # noqa: E402
+from jaxvib.steady.collocation import harmonics_of, periodic_motion  # noqa: E402
+from jaxvib.steady.grid import grid_of  # noqa: E402
 from jaxvib.steady.jam import jam_rotor_speed  # noqa: E402
 from jaxvib.steady.stability import floquet, steps_for  # noqa: E402
 

@@ -12,7 +12,8 @@ from scenes import machines, scene
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
-from jaxvib.steady.collocation import grid_of, periodic_motion
+from jaxvib.steady.collocation import periodic_motion
+from jaxvib.steady.grid import grid_of
 from jaxvib.steady.orbit import light_rotor_speed
 
 

@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 import jaxvib as jv
-from jaxvib.steady.collocation import along, grid_of, periodic_motion
+from jaxvib.steady.collocation import along, periodic_motion
+from jaxvib.steady.grid import grid_of
 from jaxvib.steady.jam import jam_rotor_speed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -27,6 +28,13 @@ class Friction(NamedTuple):
     lever: Array
     reaction: Array
     normal: tuple[Array, Array] | None
+
+    def torque(self, a: Mapping[int, Array]) -> Array:
+        """The torque on each load where the points that carry them have the acceleration `a`, by axis, m/s^2; {} for none."""
+        reaction = self.reaction
+        if self.normal is not None:
+            reaction = reaction + sum(self.normal[axis] * x for axis, x in a.items())
+        return self.lever * jnp.abs(reaction)
 
 
 class Throw(NamedTuple):

@@ -122,10 +122,7 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     for effect in scene.effects:
         friction = effect.friction(loads, state.angle, state.rate, speed, g)
         if friction is not None:
-            reaction = friction.reaction
-            if friction.normal is not None:
-                reaction = reaction + sum(friction.normal[axis] * a for axis, a in at_load.items())
-            torque = (torque[0] + friction.lever * jnp.abs(reaction), *torque[1:])
+            torque = (torque[0] + friction.torque(at_load), *torque[1:])
         resistance = effect.load_resistance(loads, state.angle, state.rate)
         if resistance is not None:
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]

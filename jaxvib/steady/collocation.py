@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -11,158 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
-from jaxvib.machine.contact import LoadContact
-from jaxvib.machine.effects import Effect
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.response import circular_loads, dynamic_stiffness, small_solve
+from jaxvib.steady.bodies import bodies, circle, load_torque, torque_slopes
+from jaxvib.steady.grid import Grid, grid_of
+from jaxvib.steady.response import dynamic_stiffness, jammed_loads, small_solve
 
-__all__ = [
-    "Along",
-    "Bodies",
-    "Grid",
-    "Harmonics",
-    "Motion",
-    "along",
-    "bodies",
-    "circle",
-    "each_load",
-    "grid_of",
-    "harmonics_of",
-    "has_half_turn",
-    "load_torque",
-    "periodic_motion",
-    "torque_of_each",
-]
-
-Points = Array | np.ndarray
+__all__ = ["Along", "Given", "Harmonics", "Motion", "along", "harmonics_of", "periodic_motion"]
 
 Given = Literal["omega", "rotor_speed"]
 
 _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
-
-
-class Grid(NamedTuple):
-    """Points on a period of theta = Omega t and the matrices of trigonometric interpolation between them.
-
-    With the half-turn symmetry psi(theta + pi) = psi(theta), e(theta + pi) = -e(theta), half a period says everything: psi
-    has even harmonics only and the point e of the loads odd ones.
-
-    **Attributes** (M points): `symmetric` whether it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
-    d^2/dtheta^2 of psi; `lag_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `lag_weights` (J,): psi has the
-    harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times cos
-    and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis` (M, K)
-    and `synthesis` (K, M) complex: e_k = sum_l e_l analysis_lk, e_l = Re sum_k e_k synthesis_kl.
-    """
-
-    symmetric: bool
-    theta: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    lag_orders: np.ndarray
-    lag_weights: np.ndarray
-    orders: np.ndarray
-    cosine: np.ndarray
-    sine: np.ndarray
-    pairs: np.ndarray
-    analysis: np.ndarray
-    synthesis: np.ndarray
-
-
-@functools.lru_cache(maxsize=64)
-def grid_of(points: int, symmetric: bool) -> Grid:
-    """The grid of `points` on half a period where the motion has the half-turn symmetry, else on the whole of it.
-
-    `points` is made even for half a period and odd for a whole one, which keeps the highest harmonic of e whole.
-    """
-    m = points + points % 2 if symmetric else points + 1 - points % 2
-    turn = np.pi if symmetric else 2.0 * np.pi
-    theta = turn * np.arange(m) / m
-    if symmetric:
-        lag_orders, orders = np.arange(0, m + 1, 2), np.arange(1, m, 2)
-        weights = np.where((lag_orders == 0) | (lag_orders == m), 1.0, 2.0)
-    else:
-        lag_orders, orders = np.arange(0, (m + 1) // 2), np.arange(1, (m + 1) // 2)
-        weights = np.where(lag_orders == 0, 1.0, 2.0)
-    apart = theta[:, None] - theta[None, :]
-    phase = lag_orders[:, None, None] * apart
-    first = np.tensordot(weights * -lag_orders, np.sin(phase), 1) / m
-    second = np.tensordot(weights * -(lag_orders**2), np.cos(phase), 1) / m
-    distance = orders * (turn / m * np.arange(1 - m, m))[:, None]
-    index = np.arange(m)
-    return Grid(
-        symmetric, theta, first, second, lag_orders, weights, orders,
-        2.0 / m * np.cos(distance), 2.0 / m * np.sin(distance), index[:, None] - index[None, :] + m - 1,
-        2.0 / m * np.exp(-1j * orders * theta[:, None]), np.exp(1j * orders[:, None] * theta),
-    )  # fmt: skip
-
-
-class Bodies(NamedTuple):
-    """The loads as G bodies that do not change their shape: loads that are alike are one, each load for itself otherwise.
-
-    **Attributes**: `unbalance` S (G,) kg m, `inertia` I = sum kappa m R^2 and `drag` sum b_W R^2 (G,) of each body; `offsets`
-    (count,) rad: where each load is on its body, an angle ahead of the body's own.
-    """
-
-    unbalance: Array
-    inertia: Array
-    drag: Array
-    offsets: Array
-
-
-def bodies(scene: Scene) -> Bodies:
-    """The collected loads of the scene as bodies. **Raises** `InputError` for a rotor out of balance."""
-    loads = circular_loads(scene)
-    for effect in scene.effects:
-        if effect.throws:
-            raise InputError(
-                f"effects.{effect.kind}", "shakes the machine at the rotor's own speed, so that no motion repeats; leave it out"
-            )
-    inertia = loads.inertia_factor() * loads.mass * loads.radius**2
-    if loads.alike:
-        n = loads.count
-        return Bodies(loads.unbalance()[None], n * inertia[None], loads.drag_sum()[None], loads.offsets())
-    each = [loads.mass * loads.radius, inertia, loads.drag * loads.radius**2]
-    return Bodies(*(jnp.broadcast_to(x, (loads.count,)) for x in each), offsets=loads.offsets())
-
-
-def has_half_turn(scene: Scene) -> bool:
-    """Whether the equations stay the same under phi + pi, -q: effects on the loads (gravity) break it."""
-    return not scene.effects
-
-
-def each_load(scene: Scene, phi: Points, rate: Array) -> tuple[Array, Array]:
-    """Angles and rates of bodies (G, M) as those of each load (count, M)."""
-    shape = (scene.loads.count, phi.shape[1])
-    return jnp.asarray(phi) + circular_loads(scene).offsets()[:, None], jnp.broadcast_to(rate, shape)
-
-
-def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
-    """What turns loads at angles `phi` besides the vibration, N m: resistance and effects (the scene's unless named)."""
-    loads, acting = scene.loads, scene.effects if effects is None else effects
-    torque = loads.resistance((jnp.asarray(phi),), (rate,), speed)[0]
-    # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
-    forces = (effect.load_force(loads, (jnp.asarray(phi),)) for effect in acting if not isinstance(effect, LoadContact))
-    return sum((force[0] for force in forces if force is not None), torque)
-
-
-def load_torque(scene: Scene, phi: Points, rate: Array, speed: Array, effects: tuple[Effect, ...] | None = None) -> Array:
-    """What turns the bodies at angles `phi` (G, M), see `torque_of_each`, summed over the loads of each, (G, M)."""
-    loads = circular_loads(scene)
-    if not loads.alike:
-        each = jax.vmap(lambda p, r: torque_of_each(scene, p, r, speed, effects), in_axes=1, out_axes=1)
-        return each(phi, rate)
-    if loads.own_radius is None:
-        return loads.count * torque_of_each(scene, phi, rate, speed, effects)
-    return jnp.sum(torque_of_each(scene, *each_load(scene, phi, rate), speed, effects), axis=0, keepdims=True)
-
-
-def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
-    """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
-    cos, sin = jnp.cos(phi), jnp.sin(phi)
-    axes = scene.machine.carrier().axes
-    return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])
 
 
 def receptance(scene: Scene, omega: Array, speed: Array, orders: np.ndarray) -> Array:
@@ -197,6 +55,7 @@ class _Balance(NamedTuple):
 
     left_over: Array
     scale: Array
+    acceleration: Array
     moving: Array
     pull: Array
 
@@ -209,12 +68,13 @@ def _balance(scene: Scene, grid: Grid, answer: Array, lag: Array, omega: Array, 
     acceleration = (along_port @ grid.synthesis).real
     size, unit = whole.unbalance[:, None], (whole.drag * omega)[:, None]
     vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
-    torque = load_torque(scene, phi, rate, speed)
+    torque = load_torque(scene, phi, rate, speed, acceleration)
     inertia = (whole.inertia * omega**2)[:, None] * (lag @ grid.second.T)
     largest = jnp.max((jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration)) / unit)
     return _Balance(
         (inertia - torque + vibration) / unit,
         1.0 + jnp.abs(speed / omega) + largest,
+        acceleration,
         moving,
         -size * jnp.einsum("agi,ai->gi", point, acceleration) / unit,
     )
@@ -226,16 +86,16 @@ def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: A
     g, m = lag.shape
     unit = (whole.drag * omega)[:, None]
     phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
-    ones = jnp.ones_like(lag)
-    by_angle = jax.jvp(lambda p: load_torque(scene, p, rate, speed), (phi,), (ones,))[1] / unit
-    by_rate = jax.jvp(lambda r: load_torque(scene, phi, r, speed), (rate,), (ones,))[1] / unit
+    by_angle, by_rate, by_acceleration = torque_slopes(scene, phi, rate, speed, balance.acceleration)
     own = (
         (whole.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
-        + (balance.pull - by_angle)[:, :, None] * np.eye(m)[None]
-        - (omega * by_rate)[:, :, None] * grid.first[None]
+        + (balance.pull - by_angle / unit)[:, :, None] * np.eye(m)[None]
+        - (omega * by_rate / unit)[:, :, None] * grid.first[None]
     )
     shake = whole.unbalance[None, :, None] * balance.moving
-    coupling = jnp.einsum("agi,abij,bhj->gihj", shake / unit[None], _feedback(grid, answer), shake)
+    # Dry friction answers to the acceleration that the others cause as well.
+    answers = (shake - by_acceleration) / unit[None]
+    coupling = jnp.einsum("agi,abij,bhj->gihj", answers, _feedback(grid, answer), shake)
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
@@ -252,7 +112,7 @@ class Motion(NamedTuple):
 def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
-        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n) - S_g e'(phi_g) . a
+        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
         a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
         D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
@@ -264,7 +124,7 @@ def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start:
     Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
     if lag is None:
-        lag = jnp.zeros((1 if circular_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
+        lag = jnp.zeros((1 if jammed_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, lag))
     psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
     omega, speed = _both(given, value, x)
@@ -325,8 +185,10 @@ def _newton(
         change, take = change_of(now)
         then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
         better = then.norm < now.norm
-        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look.
-        then = then._replace(settled=then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale)
+        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
+        # first step gains, from psi = 0, says nothing of that yet.
+        sure = then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale
+        then = then._replace(settled=sure & (then.steps > 1))
         lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
         rounded = now.norm < 16.0 * tiny * now.scale
         stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)

@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
-from jaxvib.steady.collocation import has_half_turn
+from jaxvib.steady.bodies import has_half_turn
 from jaxvib.steady.jam import fold_points
 from jaxvib.steady.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.steady.picture import picture

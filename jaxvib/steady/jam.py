@@ -12,12 +12,14 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import traced
 from jaxvib.programs import kept
+from jaxvib.steady.bodies import light_friction
 from jaxvib.steady.response import (
     _modes,
-    circular_loads,
+    jammed_loads,
     loaded_mass,
     magnitude,
     natural_frequencies,
@@ -132,6 +134,8 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
     with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
     `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
+    Dry friction helps the drag with mu2 (d/2) N sign(n - w) a load; n is then the root of that balance between w and the above,
+    N = m R w^2 (the loads' weight left out: it adds nothing on the average of a turn unless it exceeds that).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -141,15 +145,22 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
     Source: the antiphase paper, equations (31), (35).
     """
-    loads = circular_loads(scene)
+    loads = jammed_loads(scene)
     carrier = scene.machine.carrier()
     port = carrier.port @ steady_displacement(scene, omega, speed)
     torque = -loads.unbalance() * omega**2 * jnp.sum(jnp.conj(turning(carrier)) * port).imag / 2.0
-    return omega + torque / loads.drag_sum()
+    free = omega + torque / loads.drag_sum()
+    if not any(isinstance(effect, DryFriction) for effect in scene.effects):
+        return free
+
+    def left_over(n: Array) -> Array:
+        return loads.drag_sum() * (n - omega) + light_friction(scene, omega, n) - torque
+
+    return bracketed_root(left_over, omega, free)
 
 
 def jam_modes(scene: Scene) -> JamModes:
-    """Every way in which light, collected loads can jam at the scene's rotor speed.
+    """Every way in which light, collected loads can jam at the scene's rotor speed, held back by drag and dry friction.
 
     The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that reaches
     the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls
@@ -171,7 +182,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
-    drag = circular_loads(scene).drag
+    drag = jammed_loads(scene).drag
     if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
     return _jam_modes(scene)
@@ -214,7 +225,7 @@ def _jam_modes(scene: Scene) -> JamModes:
 def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
     displacement = steady_displacement(scene, omega)
     # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
-    throw = circular_loads(scene).unbalance() / jnp.min(jnp.diagonal(loaded_mass(scene)))
+    throw = jammed_loads(scene).unbalance() / jnp.min(jnp.diagonal(loaded_mass(scene)))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(throw.dtype).eps < throw)
     displacement = jnp.where(bounded, displacement, jnp.nan)
     slope = jnp.where(bounded, _slope(scene, omega), jnp.nan)

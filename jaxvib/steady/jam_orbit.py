@@ -11,10 +11,12 @@ from jax import Array
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number, traced
-from jaxvib.steady.collocation import Given, along, grid_of, has_half_turn, periodic_motion
+from jaxvib.steady.bodies import has_half_turn
+from jaxvib.steady.collocation import Given, along, periodic_motion
+from jaxvib.steady.grid import grid_of
 from jaxvib.steady.jam import fold_points, jam_modes, piece_modes, without_ripples
 from jaxvib.steady.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
-from jaxvib.steady.response import circular_loads
+from jaxvib.steady.response import jammed_loads
 from jaxvib.steady.stability import steps_for
 
 __all__ = ["exact_mode_speeds", "jam_orbit"]
@@ -41,7 +43,7 @@ def jam_orbit(
 ) -> Orbit:
     """The exact motion in which collected loads jam: no assumption that they are light.
 
-        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n) - S e'(phi) . a,      a = B q''
+        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
@@ -49,6 +51,8 @@ def jam_orbit(
     that share every number are collected at one point, or side by side where they have an `own_radius` (S is then
     m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other, on the average of a period, the status is
     `held`). Loads that differ have a psi_j each: they take the places next to each other that their torques ask for.
+    The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. Where friction
+    can hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status says so.
 
     **Arguments**, one of the first three
 
@@ -57,7 +61,7 @@ def jam_orbit(
     - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
     - `near`: a load speed to start from: a motion at the scene's rotor speed
     - `accuracy`: harmonics are added until the estimated relative error is below it
-    - `points`: a fixed number of collocation points (on half a period without effects, else on a period) in place of that.
+    - `points`: a fixed number of collocation points (on half a period without gravity, else on a period) in place of that.
       Under `jit` and `vmap` shapes cannot follow numbers: there it is 16 (33) unless said otherwise, the status tells
     - `throw`: raise where there is no such motion; else, and under a JAX transformation, the status says so
 
@@ -87,7 +91,7 @@ def jam_orbit(
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    drag = circular_loads(frozen).drag_sum()
+    drag = jammed_loads(frozen).drag_sum()
     if not traced(drag) and not float(drag) > 0.0:
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 

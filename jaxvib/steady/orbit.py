@@ -9,24 +9,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.collocation import (
-    Given,
-    Grid,
-    Harmonics,
-    Motion,
-    along,
-    bodies,
-    circle,
-    each_load,
-    grid_of,
-    harmonics_of,
-    has_half_turn,
-    load_torque,
-    periodic_motion,
-    torque_of_each,
-)
+from jaxvib.steady.bodies import bodies, circle, each_load, has_half_turn, load_torque, rotor_torque, torque_of_each
+from jaxvib.steady.collocation import Given, Harmonics, Motion, along, harmonics_of, periodic_motion
+from jaxvib.steady.grid import Grid, grid_of
 from jaxvib.steady.jam import jam_rotor_speed
-from jaxvib.steady.response import circular_loads
+from jaxvib.steady.response import jammed_loads
 from jaxvib.steady.roots import bracketed_root
 from jaxvib.steady.stability import Floquet, floquet
 
@@ -55,7 +42,7 @@ class Orbit(eqx.Module):
       speeds (and, rad, of psi) that the number of harmonics leaves
     - `omega`, `rotor_speed` rad/s; `slope` dn/dOmega along the branch
     - `amplitude` (nd,) m and `foundation_force` N: zero to peak, (max - min)/2 over the period
-    - `power` W: mean power that the loads take from the rotor
+    - `power` W: mean power that the loads take from the rotor, by drag and dry friction
     - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
       Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
       the multiplier that is 1, as computed
@@ -215,7 +202,8 @@ def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) ->
     """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
     branch = along(scene, grid, motion)
     phi, rate = grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T)
-    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, effects=()), axis=0))
+    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, acceleration, rotor_torque), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
     push = _least_push(scene, grid, motion, harmonics)
@@ -228,13 +216,13 @@ def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
     vibration that holds a jam presses the loads together at every instant.
     """
-    loads = circular_loads(scene)
+    loads = jammed_loads(scene)
     if loads.own_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
     phi, rate = each_load(scene, grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T))
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, phi)[1], acceleration)
-    needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed), axis=1)
+    needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)
     return jnp.min(-jnp.cumsum(needed)[:-1])
 
 

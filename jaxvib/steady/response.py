@@ -10,7 +10,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.drive import IdealDrive
-from jaxvib.machine.effects import Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.effects import Effect, Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
@@ -146,13 +147,25 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 def circular_loads(scene: Scene) -> CircularLoads:
     """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
-    loads = turning_loads(scene)
+    return _at_one_point(scene, turning_loads(scene))
+
+
+def jammed_loads(scene: Scene) -> CircularLoads:
+    """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
+    return _at_one_point(scene, turning_loads(scene, (*_EFFECTS, DryFriction)))
+
+
+def _at_one_point(scene: Scene, loads: CircularLoads) -> CircularLoads:
     if scene.machine.carrier().stations is not None:
         raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
     return loads
 
 
-def turning_loads(scene: Scene) -> CircularLoads:
+_EFFECTS = (Gravity, StaticImbalance, MomentImbalance, LoadContact)
+"""Effects that change nothing in what loads do on the average of a turn, or that whoever asks deals with."""
+
+
+def turning_loads(scene: Scene, effects: tuple[type[Effect], ...] = _EFFECTS) -> CircularLoads:
     """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
@@ -163,7 +176,7 @@ def turning_loads(scene: Scene) -> CircularLoads:
             "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
         )
     for effect in scene.effects:
-        if not isinstance(effect, (Gravity, StaticImbalance, MomentImbalance, LoadContact)):
+        if not isinstance(effect, effects):
             raise InputError(f"effects.{effect.kind}", "is not part of this theory; leave it out here, or simulate")
     return scene.loads
 
@@ -197,7 +210,7 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     carrier = scene.machine.carrier()
     if carrier.gyroscopic is not None and speed is None:
         raise InputError("machine.kind", f"is {scene.machine.kind!r}; leading-order jams hold for machines of platforms")
-    force = circular_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
+    force = jammed_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
     return small_solve(dynamic_stiffness(scene, omega, speed), force)
 
 

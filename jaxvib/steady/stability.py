@@ -11,8 +11,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.collocation import Grid, Harmonics, Motion, bodies, circle, has_half_turn, load_torque
-from jaxvib.steady.response import circular_loads, loaded_mass, natural_frequencies
+from jaxvib.steady.bodies import bodies, circle, has_half_turn, torque_slopes
+from jaxvib.steady.collocation import Harmonics, Motion
+from jaxvib.steady.grid import Grid
+from jaxvib.steady.response import jammed_loads, loaded_mass, natural_frequencies
 
 __all__ = ["Floquet", "floquet", "steps_for"]
 
@@ -53,9 +55,11 @@ def steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
 
 
 class _Coefficients(NamedTuple):
-    """What of the orbit enters the linear equations at one angle: s e', its derivatives (np, G, P); the rest (G, P)."""
+    """What of the orbit enters the linear equations at one angle: s e', what is left of it as the loads give way to the port
+    (dry friction takes a part), derivatives of s e' (np, G, P); the rest (G, P)."""
 
     moving: Array
+    giving: Array
     moving1: Array
     moving2: Array
     by_angle: Array
@@ -68,8 +72,9 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
 
         Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
-        I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - S_g Omega^2 t_g.B q''
+        I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
 
+    T the torque on the body, which dry friction lets depend on the port's acceleration a = Omega^2 B q'' too;
     and for loads of one body that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last
     term. Loads that lie side by side are pressed together, and do not part.
     Fixed steps of Dormand and Prince's order 8, of the same length for all orbits.
@@ -101,16 +106,16 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
         lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
         phi, rate = theta[None, :, None] + lag, 1.0 + lag1
         point, moving = circle(scene, phi)
-        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)[:, None]
-        torque = jax.vmap(lambda p, r, w, n: load_torque(scene, p, w * r, n), in_axes=-1, out_axes=-1)
-        ones = jnp.ones_like(phi)
-        by_angle = jax.jvp(lambda p: torque(p, rate, omega, speed), (phi,), (ones,))[1]
-        by_rate = jax.jvp(lambda r: torque(phi, r, omega, speed), (rate,), (ones,))[1]
-        stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration, axis=0)
+        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        slopes = jax.vmap(lambda p, r, w, n, a: torque_slopes(scene, p, w * r, n, a), in_axes=-1, out_axes=-1)
+        by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
+        stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
         moving2 = -point * lag2[None] - moving * rate[None] ** 2
         s = share[None, :, None, None]
         unit = whole.inertia[:, None, None] * omega[None, None] ** 2
-        return _Coefficients(s * moving, -s * point * rate[None], s * moving2, stiff / unit, by_rate / unit)
+        by_rate = by_rate * omega[None, None] / unit
+        giving = s * moving - by_acceleration / total
+        return _Coefficients(s * moving, giving, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
 
     def damped(q1: Array, w: Array, n: Array) -> Array:
         answer = _times(damping, q1) / w
@@ -125,7 +130,7 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
         pushed = _times(port, q2) - _times(mobility, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
         torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
         # The port's acceleration with the bodies giving way to it: an equation for each of its directions.
-        answers = lever * t
+        answers = lever * c.giving[:, :, None]
         weight = jnp.sum(t[:, None] * answers[None], axis=2)
         acceleration = _small_solve(_times(mobility, weight), pushed - _times(mobility, jnp.sum(t * torque[None], axis=1)))
         return jnp.concatenate([q1, q2, d1, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
@@ -136,7 +141,7 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     def start(n: int) -> Array:
         return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
 
-    loads = circular_loads(scene)
+    loads = jammed_loads(scene)
     parting = loads.alike and loads.count > 1 and loads.own_radius is None
     sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
     fields = (full, apart)[: len(sizes)]
@@ -147,7 +152,7 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
         def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
-            c = _Coefficients(at.moving[:, :, i], at.moving1[:, :, i], at.moving2[:, :, i], at.by_angle[:, i], at.by_rate[:, i])
+            c = _Coefficients(*(part[..., i, :] for part in at))
             return tuple(
                 rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
                 for field, x, rate in zip(fields, state, rates, strict=True)

@@ -16,7 +16,9 @@ from jaxvib.draw.comparison import convergence_chart
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number
-from jaxvib.steady.collocation import along, grid_of, has_half_turn, periodic_motion
+from jaxvib.steady.bodies import has_half_turn
+from jaxvib.steady.collocation import along, periodic_motion
+from jaxvib.steady.grid import grid_of
 from jaxvib.steady.orbit import light_rotor_speed
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.jam import Jam, jam_modes
 from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.orbit import Orbit
-from jaxvib.steady.response import circular_loads
+from jaxvib.steady.response import jammed_loads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     >>> [f"{abs(a / b - 1):.0e}" for a, b in zip(tiers.leading.omega, tiers.exact.omega)]
     ['1e-06', '1e-05', '1e-04']
     """
-    loads = circular_loads(scene)
+    loads = jammed_loads(scene)
     answers: list[tuple[Jam, Orbit]] = []
     for factor in factors:
         heavier = eqx.tree_at(
