@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax import Array
 
 from jaxvib.motion.dynamics import Dynamics, State
@@ -165,7 +166,7 @@ def _arranged(entries: list[Any], shape: tuple[int, ...]) -> np.ndarray:
     return cells
 
 
-class Tolerance(diffrax.AbstractStepSizeController):
+class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
     """Chooses steps whose error, in each part of the state's own unit, stays below a tolerance.
 
         e = max |error| / (tolerance (unit + relative |y|)),    next step = 0.9 e_before^(1/16) / e^(3/32) times this one
@@ -179,6 +180,21 @@ class Tolerance(diffrax.AbstractStepSizeController):
     tolerance: Array
     unit: Any
     relative: Any
+
+    @property
+    def rtol(self) -> Array:
+        """What an implicit method solves its equations to."""
+        return self.tolerance
+
+    @property
+    def atol(self) -> Array:
+        """As `rtol`."""
+        return self.tolerance
+
+    @property
+    def norm(self) -> Any:
+        """As `rtol`."""
+        return optimistix.rms_norm
 
     def wrap(self, direction: Any) -> Tolerance:
         """Time runs forward only."""

@@ -200,7 +200,8 @@ def _difference(scene: Scene, fine: Run, coarse: Run) -> Array:
     unit, speed = natural_units(scene), xp.asarray(scene.drive.speed)
 
     def apart(x: Any, y: Any, scale: Any) -> Any:
-        return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / scale
+        with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
+            return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / scale
 
     parts = [
         apart(a.displacement, b.displacement, xp.maximum(xp.max(xp.abs(xp.asarray(a.displacement))), unit.displacement)),
