@@ -2,8 +2,10 @@
 
 import pathlib
 
+import equinox as eqx
 import jax
 import matplotlib
+import pytest
 
 from jaxvib.backend import prepare_cpu
 
@@ -15,3 +17,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).parent / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 matplotlib.use("Agg")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget():
+    """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes."""
+    yield
+    eqx.clear_caches()
+    jax.clear_caches()
