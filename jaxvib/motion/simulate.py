@@ -77,8 +77,9 @@ def simulate(
     - `steps`: in place of a tolerance, so many equal steps
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
       unless said otherwise it is where numbers are known, and not under a JAX transformation
-    - `solver`, `controller`, `adjoint`: diffrax's, passed through; `WrittenOut`, a PI controller to `tolerance`, and
-      checkpointed reverse mode unless said otherwise. For forward mode give `diffrax.ForwardMode()`
+    - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
+      checkpointed reverse mode, and `WrittenOut`, or under a JAX transformation, where reverse mode may be asked for, the same
+      method as `diffrax.Dopri8`. For forward mode give `diffrax.ForwardMode()`
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
     - `progress`: shows a bar on the error stream
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
@@ -122,6 +123,11 @@ def simulate(
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
+    known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
+    if solver is None and adjoint is None and not known and end.dtype.itemsize >= 8:
+        # Reverse mode may be asked for, and through the written-out steps of a long run it is off by up to 1e-3.
+        solver = diffrax.Dopri8()
+
     def run(control: StepControl) -> Run:
         chosen = control if controller is None else controller
         kept = samples if save == "all" else 0
@@ -137,7 +143,6 @@ def simulate(
         jax.block_until_ready(found.steps)
         return _with(found, seconds=time.perf_counter() - begun)
 
-    known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if accuracy is not None:
         if not known:
             raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a tolerance")
