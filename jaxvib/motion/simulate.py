@@ -78,7 +78,7 @@ def simulate(
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
       unless said otherwise it is where numbers are known, and not under a JAX transformation
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
-      checkpointed reverse mode, and `WrittenOut`, or under a JAX transformation, where reverse mode may be asked for, the same
+      checkpointed reverse mode, and `WrittenOut`, or under a JAX transformation, where derivatives may be asked for, the same
       method as `diffrax.Dopri8`. For forward mode give `diffrax.ForwardMode()`
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
     - `progress`: shows a bar on the error stream
@@ -124,7 +124,7 @@ def simulate(
         max_steps = enough_steps(scene, end)
 
     known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
-    if solver is None and adjoint is None and not known and end.dtype.itemsize >= 8:
+    if solver is None and not known and end.dtype.itemsize >= 8:
         # Reverse mode may be asked for, and through the written-out steps of a long run it is off by up to 1e-3.
         solver = diffrax.Dopri8()
 
