@@ -182,17 +182,17 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
     relative: Any
 
     @property
-    def rtol(self) -> Array:
+    def rtol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What an implicit method solves its equations to."""
         return self.tolerance
 
     @property
-    def atol(self) -> Array:
+    def atol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """As `rtol`."""
         return self.tolerance
 
     @property
-    def norm(self) -> Any:
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """As `rtol`."""
         return optimistix.rms_norm
 
