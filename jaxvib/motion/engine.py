@@ -192,7 +192,7 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
         return self.tolerance
 
     @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
         """As `rtol`."""
         return optimistix.rms_norm
 

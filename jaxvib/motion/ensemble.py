@@ -75,7 +75,9 @@ def ensemble(
     - `estimate`: whether to estimate errors by a second run with half as many steps
     - `lanes`: how many runs advance together
 
-    **Returns** `Ensemble`. **Raises** `InputError` for values that are not allowed, or leading axes that differ.
+    **Returns** `Ensemble`. Derivatives go through it in forward mode.
+
+    **Raises** `InputError` for values that are not allowed, or leading axes that differ.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import equinox as eqx, jax.numpy as jnp, jaxvib as jv
@@ -181,7 +183,7 @@ def _run(scene: Scene, state: State, end: Array, steps: Array) -> tuple[State, A
             args=motion.args,
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=diffrax.ConstantStepSize(),
-            adjoint=diffrax.RecursiveCheckpointAdjoint(),
+            adjoint=diffrax.ForwardMode(),  # reverse derivatives are refused: see `WrittenOut`
             max_steps=2**30,
             throw=False,
         )

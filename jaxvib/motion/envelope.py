@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed, IdealDrive, SpinUp
+from jaxvib.machine.drive import IdealDrive
 from jaxvib.machine.effects import Gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
@@ -20,8 +20,7 @@ from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.observables import Measured
 from jaxvib.motion.rosenbrock import Rodas4
-from jaxvib.motion.simulate import _whole
-from jaxvib.motion.start import Start, initial_state
+from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.steady.response import magnitude, natural_frequencies
 
 if TYPE_CHECKING:
@@ -222,19 +221,9 @@ def envelope(
         raise InputError(
             "tolerance", f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and below 1"
         )
-    if spin_up is not None and start != "spin_up":
-        raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
-    if isinstance(start, str) and start == "spin_up":
-        if not isinstance(scene.drive, ConstantSpeed):
-            raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
-        drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
-        if not traced(end - drive.duration) and drive.duration > end:
-            raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
-        scene = eqx.tree_at(lambda s: s.drive, scene, drive)
+    scene = brought_up(scene, end, start, spin_up)
     if isinstance(start, State):
-        if mode is not None:
-            raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
-        state = _whole(scene, start)
+        state = whole_state(scene, start, mode)
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
         known = start in ("rest", "spin_up") and mode is None

@@ -68,7 +68,7 @@ def _controller(scene: Scene, motion: Motion, state: State, control: StepControl
     units = motion.held(spread(unit))
     if motion.wrapped:  # the count of turns has no error, and any unit
         units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
-    return Tolerance(tolerance, units, motion.held(spread(relative)))
+    return Tolerance(tolerance=tolerance, unit=units, relative=motion.held(spread(relative)))  # pyright: ignore[reportCallIssue]
 
 
 def on_kinks(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:

@@ -14,7 +14,7 @@ from jaxvib.motion.observables import Trajectory
 from jaxvib.steady.response import natural_frequencies
 from jaxvib.steady.whirl import whirl
 
-__all__ = ["PhasePattern", "Regime", "RegimeName", "phase_pattern", "regime"]
+__all__ = ["REGIMES", "PhasePattern", "Regime", "RegimeName", "phase_pattern", "regime"]
 
 _SAME_SPEED = 3e-3
 """Speeds of two loads, of a load and the rotor, or of one load early and late, that differ by less count as one."""
@@ -35,6 +35,10 @@ class RegimeName(eqx.Enumeration):
     balanced = "the loads turn with the rotor and balance it"
     parted = "the loads have parted: they turn at different speeds that no longer change"
     unsettled = "the loads have not come to a steady motion"
+
+
+REGIMES = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
+"""The words for the members of `RegimeName`, in their order."""
 
 
 class PhasePattern(eqx.Enumeration):
@@ -77,8 +81,7 @@ class Regime(eqx.Module):
     @property
     def label(self) -> str:
         """The name's own word: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
-        words = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
-        return next(word for word in words if bool(self.name == getattr(RegimeName, word)))
+        return next(word for word in REGIMES if bool(self.name == getattr(RegimeName, word)))
 
     @property
     def pattern_label(self) -> str:

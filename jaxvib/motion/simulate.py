@@ -15,13 +15,13 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed, Motor, SpinUp
+from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.start import Start, initial_state
+from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 
 __all__ = ["enough_steps", "simulate"]
 
@@ -108,18 +108,8 @@ def simulate(
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
     control = _control(end, tolerance, accuracy, steps, controller)
-    if spin_up is not None and start != "spin_up":
-        raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
-    if isinstance(start, str) and start == "spin_up":
-        if not isinstance(scene.drive, ConstantSpeed):
-            raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
-        drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
-        if not traced(end - drive.duration) and drive.duration > end:
-            raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
-        scene = eqx.tree_at(lambda s: s.drive, scene, drive)
-    if isinstance(start, State) and mode is not None:
-        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
-    state = _whole(scene, start) if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    scene = brought_up(scene, end, start, spin_up)
+    state = whole_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
@@ -288,21 +278,6 @@ def _in_stretches(
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
     return _with(found, seconds=time.perf_counter() - begun)
-
-
-def _whole(scene: Scene, state: State) -> State:
-    """The state, if it has the scene's numbers of coordinates and loads."""
-    nd, n = scene.machine.carrier().mass.shape[0], scene.loads.count
-    if isinstance(scene.drive, Motor) != (state.rotor is not None):
-        needed = (
-            "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
-        )
-        raise InputError("start.rotor", f"is {state.rotor!r}; under the drive {scene.drive.kind!r} it must be {needed}")
-    for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
-        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
-        if any(shape != (length,) for shape in shapes):
-            raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
-    return state
 
 
 def _enough_samples(scene: Scene, end: Array) -> int:

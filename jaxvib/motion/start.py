@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from typing import Literal
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.contact import LoadContact
-from jaxvib.machine.drive import ConstantSpeed, Motor
+from jaxvib.machine.drive import ConstantSpeed, Motor, SpinUp
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, numbers
+from jaxvib.machine.units import Number, numbers, traced
 from jaxvib.motion.dynamics import State
 from jaxvib.steady.jam import jam_modes
 
-__all__ = ["Start", "initial_state"]
+__all__ = ["Start", "brought_up", "initial_state", "whole_state"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
@@ -74,3 +76,40 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
         (angle,),
         (jnp.full((n,), jam.omega),),
     )
+
+
+def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
+    """The scene; for the start "spin_up" with a drive that rises over the time `spin_up` (s), half of `end` unless said.
+
+    **Raises** `InputError` for a time that goes with another start or is longer than the run, and for another drive.
+    """
+    if not (isinstance(start, str) and start == "spin_up"):
+        if spin_up is not None:
+            raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
+        return scene
+    if not isinstance(scene.drive, ConstantSpeed):
+        raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
+    drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
+    if not traced(end - drive.duration) and drive.duration > end:
+        raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
+    return eqx.tree_at(lambda s: s.drive, scene, drive)
+
+
+def whole_state(scene: Scene, state: State, mode: int | None) -> State:
+    """A state that was given to start from, if it has the scene's numbers of coordinates and loads.
+
+    **Raises** `InputError` where it has not, or a `mode` is named beside it.
+    """
+    if mode is not None:
+        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
+    nd, n = scene.machine.carrier().mass.shape[0], scene.loads.count
+    if isinstance(scene.drive, Motor) != (state.rotor is not None):
+        needed = (
+            "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
+        )
+        raise InputError("start.rotor", f"is {state.rotor!r}; under the drive {scene.drive.kind!r} it must be {needed}")
+    for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
+        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
+        if any(shape != (length,) for shape in shapes):
+            raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
+    return state

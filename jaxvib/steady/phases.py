@@ -75,6 +75,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(scene: Scene) -> Parts:
+    """The scene's matrices and numbers at its own rotor speed, see `Parts`."""
     carrier, loads = scene.machine.carrier(), turning_loads(scene)
 
     def each(value: Array) -> Array:
@@ -103,6 +104,7 @@ def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
 
 
 def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
+    """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
     turned = jnp.exp(1j * phase)
     coupled = jnp.conj(turned) * (influence @ (parts.throw * turned))
     return 0.5 * omega**4 * parts.throw * coupled.imag
@@ -162,6 +164,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:
+    """The scene's loads. **Raises** `InputError` where one has no drag."""
     loads = turning_loads(scene)
     if not traced(loads.drag) and not np.all(np.asarray(loads.drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
@@ -187,6 +190,7 @@ def balanced(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
 
 @eqx.filter_jit
 def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
+    """`phase_jam` of arguments that are known to be right."""
     parts = parts_of(scene)
     frozen = jax.lax.stop_gradient(parts)
     w, angles = balanced(parts, omega, phase)

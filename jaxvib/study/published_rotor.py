@@ -13,6 +13,7 @@ from jaxvib.machine.effects import Gravity, StaticImbalance
 from jaxvib.machine.loads import pendulums
 from jaxvib.machine.rotor import rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.regime import pattern_word, phase_pattern
 from jaxvib.study.run_ups import RunUps, run_ups
 
 __all__ = ["VARIANTS", "RotorRegimes", "published_rotor", "rotor_regimes"]
@@ -84,7 +85,7 @@ class RotorRegimes(NamedTuple):
         found = self.computed[variant]
         kind = str(found.kind[k, 0])
         if kind == "jammed":
-            pattern = ("together", "in opposite groups")[int(np.std(np.cos(found.regime.phase[k, 0])) > 0.5)]
+            pattern = pattern_word(phase_pattern(found.regime.phase[k, 0]))
             return f"jammed at {found.omega[k, 0]:.1f}, ripple {float(found.regime.ripple[k, 0]):.1f}, {pattern}"
         if kind in ("unsettled", "parted"):
             return f"{kind}, mean {found.omega[k, 0]:.1f}"

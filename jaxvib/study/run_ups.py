@@ -16,7 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, numbers
-from jaxvib.motion.regime import Regime, RegimeName
+from jaxvib.motion.regime import REGIMES, Regime, RegimeName
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
 
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["RunUps", "run_ups"]
-
-KINDS = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
-"""Words for the members of `RegimeName`, in their order."""
 
 
 class RunUps(NamedTuple):
@@ -46,13 +43,13 @@ class RunUps(NamedTuple):
 
     def fraction(self, kind: str) -> np.ndarray:
         """Share of the starts (nd,) that came to a `kind` of motion."""
-        if kind not in KINDS:
-            raise InputError("kind", f"is {kind!r}; allowed: {', '.join(KINDS)}")
+        if kind not in REGIMES:
+            raise InputError("kind", f"is {kind!r}; allowed: {', '.join(REGIMES)}")
         return np.mean(self.kind == kind, axis=1)
 
     def plot(self) -> Figure:
         """Shares of the kinds of motion, and the speeds of the loads, over drag."""
-        shares = {kind: self.fraction(kind) for kind in KINDS if np.any(self.kind == kind)}
+        shares = {kind: self.fraction(kind) for kind in REGIMES if np.any(self.kind == kind)}
         return regime_chart(self.drag, shares, self.omega, float(np.max(self.regime.rotor_speed)))
 
 
@@ -118,8 +115,8 @@ def run_ups(
     if max_steps is None:
         max_steps = enough_steps(scene, end)
     named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
-    code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in KINDS]))(named.name)
-    kind = np.asarray(KINDS)[np.argmax(np.asarray(code), axis=1)]
+    code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
+    kind = np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)]
 
     def folded(leaf: Array) -> Array:
         return leaf.reshape(shape + leaf.shape[1:])
