@@ -152,7 +152,7 @@ def moved(s, x):
     )
 
 
-def through_time(adjoint, until):
+def through_time(adjoint, until, of=lambda run: jnp.append(run.amplitude, run.foundation_force)):
     """The start is held: what the numbers change reaches the jam through the motion alone."""
     s = damped()
     start = jv.initial_state(s, "jam", mode=3)
@@ -169,7 +169,7 @@ def through_time(adjoint, until):
             max_steps=2**15,
             throw=False,
         )
-        return jnp.append(run.amplitude, run.foundation_force)
+        return of(run)
 
     return outputs
 
@@ -194,20 +194,32 @@ def test_forward_gradient_through_time_is_the_implicit_one():
     np.testing.assert_allclose(gradient[:, 4], ahead, atol=1e-4 * float(jnp.max(jnp.abs(gradient))))
 
 
+def last_state(run):
+    """Where the motion ends. Amplitudes are the largest of many peaks, of which rounding chooses one: the derivatives of two
+    settled peaks differ by what has not died out yet, 1e-6."""
+    return jnp.concatenate([leaf[-1] for leaf in jax.tree.leaves(run.window.state)])
+
+
 def test_reverse_gradient_through_time_is_the_forward_one():
     x = jnp.ones(6)
-    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 60.0)))(x)
-    reverse = jax.jit(jax.jacrev(through_time(None, 60.0)))(x)
-    np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-9)
+    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 60.0, last_state)))(x)
+    reverse = jax.jit(jax.jacrev(through_time(None, 60.0, last_state)))(x)
+    np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-11)
 
 
 @pytest.mark.slow
 def test_every_gradient_through_time_is_the_finite_difference():
     x = jnp.ones(6)
-    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 1000.0)))(x)
-    reverse = jax.jit(jax.jacrev(through_time(None, 1000.0)))(x)
+
+    def both(run):
+        return jnp.concatenate([last_state(run), run.amplitude, run.foundation_force[None]])
+
+    forward = jax.jit(jax.jacfwd(through_time(diffrax.ForwardMode(), 1000.0, both)))(x)
+    reverse = jax.jit(jax.jacrev(through_time(None, 1000.0, both)))(x)
+    np.testing.assert_allclose(relative(reverse)[:-3], relative(forward)[:-3], atol=1e-10)
+    np.testing.assert_allclose(relative(reverse)[-3:], relative(forward)[-3:], atol=1e-5)
+    forward = forward[-3:]
     difference = central(jax.jit(through_time(diffrax.ForwardMode(), 1000.0)), x, 1e-3)
     scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
-    np.testing.assert_allclose(reverse / scale, forward / scale, atol=1e-8)
     np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-3)
     np.testing.assert_allclose(relative(forward), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)

@@ -183,7 +183,7 @@ def _run(scene: Scene, state: State, end: Array, steps: Array) -> tuple[State, A
             args=motion.args,
             saveat=diffrax.SaveAt(t1=True),
             stepsize_controller=diffrax.ConstantStepSize(),
-            adjoint=diffrax.ForwardMode(),  # reverse derivatives are refused: see `WrittenOut`
+            adjoint=diffrax.ForwardMode(),
             max_steps=2**30,
             throw=False,
         )

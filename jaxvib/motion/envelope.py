@@ -19,6 +19,7 @@ from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.observables import Measured
+from jaxvib.motion.replay import solve
 from jaxvib.motion.rosenbrock import Rodas4
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.steady.response import magnitude, natural_frequencies
@@ -234,7 +235,7 @@ def envelope(
         state,
         Rodas4() if solver is None else solver,
         diffrax.PIDController(rtol=tolerance, atol=tolerance) if controller is None else controller,
-        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        adjoint,
         samples if save == "all" else 0,
         turns,
         count(max_steps, "max_steps"),
@@ -251,7 +252,7 @@ def _run(
     state: State | None,
     solver: diffrax.AbstractSolver,
     controller: diffrax.AbstractStepSizeController,
-    adjoint: diffrax.AbstractAdjoint,
+    adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
     turns: int,
     max_steps: int,
@@ -270,22 +271,21 @@ def _run(
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
 
-    def term(t: Any, y: Array, args: Averaged) -> Array:
-        return units.pack(args(t, units.unpack(y, nd)))
+    def term(t: Any, y: Array, args: tuple[Averaged, _Units]) -> Array:
+        field, units = args
+        return units.pack(field(t, units.unpack(y, nd)))
 
-    solution = diffrax.diffeqsolve(
+    solution = solve(
         diffrax.ODETerm(term),
         solver,
-        t0=jnp.zeros_like(end),
-        t1=end,
-        dt0=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
+        end=end,
+        first_step=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
         y0=units.pack(begin),
-        args=field,
+        args=(field, units),
         saveat=diffrax.SaveAt(subs=saves),
-        stepsize_controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
+        controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
         adjoint=adjoint,
         max_steps=max_steps,
-        throw=False,
     )
     assert solution.ts is not None and solution.ys is not None
 

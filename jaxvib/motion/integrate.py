@@ -17,6 +17,7 @@ from jaxvib.motion.dynamics import State, vector_field
 from jaxvib.motion.engine import Motion, Tolerance
 from jaxvib.motion.observables import measure, trajectory
 from jaxvib.motion.progress import ProgressBar
+from jaxvib.motion.replay import solve
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.solver import WrittenOut
 from jaxvib.programs import kept
@@ -99,7 +100,7 @@ def integrate(
     state: State,
     solver: diffrax.AbstractSolver | None,
     controller: diffrax.AbstractStepSizeController | StepControl,
-    adjoint: diffrax.AbstractAdjoint,
+    adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
     turns: int,
     max_steps: int,
@@ -118,25 +119,23 @@ def integrate(
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wraps(scene, state.displacement.dtype)
     motion = Motion(field, state, wrapped=single and solver is None, together=together)
-    first = 0.05 / fastest
+    first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
     if isinstance(controller, StepControl):
         if controller.steps is not None:
             first = end / controller.steps
         controller = _controller(scene, motion, state, controller)
-    solution = diffrax.diffeqsolve(
+    solution = solve(
         motion.term,
         WrittenOut(wrap=motion.wrap) if solver is None else solver,
-        t0=jnp.zeros_like(end),
-        t1=end,
-        dt0=first,
+        end=end,
+        first_step=first,
         y0=motion.held(state),
         args=motion.args,
         saveat=diffrax.SaveAt(subs=saves),
-        stepsize_controller=on_kinks(scene, controller),
+        controller=on_kinks(scene, controller),
         adjoint=adjoint,
         max_steps=max_steps,
-        throw=False,
-        progress_meter=ProgressBar() if progress else diffrax.NoProgressMeter(),
+        progress=ProgressBar() if progress else None,
     )
     assert solution.ts is not None and solution.ys is not None
     times, (states, since) = solution.ts[0], motion.states(solution.ys[0])

@@ -77,9 +77,10 @@ def simulate(
     - `steps`: in place of a tolerance, so many equal steps
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
       unless said otherwise it is where numbers are known, and not under a JAX transformation
-    - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
-      checkpointed reverse mode, and `WrittenOut`, or under a JAX transformation, where derivatives may be asked for, the same
-      method as `diffrax.Dopri8`. For forward mode give `diffrax.ForwardMode()`
+    - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`, reverse
+      derivatives of the very steps that were taken (over checkpoints), and `WrittenOut`, or under a JAX transformation the
+      same method as `diffrax.Dopri8`, whose derivatives compile several times faster. For forward derivatives give
+      `diffrax.ForwardMode()`
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
     - `progress`: shows a bar on the error stream
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
@@ -115,19 +116,18 @@ def simulate(
 
     known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if solver is None and not known and end.dtype.itemsize >= 8:
-        # Reverse mode may be asked for, and through the written-out steps of a long run it is off by up to 1e-3.
+        # Derivatives may be asked for; those of the written-out step take several times as long to compile.
         solver = diffrax.Dopri8()
 
     def run(control: StepControl) -> Run:
         chosen = control if controller is None else controller
         kept = samples if save == "all" else 0
         allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
-        way = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         stretches = _stretches(scene, end, state, save)
         if stretches > 1:
-            return _in_stretches(scene, end / stretches, stretches, state, solver, chosen, way, turns, allowed)
+            return _in_stretches(scene, end / stretches, stretches, state, solver, chosen, adjoint, turns, allowed)
         begun = time.perf_counter()
-        found = integrate(scene, end, state, solver, chosen, way, kept, turns, allowed, progress)
+        found = integrate(scene, end, state, solver, chosen, adjoint, kept, turns, allowed, progress)
         if traced(found.steps):
             return found
         jax.block_until_ready(found.steps)
