@@ -22,6 +22,7 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.study.published_rotor import published_rotor
 
+jv.prepare_cpu()
 jax.config.update("jax_enable_x64", True)
 
 TABLEAU = diffrax.Dopri8.tableau
@@ -192,7 +193,7 @@ def main() -> None:
         print(f"{'native loop':16} {tolerance:9.0e} {error:10.1e} {seconds:9.4f} {compiling:10.1f}")
 
         def run(tol: float = tolerance) -> Any:
-            found = jv.simulate(scene, END, start=start, tolerance=tol, samples=2)
+            found = jv.simulate(scene, END, start=start, tolerance=tol, samples=2, estimate=False)
             return jax.block_until_ready(found.trajectory.state.angle[0][-1])  # pyright: ignore[reportOptionalMemberAccess]
 
         compiling, seconds, angle = timed(run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -16,13 +15,17 @@ from jax import Array
 
 from jaxvib.motion.dynamics import Dynamics, State
 from jaxvib.motion.scalars import Unwritten, on_numbers, split
+from jaxvib.motion.solver import WrittenOut
 
 __all__ = ["Motion", "Tolerance"]
 
 _TURN = 2.0 * math.pi
 
-_MOST_NUMBERS = 8
-"""Above so many numbers in a state, a step written out on each of them takes too long to compile for what it saves."""
+_MOST_NUMBERS = 32
+"""Above so many numbers in a state, equations written out on each of them take too long to compile for what they save."""
+
+_MOST_WRITTEN = 8
+"""The same for the method's stages, written out one after another: they take 13 times as long to compile."""
 
 
 class Motion(eqx.Module):
@@ -34,11 +37,12 @@ class Motion(eqx.Module):
     **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
     the same turns, so that their differences stay.
 
-    **Attributes**: `few` whether numbers are held; `args` the arguments of `term`.
+    **Attributes**: `few` whether numbers are held; `size` how many there are; `args` the arguments of `term`.
     """
 
     args: Any
     few: bool = eqx.field(static=True)
+    size: int = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: Any = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
@@ -48,7 +52,8 @@ class Motion(eqx.Module):
         self.wrapped, self.together = wrapped, together
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
-        self.few = sum(leaf.size for leaf in leaves) <= _MOST_NUMBERS
+        self.size = sum(leaf.size for leaf in leaves)
+        self.few = self.size <= _MOST_NUMBERS
         self.args = field
         if self.few:
             try:
@@ -64,6 +69,12 @@ class Motion(eqx.Module):
         """The equations of motion on what the integrator holds."""
         return diffrax.ODETerm(self._rates)
 
+    def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
+        """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
+        if self.wrapped or self.size <= _MOST_WRITTEN:
+            return WrittenOut(lanes=lanes, wrap=self._wrap if self.wrapped else None)
+        return diffrax.Dopri8()
+
     def held(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""
         y = _numbers(jax.tree.map(split, state)) if self.few else state
@@ -78,12 +89,8 @@ class Motion(eqx.Module):
         since = jax.tree.map(lambda n: n - n[:1], turns)
         return self._state(self._turned(y, turns, 1.0)), self._state(self._turned(y, since, 1.0))
 
-    @property
-    def wrap(self) -> Callable[[Any], Any] | None:
-        """Takes whole turns out of the angles and counts them; None where angles are not wrapped."""
-        return self._wrap if self.wrapped else None
-
     def _wrap(self, held: Any) -> Any:
+        """Takes whole turns out of the angles and counts them."""
         y, turns = held
         angles = self._angles(y)
         first = jnp.ravel(angles[0])[0]

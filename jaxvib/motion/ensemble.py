@@ -21,7 +21,6 @@ from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.dynamics import State, vector_field
 from jaxvib.motion.engine import Motion
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite
-from jaxvib.motion.solver import WrittenOut
 from jaxvib.motion.start import initial_state
 
 __all__ = ["Ensemble", "ensemble"]
@@ -175,7 +174,7 @@ def _run(scene: Scene, state: State, end: Array, steps: Array) -> tuple[State, A
     def part(held: Any, begin: Array) -> tuple[Any, Any]:
         solution = diffrax.diffeqsolve(
             motion.term,
-            WrittenOut(lanes=True),
+            motion.method(lanes=True),
             t0=begin,
             t1=begin + each,
             dt0=step,

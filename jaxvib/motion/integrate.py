@@ -19,7 +19,6 @@ from jaxvib.motion.observables import measure, trajectory
 from jaxvib.motion.progress import ProgressBar
 from jaxvib.motion.replay import solve
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.solver import WrittenOut
 from jaxvib.programs import kept
 from jaxvib.steady.response import natural_frequencies
 
@@ -119,6 +118,8 @@ def integrate(
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wraps(scene, state.displacement.dtype)
     motion = Motion(field, state, wrapped=single and solver is None, together=together)
+    if solver is None:
+        solver = motion.method()
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
     if isinstance(controller, StepControl):
         if controller.steps is not None:
@@ -126,7 +127,7 @@ def integrate(
         controller = _controller(scene, motion, state, controller)
     solution = solve(
         motion.term,
-        WrittenOut(wrap=motion.wrap) if solver is None else solver,
+        solver,
         end=end,
         first_step=first,
         y0=motion.held(state),
@@ -162,9 +163,9 @@ def integrate(
     )
 
 
-def _stages(solver: diffrax.AbstractSolver | None) -> int:
+def _stages(solver: diffrax.AbstractSolver) -> int:
     """Evaluations of the vector field in a step; 0 for a method that does not say."""
-    tableau = getattr(WrittenOut if solver is None else solver, "tableau", None)
+    tableau = getattr(solver, "tableau", None)
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 
 

@@ -78,9 +78,9 @@ def simulate(
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
       unless said otherwise it is where numbers are known, and not under a JAX transformation
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
-      reverse derivatives of the very steps that were taken (over checkpoints), and `WrittenOut`, or under a JAX transformation
-      the same method as `diffrax.Dopri8`, whose derivatives compile several times faster. For forward derivatives give
-      `diffrax.ForwardMode()`
+      reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
+      `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `diffrax.Dopri8`.
+      For forward derivatives give `diffrax.ForwardMode()`
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
     - `progress`: shows a bar on the error stream
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
