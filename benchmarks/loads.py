@@ -65,7 +65,7 @@ def growth_with_loads(quick: bool = False) -> None:
             seconds, compiling = cost(count, work(count))
             base = seconds if base is None else base
             note = "" if before is None else f"{seconds / before[1] / (count / before[0]):.2f} of linear since the last"
-            say(group, f"{count} loads", seconds, base, None, compiling, note, loads=count)
+            say(group, "1 load" if count == 1 else f"{count} loads", seconds, base, None, compiling, note, loads=count)
             before = (count, seconds)
 
 

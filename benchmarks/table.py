@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-OWN = ("jaxvib", "envelope", "the run itself")
+OWN = ("jaxvib", "envelope", "the run itself", "forward", "reverse")
 """How the names of jaxvib's own ways begin, where a group compares it with others."""
 
 
@@ -51,7 +51,7 @@ def whole(document: dict[str, Any]) -> str:
     lines = ["| what | way | time | times | error | compile |", "|---|---|---|---|---|---|"]
     for group, rows in _groups(document).items():
         for row in rows:
-            ratio = "" if row["ratio"] is None else f"{row['ratio']:.3g}"
+            ratio = "" if row["ratio"] is None else _times(row["ratio"])
             error = "" if row["error"] is None else f"{row['error']:.0e}"
             compiling = "" if row["compile"] is None else f"{row['compile']:.1f} s"
             name = row["name"] + (f" ({row['note']})" if row["note"] else "")
@@ -63,6 +63,10 @@ def _said(row: dict[str, Any]) -> str:
     return _time(row["seconds"]) + (f", {row['note']}" if "bytes" in row or "per_second" in row else "")
 
 
+def _times(ratio: float) -> str:
+    return f"{ratio:.2g}" if ratio < 10.0 else f"{ratio:,.0f}"
+
+
 def _within(row: dict[str, Any]) -> str:
     return "" if row["error"] is None else f", error {row['error']:.0e}"
 
@@ -71,7 +75,7 @@ def _against(row: dict[str, Any], own: dict[str, Any]) -> str:
     if "bytes" in row:
         return f"{row['name']}: {_said(row)}"
     far = row["error"] is not None and own["error"] is not None and row["error"] > 10.0 * own["error"]
-    return f"{row['name']} {row['seconds'] / own['seconds']:.2g}" + (f" (error {row['error']:.0e})" if far else "")
+    return f"{row['name']} {_times(row['seconds'] / own['seconds'])}" + (f" (error {row['error']:.0e})" if far else "")
 
 
 def figures(document: dict[str, Any]) -> dict[str, Figure]:
@@ -100,9 +104,9 @@ def ratios(groups: dict[str, list[dict[str, Any]]], line: str) -> Figure:
         place = np.arange(len(rows))[::-1]
         values = np.array([row["ratio"] for row in rows])
         colors = [COLORS[0] if not others or row["name"].startswith(OWN) else "#b0b0b0" for row in rows]
-        axes.barh(place, values / (0.5 * low), left=0.5 * low, color=colors, height=0.7)
+        axes.barh(place, values - 0.5 * low, left=0.5 * low, color=colors, height=0.7)
         for y, value in zip(place, values, strict=True):
-            axes.text(1.08 * value, y, f"{value:.3g}", va="center", fontsize=8)
+            axes.text(1.08 * value, y, _times(value), va="center", fontsize=8)
         axes.set_yticks(place, [row["name"] for row in rows], fontsize=8)
         axes.set_title(group, fontsize=9, loc="left", fontweight="bold")
         axes.set_xscale("log")
@@ -124,7 +128,7 @@ def memory(rows: list[dict[str, Any]]) -> Figure:
     axes.loglog(turns, size[0] * np.sqrt(turns / turns[0]) / 2**20, "--", color="#777777", label="to their square root")
     axes.set_xlabel("turns of the rotor")
     axes.set_ylabel("temporary memory, MiB")
-    axes.legend()
+    axes.legend(frameon=False)
     return figure
 
 
