@@ -50,6 +50,16 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
     assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 1.")
 
 
+def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
+    """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
+    scene = published(speed=5.19, eps=0.05).scene()
+    cost = jv.accuracy(scene, mode=3, until=30.0, tolerances=(1e-6,), solvers=["Tsit5"], repeats=1)
+    by_tier = {row.tier: row.error for row in cost.rows}
+    assert by_tier.keys() == {"exact orbit", "envelope", "full"} and by_tier["full"] < 1e-4 < by_tier["envelope"]
+    (reason,) = cost.left_out
+    assert reason.startswith("leading order: this mode does not exist at this rotor speed; runs start on the exact motion")
+
+
 def test_a_run_up_is_measured_at_its_end():
     machine = jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0)
     loads = jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5)

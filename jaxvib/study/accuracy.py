@@ -22,7 +22,7 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
 from jaxvib.steady.bodies import has_half_turn
-from jaxvib.steady.jam import jam_modes
+from jaxvib.steady.jam import JamStatus, jam_modes
 from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.orbit import Orbit
 from jaxvib.steady.response import natural_frequencies
@@ -65,7 +65,7 @@ def accuracy(
     """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
 
     - "amplitude", "foundation_force": of a jam mode, where the scene has jams that can be computed exactly; tiers leading
-      order, exact orbit, averaged equations, and full integration from the leading order's motion. The reference is the
+      order, exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the
       exact orbit with 32 points, its own error the difference to 24. Else (run-ups, imbalance, loads at different stations)
       as measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error
       the difference to 1e-11.
@@ -181,22 +181,29 @@ def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
         call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
         return row_of("leading order", "", "", call, error, ask.repeats, dtype)
 
-    rows, left_out = [leading(scene, "float64")], []
-    with jax.enable_x64(False):
-        rows.append(leading(_single(scene), "float32"))
+    rows, left_out = [], []
+    light = jam_modes(scene).select(mode, throw=False)
+    if bool(light.status == JamStatus.found):
+        start = initial_state(scene, "jam", mode=mode)
+        rows.append(leading(scene, "float64"))
+        with jax.enable_x64(False):
+            rows.append(leading(_single(scene), "float32"))
+    else:
+        start = State(*jam.fine.at(jnp.zeros(())))
+        left_out.append(f"leading order: {JamStatus[light.status]}; runs start on the exact motion in its place")  # pyright: ignore
     for few in _POINTS:
         points = _whole(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
         rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
     if not bool(jam.fine.stable):
-        left_out = [_unstable("envelope, full", jam)]
+        left_out.append(_unstable("envelope, full", jam))
     else:
 
         def length(tolerance: float) -> float:
             return jam.length(scene, tolerance) if end is None else end
 
-        integrated, left_out = _integrated(ask, read, error, mode, length)
-        rows += integrated
+        integrated, reasons = _integrated(ask, read, error, start, length)
+        rows, left_out = rows + integrated, left_out + reasons
     return Cost(quantity, reference.tolist(), relative(read(jam.coarse), reference), rows, tuple(left_out))
 
 
@@ -207,12 +214,14 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
     def read(found: Any) -> Any:
         return getattr(found, quantity)
 
+    start = initial_state(ask.scene)
+
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
         """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
         return np.ravel(np.asarray(read(simulate(ask.scene, end, save="window", tolerance=tolerance, estimate=False)), float))
 
-    rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), None, lambda tolerance: end)
+    rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
     return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
 
 
@@ -220,11 +229,10 @@ def _integrated(
     ask: _Ask,
     read: Callable[[Any], Any],
     error: Callable[[Any], float],
-    mode: int | None,
+    start: State,
     length: Callable[[float], float],
 ) -> tuple[list[CostRow], list[str]]:
     """What comes out at the end of averaged and full runs, of a `length` for each tolerance."""
-    start = initial_state(ask.scene) if mode is None else initial_state(ask.scene, "jam", mode=mode)
     full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
     for tolerance in _AVERAGED:
         end = length(tolerance)
@@ -322,19 +330,23 @@ def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
     fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
     value = eqx.filter_jit(full)
     ways: list[tuple[str, str, str, Callable[..., Any]]] = [
-        ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))),
         ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
         ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
     ]
     left_out: list[str] = []
-    if bool(jam.fine.stable):
-        ways += [
-            ("full", "forward", tolerance, jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
-            ("full", "reverse", tolerance, jax.jit(jax.grad(full))),
-            ("full", "finite differences", tolerance, lambda k: _differences(value, k)),
-        ]
+    light = jam_modes(scene).select(mode, throw=False).status
+    if not bool(light == JamStatus.found):
+        left_out = [f"leading order, full, which starts from it: {JamStatus[light]}"]  # pyright: ignore
     else:
-        left_out = [_unstable("full", jam)]
+        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
+        if not bool(jam.fine.stable):
+            left_out = [_unstable("full", jam)]
+        else:
+            ways += [
+                ("full", "forward", tolerance, jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
+                ("full", "reverse", tolerance, jax.jit(jax.grad(full))),
+                ("full", "finite differences", tolerance, lambda k: _differences(value, k)),
+            ]
     rows = [
         row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
         for tier, method, setting, f in ways
