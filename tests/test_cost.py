@@ -36,18 +36,17 @@ def light():
 
 
 def test_runs_are_long_enough_to_forget_their_start():
-    """Single precision ends at its rounding, over a thousand times the smallest that double does."""
-    cost = jv.accuracy(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["default"], repeats=1)
-    error = {(row.dtype, row.setting): row.error for row in cost.rows if row.tier == "full"}
-    assert error["float64", "1e-04"] < 1e-4 and error["float64", "1e-08"] < 1e-8
-    assert ("float32", "1e-08") not in error and 1e-8 < error["float32", "1e-04"] < 1e-3
+    """Had they half the time, the square root of the tolerance would be left of the start."""
+    cost = jv.accuracy(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["Tsit5"], repeats=1)
+    error = {row.setting: row.error for row in cost.rows if row.tier == "full"}
+    assert error.keys() == {"1e-04", "1e-08"} and error["1e-04"] < 3e-4 and error["1e-08"] < 3e-8
 
 
 def test_a_run_does_not_stay_in_an_unstable_jam():
     cost = jv.accuracy(light(), mode=2, repeats=1)
     assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
     (reason,) = cost.left_out
-    assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 1.")
+    assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
 
 
 def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():

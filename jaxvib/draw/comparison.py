@@ -73,14 +73,15 @@ def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Ma
     for name, points in panel.lines.items():
         seconds, error = points[np.isfinite(points[:, 1])].T
         axes.loglog(seconds, np.maximum(error, 1e-16), ms=5, **looks[name])
-    for error in wanted:
-        axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
-    axes.axhspan(1e-17, max(panel.floor, 1e-17), color=_FLOOR, zorder=0.4)
+    floor = min(max(panel.floor, 1e-17), 1.0)
+    axes.axhspan(1e-17, floor, color=_FLOOR, zorder=0.4)
     if panel.best.size:
         axes.plot(*panel.best.T, "o", ms=11, mfc="none", color="black")
     errors = np.concatenate([points[:, 1] for points in panel.lines.values()])
     errors = errors[np.isfinite(errors)]
-    axes.set_ylim(0.3 * max(min([panel.floor, *errors]), 1e-15), 3.0 * max([*errors, 1e-2]))
+    axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([floor, *errors, 1e-2]))
+    for error in wanted:
+        axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
     axes.set_xlabel("seconds, once compiled")
     axes.set_ylabel(f"relative error of {panel.quantity}")
 
