@@ -11,20 +11,13 @@ neighbours), and as measured at the end. The machine is the two-mass one of the 
 
 from __future__ import annotations
 
-import argparse
-import os
-import time
-from collections.abc import Callable
-
 import diffrax
 import equinox as eqx
 import jax
+import numpy as np
+from common import best, first, published, say
 
-jax.config.update("jax_enable_x64", True)
-
-import numpy as np  # noqa: E402
-
-import jaxvib as jv  # noqa: E402
+import jaxvib as jv
 
 BLOCKS, SAMPLES = 64, 2**17
 ALLOWED = 1e-2
@@ -32,9 +25,7 @@ ALLOWED = 1e-2
 
 def run_up(eps: float, speed: float, until: float) -> jv.Scene:
     """Spun up to `speed` over half the time."""
-    numbers = dict(natural=(1 / 3, 1 / 3), damping=(0.02, 0.02), link_natural=2 / 3, link_damping=0.02, rho=1.0, beta=1.0)
-    scene = jv.Dimensionless("antiphase", **numbers, eps=eps, speed=speed).scene()
-    return eqx.tree_at(lambda s: s.drive, scene, jv.SpinUp(speed, until / 2.0))
+    return eqx.tree_at(lambda s: s.drive, published(speed, eps, 0.02), jv.SpinUp(speed, until / 2.0))
 
 
 def peaks(amplitude: np.ndarray, at_the_end: jax.Array) -> np.ndarray:
@@ -50,65 +41,65 @@ def peaks_of_run(run: jv.Run) -> np.ndarray:
     return peaks(np.abs(np.fft.ifft(spectrum, axis=0)), run.amplitude)
 
 
-def full(scene: jv.Scene, until: float, solver: diffrax.AbstractSolver, tolerance: float, **given) -> jv.Run:
-    return jv.simulate(scene, until, solver=solver, tolerance=tolerance, turns=1, max_steps=2**20, throw=False, **given)
-
-
-def timed(call: Callable, runs: int) -> tuple[float, float]:
-    begin = time.perf_counter()
-    jax.block_until_ready(call())
-    first, best = time.perf_counter() - begin, np.inf
-    for _ in range(runs):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        best = min(best, time.perf_counter() - begin)
-    return first - best, best
+def full(scene: jv.Scene, until: float, solver: diffrax.AbstractSolver | None, tolerance: float, **given) -> jv.Run:
+    asked = dict(turns=1, max_steps=2**20, estimate=False, throw=False)
+    return jv.simulate(scene, until, solver=solver, tolerance=tolerance, **asked, **given)
 
 
 def compare(name: str, scene: jv.Scene, until: float, runs: int) -> None:
-    reference = full(scene, until, diffrax.Dopri8(), 1e-9, samples=SAMPLES)
+    reference = full(scene, until, None, 1e-9, samples=SAMPLES)
     exact = peaks_of_run(reference)
     turns = float(reference.window.state.angle[0][-1, 0]) / (2.0 * np.pi)
-    print(f"\n{name}: {turns:.0f} turns of the load", flush=True)
+    group = f"run-up, {name}"
+    print(f"{group}: {turns:.0f} turns of the load, amplitudes within {ALLOWED:.0%}", flush=True)
 
     def error(values: np.ndarray) -> float:
         return float(np.max(np.abs(values - exact) / np.max(exact, axis=0)))
 
-    best = np.inf
-    for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-        for tolerance in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5):
-            run = full(scene, until, solver, tolerance, samples=SAMPLES)
-            off = error(peaks_of_run(run)) if bool(run.status == jv.RunStatus.done) else np.inf
-            if off < ALLOWED:
-                break
-        else:
-            continue
-        first, seconds = timed(lambda s=solver, t=tolerance: full(scene, until, s, t, save="window"), runs)
-        best = min(best, seconds)
-        title = f"full, {type(solver).__name__}"
-        print(f"  {title:16s} tolerance {tolerance:.0e} error {off:.1e} steps {int(run.steps + run.rejected):7d} "
-              f"compile {first:6.2f} s  run {1e3 * seconds:9.2f} ms", flush=True)  # fmt: skip
+    slow, off, tolerance = None, np.inf, np.nan
     for tolerance in (3e-2, 1e-2, 3e-3, 1e-3, 1e-4):
         slow = jv.envelope(scene, until, tolerance=tolerance, samples=SAMPLES)
         assert slow.trajectory is not None
         off = error(peaks(np.asarray(slow.trajectory.amplitude), slow.amplitude))
         if off < ALLOWED:
             break
-    first, seconds = timed(lambda: jv.envelope(scene, until, tolerance=tolerance, save="window"), 10 * runs)
-    print(f"  {'envelope':16s} tolerance {tolerance:.0e} error {off:.1e} steps {int(slow.steps + slow.rejected):7d} "
-          f"compile {first:6.2f} s  run {1e3 * seconds:9.2f} ms")  # fmt: skip
-    print(f"  the envelope is {best / seconds:.0f} times as fast; {turns / float(slow.steps):.1f} turns a step")
+    assert slow is not None
+
+    def averaged() -> jax.Array:
+        return jv.envelope(scene, until, tolerance=tolerance, save="window").amplitude
+
+    compiling, base = first(averaged), best(averaged, 10 * runs)
+    say(group, "envelope", base, base, off, compiling, f"{turns / float(slow.steps):.1f} turns a step")
+    for title, solver in (
+        ("full, default of simulate", None),
+        ("full, Tsit5", diffrax.Tsit5()),
+        ("full, Dopri8", diffrax.Dopri8()),
+    ):
+        run, off = None, np.inf
+        for tolerance_ in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5):
+            run = full(scene, until, solver, tolerance_, samples=SAMPLES)
+            off = error(peaks_of_run(run)) if bool(run.status == jv.RunStatus.done) else np.inf
+            if off < ALLOWED:
+                break
+        assert run is not None
+
+        def whole(solver: diffrax.AbstractSolver | None = solver, tolerance: float = tolerance_) -> jax.Array:
+            return full(scene, until, solver, tolerance, save="window").amplitude
+
+        compiling, seconds = first(whole), best(whole, runs)
+        say(group, title, seconds, base, off, compiling, f"tolerance {tolerance_:.0e}, {int(run.steps + run.rejected)} steps")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=3)
-    options = parser.parse_args()
-    compare("caught below the second resonance", run_up(2e-3, 1.5, 8000.0), 8000.0, options.runs)
-    compare("past both resonances", run_up(2e-3, 6.0, 8000.0), 8000.0, options.runs)
-    compare("caught, lighter loads, longer", run_up(5e-4, 1.5, 32000.0), 32000.0, options.runs)
-    print("\nload of this machine over the last minutes: " + " ".join(f"{x:.1f}" for x in os.getloadavg()))
+def run_ups(quick: bool = False) -> None:
+    if quick:
+        compare("caught", run_up(2e-3, 1.5, 2000.0), 2000.0, 1)
+        return
+    compare("caught below the second resonance", run_up(2e-3, 1.5, 8000.0), 8000.0, 3)
+    compare("past both resonances", run_up(2e-3, 6.0, 8000.0), 8000.0, 3)
+    compare("caught, lighter loads, longer", run_up(5e-4, 1.5, 32000.0), 32000.0, 3)
 
 
 if __name__ == "__main__":
-    main()
+    jv.prepare_cpu()
+    jax.config.update("jax_enable_x64", True)
+    run_ups()

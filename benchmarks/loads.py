@@ -1,24 +1,20 @@
-"""What one evaluation of the vector field costs with 1, 10, 100, 1000 loads: it should grow no faster than their number.
+"""What 1, 10, 100, 1000 loads cost: an evaluation of the vector field, and a time integration; no more than their number.
 
     python benchmarks/loads.py
 
 The field is evaluated many times inside one compiled loop, so that the cost of calling into JAX does not count; each
-evaluation uses the last one's result, so that none is left out. Compile time is told apart; of 7 runs the fastest counts.
+evaluation uses the last one's result, so that none is left out. The integration takes equal steps, each load has its own angle
+from the start. Compile time is told apart; the fastest of several runs counts.
 """
 
 from __future__ import annotations
 
-import time
-
 import jax
 import jax.numpy as jnp
+from common import best, first, say
+from single import integrator
 
 import jaxvib as jv
-
-jax.config.update("jax_enable_x64", True)
-
-COUNTS = (1, 10, 100, 1000)
-RUNS = 7
 
 
 def scene(count: int) -> jv.Scene:
@@ -27,10 +23,9 @@ def scene(count: int) -> jv.Scene:
     return jv.Scene(machine, jv.balls(count=count, mass=2.0 / count, radius=0.12, drag=1.5), jv.ConstantSpeed("1500 rpm"))
 
 
-def cost(count: int, evaluations: int) -> tuple[float, float]:
-    """Seconds to compile, and seconds an evaluation takes."""
+def evaluation(count: int, evaluations: int) -> tuple[float, float]:
+    """Seconds that an evaluation of the vector field takes, seconds to compile."""
     s = scene(count)
-    start = jv.initial_state(s, "rest", angles=jnp.linspace(0.0, 6.0, count))
 
     def loop(state: jv.State) -> jv.State:
         field = jv.vector_field(s)
@@ -40,27 +35,41 @@ def cost(count: int, evaluations: int) -> tuple[float, float]:
 
         return jax.lax.fori_loop(0, evaluations, step, state)
 
-    begun = time.perf_counter()
-    compiled = jax.jit(loop).lower(start).compile()
-    compiling = time.perf_counter() - begun
-    best = float("inf")
-    for _ in range(RUNS):
-        begun = time.perf_counter()
-        jax.block_until_ready(compiled(start))
-        best = min(best, time.perf_counter() - begun)
-    return compiling, best / evaluations
+    run, start = jax.jit(loop), apart(s)
+    compiling = first(lambda: run(start))
+    return best(lambda: run(start)) / evaluations, compiling
 
 
-def main() -> None:
-    """Prints the table."""
-    print(f"{'loads':>6} {'compile, s':>11} {'evaluation, us':>15} {'per load, us':>13} {'growth':>7} {'of linear':>10}")
-    before = None
-    for count in COUNTS:
-        compiling, each = cost(count, max(2000, 200_000 // count))
-        growth = "" if before is None else f"{each / before[1]:7.2f} {each / before[1] / (count / before[0]):10.2f}"
-        print(f"{count:6d} {compiling:11.2f} {1e6 * each:15.3f} {1e6 * each / count:13.4f} {growth}")
-        before = (count, each)
+def integration(count: int, steps: int) -> tuple[float, float]:
+    """Seconds that a step of a run takes, all of it counted, seconds to compile."""
+    s = scene(count)
+    run = integrator(s, apart(s))
+    end = steps * 1e-3
+    compiling = first(lambda: run(s, end, steps))
+    return best(lambda: run(s, end, steps), 5) / steps, compiling
+
+
+def apart(s: jv.Scene) -> jv.State:
+    return jv.initial_state(s, "rest", angles=jnp.linspace(0.0, 6.0, s.loads.count))
+
+
+def growth_with_loads(quick: bool = False) -> None:
+    counts = (1, 10) if quick else (1, 10, 100, 1000)
+    for group, cost, work in (
+        ("vector field over loads", evaluation, lambda n: max(2000, 200_000 // n)),
+        ("time integration over loads, a step", integration, lambda n: max(200, 20_000 // n)),
+    ):
+        print(group)
+        base = before = None
+        for count in counts:
+            seconds, compiling = cost(count, work(count))
+            base = seconds if base is None else base
+            note = "" if before is None else f"{seconds / before[1] / (count / before[0]):.2f} of linear since the last"
+            say(group, "1 load" if count == 1 else f"{count} loads", seconds, base, None, compiling, note, loads=count)
+            before = (count, seconds)
 
 
 if __name__ == "__main__":
-    main()
+    jv.prepare_cpu()
+    jax.config.update("jax_enable_x64", True)
+    growth_with_loads()

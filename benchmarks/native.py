@@ -14,7 +14,6 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
-import jax
 import numba
 import numpy as np
 
@@ -181,8 +180,3 @@ def symbolic(y: Any, algebra: Any, speed: float, par: Any) -> list[Any]:
     lift = (force + mR * (y(5) ** 2 * s - torque * c)) / (M2 - e * c * c)
     first = (-d11 * y(2) - k11 * y(0) - d12 * y(3) - k12 * y(1)) * M1i
     return [y(2), y(3), first, lift, y(5), torque - ek * lift * c]
-
-
-def flat(state: Any) -> np.ndarray:
-    """A `State` of this machine as (6,) numbers."""
-    return np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(state)])

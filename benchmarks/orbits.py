@@ -9,29 +9,23 @@ the two-mass one of the antiphase paper with eps = 0.05.
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
+from common import best, first, published, say
 from jax.flatten_util import ravel_pytree
 
-jax.config.update("jax_enable_x64", True)
+import jaxvib as jv
+from jaxvib.steady.collocation import harmonics_of, periodic_motion
+from jaxvib.steady.grid import grid_of
+from jaxvib.steady.jam import jam_rotor_speed
+from jaxvib.steady.stability import floquet, steps_for
 
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-import jaxvib as jv  # noqa: E402
-from jaxvib.steady.collocation import harmonics_of, periodic_motion  # noqa: E402
-from jaxvib.steady.grid import grid_of  # noqa: E402
-from jaxvib.steady.jam import jam_rotor_speed  # noqa: E402
-from jaxvib.steady.stability import floquet, steps_for  # noqa: E402
-
-
-def published(eps: float = 0.05, speed: float = 3.0) -> jv.Scene:
-    numbers = dict(natural=(1 / 3, 1 / 3), damping=(0.01, 0.01), link_natural=2 / 3, link_damping=0.01, rho=1.0, beta=1.0)
-    return jv.Dimensionless("antiphase", **numbers, eps=eps, speed=speed).scene()
+GROUP = "exact orbits, each"
 
 
 def chain(platforms: int) -> jv.Scene:
@@ -47,19 +41,6 @@ def chain(platforms: int) -> jv.Scene:
         exciter=min(2, platforms),
     )
     return jv.Scene(machine, jv.balls(count=1, mass=0.05, radius=1.0, drag=0.0025), jv.ConstantSpeed(1.0))
-
-
-def timed(name: str, call: Callable, runs: int) -> tuple[object, float]:
-    begin = time.perf_counter()
-    result = jax.block_until_ready(call())
-    first = time.perf_counter() - begin
-    best = np.inf
-    for _ in range(runs):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        best = min(best, time.perf_counter() - begin)
-    print(f"{name:58s} compile {first - best:7.2f} s   run {1e3 * best:9.3f} ms")
-    return result, best
 
 
 @eqx.filter_jit
@@ -137,21 +118,21 @@ def trajectory(scene: jv.Scene, omega: float) -> tuple[jv.Orbit, np.ndarray, np.
     return orbit, theta / omega, state
 
 
-def with_jaxcont(scene: jv.Scene, omega: jax.Array, runs: int) -> None:
+def with_jaxcont(scene: jv.Scene, omega: jax.Array, base: float, runs: int) -> None:
     """jaxcont's collocation of the whole state: a Newton solution at a rotor speed 0.1 % off the one it starts from."""
     try:
         from jaxcont.core.collocation import Collocation
         from jaxcont.problems.periodic import periodic_orbit_problem
         from jaxcont.solvers.implicit import differentiable_root
     except ImportError:
-        print("jaxcont is not installed: left out")
+        print("  jaxcont is not installed: left out")
         return
 
     def field(u, n, _):
         return paper(u, n)
 
     for intervals, degree in ((10, 4), (12, 5)):
-        errors, best, mesh = [], np.inf, Collocation(intervals, degree)
+        errors, fastest, mesh = [], np.inf, Collocation(intervals, degree)
         residual: list[Callable] = []
 
         @jax.jit
@@ -163,30 +144,27 @@ def with_jaxcont(scene: jv.Scene, omega: jax.Array, runs: int) -> None:
             n, period = orbit.rotor_speed, 2.0 * np.pi / w
             near = periodic_orbit_problem(field, jnp.asarray(states), jnp.asarray(times), period, 1.001 * n, mesh)
             residual.append(near.f)
-            for _ in range(runs + 1):
-                begin = time.perf_counter()
-                found = jax.block_until_ready(solve(near.u0, n, *near.args[:2]))
-                best = min(best, time.perf_counter() - begin)
+            found = solve(near.u0, n, *near.args[:2])
+            fastest = min(fastest, best(lambda near=near, n=n, solve=solve: solve(near.u0, n, *near.args[:2]), runs))
             # An error of Omega at a given rotor speed is one of the rotor speed at a given Omega.
             errors.append(abs(2.0 * np.pi / found[-1] / w - 1.0) * abs(orbit.slope) * w / n)
-        name = f"jaxcont, {intervals} intervals of degree {degree}, one orbit"
-        print(f"{name:58s} run {1e3 * best:9.3f} ms\n    error of n {max(errors):.1e}")
+        say(GROUP, f"jaxcont, {intervals} intervals of degree {degree}", fastest, base, max(errors))
 
 
-def with_solve_bvp(omega: jax.Array) -> None:
+def with_solve_bvp(omega: jax.Array, base: float) -> None:
     """SciPy's solve_bvp on half a period, from the leading order."""
     from scipy.integrate import solve_bvp
 
     scene, eps = published(), 0.05
     for tol in (1e-6, 1e-9):
-        errors, best = [], np.inf
+        errors, fastest = [], np.inf
         for w in map(float, omega):
             exact, times, states = trajectory(scene, w)
             half = slice(0, 1001, 25)
             y = states[half].T.copy()
             phi = np.unwrap(np.arctan2(y[5], y[4]))
             y = np.stack([*y[:4], phi, y[6]])
-            first = phi[0]
+            pinned = phi[0]
             near = y * (1.0 + 1e-3)
 
             def field(t, y, p, eps=eps):
@@ -194,56 +172,78 @@ def with_solve_bvp(omega: jax.Array) -> None:
                 rates = paper(full, p[0], eps, np)
                 return np.stack([*rates[:4], y[5], rates[6]])
 
-            def ends(a, b, p, first=first):
-                return np.array([*(a[:4] + b[:4]), b[4] - a[4] - np.pi, b[5] - a[5], a[4] - first])
+            def ends(a, b, p, pinned=pinned):
+                return np.array([*(a[:4] + b[:4]), b[4] - a[4] - np.pi, b[5] - a[5], a[4] - pinned])
 
-            begin = time.perf_counter()
-            found = solve_bvp(field, ends, times[half], near, p=[1.001 * float(exact.rotor_speed)], tol=tol, max_nodes=20000)
-            best = min(best, time.perf_counter() - begin)
+            found: Any = None
+
+            def solve(half=half, near=near, field=field, ends=ends, times=times, exact=exact, tol=tol) -> None:
+                nonlocal found
+                guess = [1.001 * float(exact.rotor_speed)]
+                found = solve_bvp(field, ends, times[half], near, p=guess, tol=tol, max_nodes=20000)
+
+            fastest = min(fastest, first(solve))
             errors.append(abs(found.p[0] / float(exact.rotor_speed) - 1.0) if found.success else np.nan)
-        name = f"SciPy solve_bvp, tol {tol:.0e}, one orbit"
-        print(f"{name:58s} run {1e3 * best:9.3f} ms\n    error of n {np.nanmax(errors):.1e}")
+        say(GROUP, f"SciPy solve_bvp, tol {tol:.0e}", fastest, base, float(np.nanmax(errors)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--orbits", type=int, default=2000, help="a multiple of 100")
-    parser.add_argument("--runs", type=int, default=5)
-    options = parser.parse_args()
+def orbits(quick: bool = False) -> None:
+    count, runs = (200, 1) if quick else (2000, 5)
     scene = published()
-    omega = jnp.linspace(0.3, 1.5, options.orbits)
+    omega = jnp.linspace(0.3, 1.5, count)
+    print(f"{GROUP}, {count} of them at given load speeds; error: of the rotor speed")
     exact = np.ravel(collocation(scene, omega, 24, False)[0])
 
     def error(speeds) -> float:
         return float(np.nanmax(np.abs(np.ravel(speeds) / exact - 1.0)))
 
-    name = f"{options.orbits} orbits, "
-    for points in (6, 8, 12):
-        result, alone = timed(f"{name}{points} points", lambda p=points: collocation(scene, omega, p, False), options.runs)
-        whole = f"{name}{points} points, multipliers"
-        _, both = timed(whole, lambda p=points: collocation(scene, omega, p, True), options.runs)
-        each, with_all = 1e3 * alone / options.orbits, 1e3 * both / options.orbits
-        print(f"    error of n {error(result[0]):.1e}; {each:.4f} ms an orbit, {with_all:.4f} with multipliers")
+    base = np.nan
+    for points in (8, 6, 12):
+        for multipliers in (False, True):
+
+            def call(points: int = points, multipliers: bool = multipliers) -> Any:
+                return collocation(scene, omega, points, multipliers)
+
+            compiling, each = first(call), best(call, runs) / count
+            base = each if np.isnan(base) else base
+            name = f"jaxvib, {points} points" + (", multipliers" if multipliers else "")
+            say(GROUP, name, each, base, error(call()[0]), compiling)
 
     def from_leading_order(w):
         displacement = jv.steady_displacement(scene, w)
         return jnp.concatenate([displacement.real, -w * displacement.imag, jnp.stack([w, jam_rotor_speed(scene, w)])])
 
     start = jax.vmap(from_leading_order)(omega)
-    for steps in (32, 128):
-        text = f"{name}shooting, RK4, {2 * steps} steps a period"
-        result, _ = timed(text, lambda s=steps: shooting(scene, omega, s, start), 2)
-        right = np.abs(np.ravel(result) / exact - 1.0) < 1e-3
-        worst = error(np.where(right, np.ravel(result), np.nan))
-        print(f"    error of n {worst:.1e} where it converged, on {np.mean(right):.1%}")
+    for steps in (32,) if quick else (32, 128):
 
-    few = omega[:: max(1, options.orbits // 5)][1:]
-    with_jaxcont(scene, few, options.runs)
-    with_solve_bvp(few)
+        def shoot(steps: int = steps) -> Any:
+            return shooting(scene, omega, steps, start)
 
-    for points in (8, 16):
-        times = {}
-        for platforms in (2, 20):
+        compiling, each, found = first(shoot), best(shoot, 2) / count, np.ravel(shoot())
+        right = np.abs(found / exact - 1.0) < 1e-3
+        note = f"error where it converged, on {np.mean(right):.1%}"
+        say(
+            GROUP,
+            f"shooting, RK4, {2 * steps} steps a period",
+            each,
+            base,
+            error(np.where(right, found, np.nan)),
+            compiling,
+            note,
+        )
+
+    few = omega[:: max(1, count // 5)][1:]
+    with_jaxcont(scene, few, base, runs)
+    with_solve_bvp(few[:2] if quick else few, base)
+    value_and_gradient(quick, runs)
+
+
+def value_and_gradient(quick: bool, runs: int) -> None:
+    """At a given rotor speed, with respect to every number of the machine."""
+    group, base = "exact orbit and its gradient", None
+    print(f"{group}; error: of the load speed, to 16 points")
+    for platforms in (2,) if quick else (2, 20):
+        for points in (8, 16):
             machine = chain(platforms)
             flat, restore = ravel_pytree(machine)
             modes = jv.jam_modes(machine)
@@ -251,16 +251,17 @@ def main() -> None:
             near = float(modes.select(mode).omega)
 
             @jax.jit
-            def value_and_gradient(x, restore=restore, near=near, points=points):
+            def call(x, restore=restore, near=near, points=points):
                 return jax.value_and_grad(lambda v: jv.jam_orbit(restore(v), near=near, points=points).amplitude[0])(x)
 
-            text = f"value and gradient at a given n, {platforms} platforms, {points} points"
-            _, times[platforms] = timed(text, lambda f=value_and_gradient, x=flat: f(x), 40 * options.runs)
-            at = jv.jam_orbit(machine, near=near, points=16)
-            rough = jv.jam_orbit(machine, near=near, points=points, throw=False)
-            print(f"    error of Omega {abs(float(rough.omega / at.omega) - 1.0):.1e} (against 16 points)")
-        print(f"    20 platforms take {times[20] / times[2]:.1f} times as long as 2")
+            compiling = first(lambda call=call, x=flat: call(x))
+            seconds = best(lambda call=call, x=flat: call(x), 40 * runs)
+            base = seconds if base is None else base
+            at, rough = (jv.jam_orbit(machine, near=near, points=p, throw=False) for p in (16, points))
+            off = None if points == 16 else abs(float(rough.omega / at.omega) - 1.0)
+            say(group, f"{platforms} platforms, {points} points", seconds, base, off, compiling)
 
 
 if __name__ == "__main__":
-    main()
+    jax.config.update("jax_enable_x64", True)
+    orbits()

@@ -45,7 +45,8 @@ from jaxvib.steady.phases import PhaseJam, PhaseStatus, phase_jam, phase_torques
 from jaxvib.steady.response import natural_frequencies, steady_displacement
 from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
-from jaxvib.study.accuracy import Cost, CostRow, accuracy
+from jaxvib.study.accuracy import accuracy
+from jaxvib.study.cost import Cost, CostRow, cost_figure
 from jaxvib.study.criterion_map import CriterionMap, criterion_map
 from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
 from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
@@ -147,6 +148,7 @@ __all__ = [
     "branches",
     "characteristic_speeds",
     "compare_tiers",
+    "cost_figure",
     "criterion",
     "criterion_functional",
     "criterion_map",

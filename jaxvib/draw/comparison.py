@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
+__all__ = ["CostPanel", "convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
 
 
 def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray) -> Figure:
@@ -26,27 +30,60 @@ def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable:
     return figure
 
 
-def cost_chart(lines: Mapping[str, tuple[np.ndarray, np.ndarray]], floor: float, quantity: str) -> Figure:
-    """Relative error over seconds, a line of (seconds, error) for each name; below `floor` the reference itself may be wrong.
+class CostPanel(NamedTuple):
+    """What a panel of `cost_chart` shows: `lines` by name, (n, 2) seconds and relative errors each; `floor`, below which the
+    reference itself may be wrong; the `quantity`; `best` (m, 2), the points to ring."""
 
-    >>> figure = cost_chart({"exact": (np.array([1e-3, 2e-3]), np.array([1e-4, 1e-8]))}, 1e-9, "amplitude")
+    lines: Mapping[str, np.ndarray]
+    floor: float
+    quantity: str
+    best: np.ndarray
+
+
+def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]) -> Figure:
+    """Relative error over seconds, a panel for each title, two in a row; a name has one look in all of them, told in one
+    legend. Dotted lines at the errors that are `wanted`.
+
+    >>> lines = {"exact": np.array([[1e-3, 1e-4], [2e-3, 1e-8]])}
+    >>> figure = cost_chart({"": CostPanel(lines, 1e-9, "amplitude", lines["exact"][1:])}, [1e-6])
     >>> figure.axes[0].get_ylabel()
     'relative error of amplitude'
     """
-    figure, (axes,) = panels(1, size=(7.5, 4.5))
-    for k, (name, (seconds, error)) in enumerate(lines.items()):
-        there = np.isfinite(error)
-        shape = "os^Dv*P"[k % 7]
-        axes.loglog(
-            seconds[there], np.maximum(error[there], 1e-16), f"{shape}-", color=COLORS[k % len(COLORS)], ms=5, label=name
-        )
-    axes.axhspan(1e-17, max(floor, 1e-17), color="#eeeeee", label="the reference's own error")
-    errors = np.concatenate([error[np.isfinite(error)] for _, error in lines.values()])
-    axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([*errors, 1e-2]))
-    axes.set_xlabel("seconds, once compiled")
-    axes.set_ylabel(f"relative error of {quantity}")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
+    # Colours repeat after 8 and marks after 7, so that no two lines look alike.
+    looks = {name: dict(color=COLORS[k % len(COLORS)], marker="os^Dv*P"[k % 7]) for k, name in enumerate(names)}
+    columns = min(2, len(panels_by_title))
+    figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4))
+    for spare in cells[len(panels_by_title) :]:
+        spare.set_axis_off()
+    for axes, (title, panel) in zip(cells, panels_by_title.items(), strict=False):
+        _cost_panel(axes, panel, wanted, looks)
+        axes.set_title(title)
+    handles: list[Any] = [Line2D([], [], ms=5, **look) for look in looks.values()]  # pyright: ignore[reportArgumentType]
+    handles += [Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"), Patch(color=_FLOOR)]
+    told = ["cheapest within " + ", ".join(f"{error:.0e}" for error in wanted), "reference's own error"]
+    figure.legend(handles, [*names, *told], loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
     return figure
+
+
+_FLOOR = "#e6e6e6"
+
+
+def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Mapping[str, Any]) -> None:
+    for name, points in panel.lines.items():
+        seconds, error = points[np.isfinite(points[:, 1])].T
+        axes.loglog(seconds, np.maximum(error, 1e-16), ms=5, **looks[name])
+    floor = min(max(panel.floor, 1e-17), 1.0)
+    axes.axhspan(1e-17, floor, color=_FLOOR, zorder=0.4)
+    if panel.best.size:
+        axes.plot(*panel.best.T, "o", ms=11, mfc="none", color="black")
+    errors = np.concatenate([points[:, 1] for points in panel.lines.values()])
+    errors = errors[np.isfinite(errors)]
+    axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([floor, *errors, 1e-2]))
+    for error in wanted:
+        axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
+    axes.set_xlabel("seconds, once compiled")
+    axes.set_ylabel(f"relative error of {panel.quantity}")
 
 
 def convergence_chart(harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str]) -> Figure:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
+import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -13,72 +13,43 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
-from jaxvib.machine.effects import Gravity
+from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number
+from jaxvib.motion.dynamics import State
 from jaxvib.motion.envelope import envelope
 from jaxvib.motion.run import Run
-from jaxvib.motion.simulate import simulate
-from jaxvib.steady.jam import jam_modes
+from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.start import initial_state
+from jaxvib.steady.bodies import has_half_turn
+from jaxvib.steady.jam import JamStatus, jam_modes
 from jaxvib.steady.jam_orbit import jam_orbit
+from jaxvib.steady.orbit import Orbit
 from jaxvib.steady.response import natural_frequencies
+from jaxvib.study.cost import Cost, CostRow, relative, row_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["QUANTITIES", "Cost", "CostRow", "accuracy"]
+__all__ = ["QUANTITIES", "SOLVERS", "accuracy"]
 
 Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
 QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
 
+SOLVERS: dict[str, Any] = {"default": None, "Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
+"""Methods of time integration by name; the default is what `simulate` takes unless told otherwise."""
+
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
-_SOLVERS: dict[str, Any] = {"written out, order 8": None, "Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
 _POINTS = (8, 16)
 _AVERAGED = (1e-3, 1e-6)
 
+_SINGLE = 2e-6
+"""The smallest tolerance that single precision is asked for."""
 
-class CostRow(NamedTuple):
-    """One way of computing the quantity: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, in words),
-    its relative `error`, the `seconds` it took once compiled, and what the first call took besides, `compile`."""
+_GRADIENT_TOLERANCE = 1e-8
 
-    tier: str
-    method: str
-    dtype: str
-    setting: str
-    error: float
-    seconds: float
-    compile: float
+_MOST_NOTED = 2**17
+"""Steps that a run may take whose derivatives are asked for: the end of each is noted."""
 
-
-class Cost(NamedTuple):
-    """What a quantity costs: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
-    (`reference_error`, relative), and the `rows`."""
-
-    quantity: str
-    reference: list[float]
-    reference_error: float
-    rows: list[CostRow]
-
-    def cheapest(self, error: float) -> CostRow | None:
-        """The fastest way to that relative error; None if there is none here, or the reference is not good enough to tell."""
-        if not self.reference_error < error:
-            return None
-        able = [row for row in self.rows if row.error + self.reference_error <= error]
-        return min(able, key=lambda row: row.seconds, default=None)
-
-    def plot(self) -> Figure:
-        """Error against seconds, a line for each method. **Returns** a matplotlib figure."""
-        from jaxvib.draw.comparison import cost_chart  # slow to import: only who draws pays
-
-        names = list(dict.fromkeys((row.tier, row.method, row.dtype) for row in self.rows))
-        lines = {
-            ", ".join(part for part in name if part): (
-                np.array([row.seconds for row in self.rows if row[:3] == name]),
-                np.array([row.error for row in self.rows if row[:3] == name]),
-            )
-            for name in names
-        }
-        return cost_chart(lines, self.reference_error, self.quantity.replace("_", " "))
+_SLOW_PERIODS, _MOST_PERIODS = 20.0, 2000.0
+"""The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
 
 
 def accuracy(
@@ -88,91 +59,218 @@ def accuracy(
     mode: int | None = None,
     until: Number | None = None,
     tolerances: Sequence[float] = _TOLERANCES,
+    solvers: Sequence[str] = tuple(SOLVERS),
     repeats: int = 3,
 ) -> Cost:
     """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
 
-    - "amplitude", "foundation_force": of a jam mode; tiers leading order, exact orbit, averaged equations, and full
-      integration from the leading order's motion to `until`. The reference is the exact orbit with 32 points, its own error
-      the difference to 24.
-    - "final_state": of the full equations at `until`; every solver, in double and in single precision. The reference is a
-      run to a tolerance of 1e-13, its own error estimated as every run's.
+    - "amplitude", "foundation_force": of a jam mode, where the scene has jams that can be computed exactly; tiers leading
+      order, exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the
+      exact orbit with 32 points, its own error the difference to 24. Else (run-ups, imbalance, loads at different stations)
+      as measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error
+      the difference to 1e-11.
+    - "final_state": of the full equations at `until`, from rest; every solver, in double and in single precision. The
+      reference is a run to a tolerance of 1e-13, its own error estimated as every run's.
     - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
       order and exact orbit, forward and reverse mode and finite differences through the full integration.
 
-    **Arguments**: `mode` a jam mode (the highest there is with a rising slope unless said otherwise); `until` s or text, 20
-    slow periods unless said otherwise; `tolerances` of time integration; `repeats` how often each is timed, the fastest counts.
+    Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer
+    is left out, and the result says why.
 
-    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity; as `jam_modes`, `simulate` besides.
+    **Arguments**: `mode` a jam mode (the highest there is with a rising slope unless said otherwise); `until` s or text;
+    unless said otherwise 20 slow periods, and for a jam besides as long as its slowest Floquet multiplier needs to forget
+    the start to the tolerance of the run; `tolerances` of time integration; `solvers` its methods, names from `SOLVERS`;
+    `repeats` how often each is timed (less often where it takes seconds), the fastest counts.
+
+    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, a scene in single precision, a gradient
+    of a scene without an exact jam; as `jam_modes`, `simulate` besides.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
-    >>> cost = jv.accuracy(scene, "amplitude", mode=1, tolerances=(1e-6,), repeats=1)
+    >>> cost = jv.accuracy(scene, "amplitude", mode=1, tolerances=(1e-6,), solvers=["default"], repeats=1)
     >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
     ('exact orbit', True)
     """
     if quantity not in QUANTITIES:
         raise InputError("quantity", f"is {quantity!r}; it must be one of {', '.join(QUANTITIES)}")
-    slowest = float(jnp.min(jnp.where(natural_frequencies(scene) > 0.0, natural_frequencies(scene), scene.drive.speed)))
-    end = number(40.0 * np.pi / slowest if until is None else until, "s", "until", low=0.0, open_low=True)
+    unknown = [name for name in solvers if name not in SOLVERS]
+    if unknown or not solvers:
+        raise InputError("solvers", f"are {list(solvers)!r}; name some of {', '.join(SOLVERS)}")
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if scene.drive.speed.dtype.itemsize < 8:
+        problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
+        raise InputError("scene", problem)
+    end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
+    ask = _Ask(scene, tuple(tolerances), tuple(solvers), repeats)
     if quantity == "final_state":
-        return _final_state(scene, float(end), tolerances, repeats)
+        return _final_state(ask, end)
+    if quantity == "gradient":
+        return _gradient(scene, _exact_jam(scene, mode), end, repeats)
+    try:
+        jam = _exact_jam(scene, mode)
+    except InputError as problem:
+        if mode is not None:
+            raise
+        return _at_the_end(ask, quantity, end, f"leading order, exact orbit: {problem}")
+    return _steady(ask, quantity, jam, end)
+
+
+class _Ask(NamedTuple):
+    scene: Scene
+    tolerances: tuple[float, ...]
+    solvers: tuple[str, ...]
+    repeats: int
+
+
+class _Jam(NamedTuple):
+    """A jam mode exactly, with many points and fewer."""
+
+    mode: int
+    fine: Orbit
+    coarse: Orbit
+
+    def length(self, scene: Scene, tolerance: float) -> float:
+        """How long a run takes to forget its start to the tolerance, s, the measuring window after that."""
+        rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
+        window = _slow_period(scene) * _SLOW_PERIODS
+        return min(window + np.log(1.0 / tolerance) / rate, _slow_period(scene) * _MOST_PERIODS)
+
+
+def _exact_jam(scene: Scene, mode: int | None) -> _Jam:
+    if not isinstance(scene.drive, ConstantSpeed):
+        raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
+    modes = jam_modes(scene)
     if mode is None:
-        modes = jam_modes(scene)
         rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
         if not rising:
             raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
         mode = rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
-    if quantity == "gradient":
-        return _gradient(scene, mode, float(end), repeats)
-    return _steady(scene, quantity, mode, float(end), tolerances, repeats)
+    return _Jam(mode, *(jam_orbit(scene, mode=mode, points=_whole(scene, points)) for points in (32, 24)))
 
 
-def _timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
-    """A result, the seconds of its fastest computation, and what the first one took besides."""
-    begun = time.perf_counter()
-    value = jax.block_until_ready(call())
-    first, best = time.perf_counter() - begun, np.inf
-    for _ in range(repeats):
-        begun = time.perf_counter()
-        value = jax.block_until_ready(call())
-        best = min(best, time.perf_counter() - begun)
-    return value, best, max(first - best, 0.0)
+def _whole(scene: Scene, points: int) -> int:
+    """So many points on half a period, or as close together on a whole one where that is needed."""
+    return points if has_half_turn(scene) else 2 * points + 1
 
 
-def _relative(value: Any, reference: np.ndarray) -> float:
-    difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
-    return difference if np.isfinite(difference) else np.inf
+def _slow_period(scene: Scene) -> float:
+    frequencies = natural_frequencies(scene)
+    return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
 
 
-def _row(tier: str, method: str, setting: str, call: Callable[[], Any], reference: np.ndarray, repeats: int) -> CostRow:
-    value, seconds, compiling = _timed(call, repeats)
-    return CostRow(tier, method, "float64", setting, _relative(value, reference), seconds, compiling)
+def _single(tree: Any) -> Any:
+    """A scene, or more, in single precision; goes with `jax.enable_x64(False)`."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 
-def _steady(scene: Scene, quantity: str, mode: int, end: float, tolerances: Sequence[float], repeats: int) -> Cost:
+def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
+    scene, mode = ask.scene, jam.mode
+
     def read(found: Any) -> Any:
         return getattr(found, quantity)
 
-    fine, coarse = (read(jam_orbit(scene, mode=mode, points=points)) for points in (32, 24))
-    reference = np.ravel(np.asarray(fine, float))
-    rows = [_row("leading order", "", "", _compiled(lambda s: read(jam_modes(s).select(mode)), scene), reference, repeats)]
-    for points in _POINTS:
+    reference = np.ravel(np.asarray(read(jam.fine), float))
+
+    def error(value: Any) -> float:
+        return relative(value, reference)
+
+    def leading(scene: Scene, dtype: str) -> CostRow:
+        call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
+        return row_of("leading order", "", "", call, error, ask.repeats, dtype)
+
+    rows, left_out = [], []
+    light = jam_modes(scene).select(mode, throw=False)
+    if bool(light.status == JamStatus.found):
+        start = initial_state(scene, "jam", mode=mode)
+        rows.append(leading(scene, "float64"))
+        with jax.enable_x64(False):
+            rows.append(leading(_single(scene), "float32"))
+    else:
+        start = State(*jam.fine.at(jnp.zeros(())))
+        left_out.append(f"leading order: {JamStatus[light.status]}; runs start on the exact motion in its place")  # pyright: ignore
+    for few in _POINTS:
+        points = _whole(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
-        rows.append(_row("exact orbit", "", f"{points} points", call, reference, repeats))
-    if all(isinstance(effect, Gravity) for effect in scene.effects):
-        for tolerance in _AVERAGED:
+        rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
+    if not bool(jam.fine.stable):
+        left_out.append(_unstable("envelope, full", jam))
+    else:
 
-            def averaged(tolerance: float = tolerance) -> Any:
-                return read(envelope(scene, end, start="jam", mode=mode, save="window", tolerance=tolerance, throw=False))
+        def length(tolerance: float) -> float:
+            return jam.length(scene, tolerance) if end is None else end
 
-            rows.append(_row("envelope", "averaged equations", f"{tolerance:.0e}", averaged, reference, repeats))
-    for tolerance in tolerances:
-        run = _run_to(scene, end, tolerance, None, mode)
-        rows.append(_row("full", "written out, order 8", f"{tolerance:.0e}", lambda run=run: read(run()), reference, repeats))
-    return Cost(quantity, reference.tolist(), _relative(coarse, reference), rows)
+        integrated, reasons = _integrated(ask, read, error, start, length)
+        rows, left_out = rows + integrated, left_out + reasons
+    return Cost(quantity, reference.tolist(), relative(read(jam.coarse), reference), rows, tuple(left_out))
+
+
+def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
+    """Of a motion that is no jam: as measured at the end of a run from rest."""
+    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+
+    def read(found: Any) -> Any:
+        return getattr(found, quantity)
+
+    start = initial_state(ask.scene)
+
+    @functools.cache
+    def reference(tolerance: float = 1e-13) -> np.ndarray:
+        """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
+        return np.ravel(np.asarray(read(simulate(ask.scene, end, save="window", tolerance=tolerance, estimate=False)), float))
+
+    rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
+    return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
+
+
+def _integrated(
+    ask: _Ask,
+    read: Callable[[Any], Any],
+    error: Callable[[Any], float],
+    start: State,
+    length: Callable[[float], float],
+) -> tuple[list[CostRow], list[str]]:
+    """What comes out at the end of averaged and full runs, of a `length` for each tolerance."""
+    full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
+    for tolerance in _AVERAGED:
+        end = length(tolerance)
+
+        def averaged(end: float = end, tolerance: float = tolerance) -> Any:
+            return read(envelope(ask.scene, end, start=start, save="window", tolerance=tolerance, throw=False))
+
+        try:
+            rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, ask.repeats))
+        except InputError as problem:
+            left_out.append(f"envelope: {problem}")
+            break
+    return rows + full, left_out
+
+
+def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
+    """Full runs by every solver to every tolerance, in double and (the default method) in single precision."""
+    ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
+    steps = enough_steps(ask.scene, jnp.asarray(max(ends.values())))  # one for all: it is a part of the program
+
+    def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
+        solver = None if SOLVERS[name] is None else SOLVERS[name]()
+
+        def run(tolerance: float) -> Run:
+            asked = dict(save="window", tolerance=tolerance, solver=solver, estimate=False, max_steps=steps, throw=False)
+            return simulate(scene, ends[tolerance], start=start, **asked)  # pyright: ignore[reportArgumentType]
+
+        return [
+            row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
+            for tolerance in ask.tolerances
+            if tolerance >= least
+        ]
+
+    found = [row for name in ask.solvers for row in rows(ask.scene, start, name, "float64")]
+    if "default" in ask.solvers:
+        with jax.enable_x64(False):
+            found += rows(_single(ask.scene), _single(start), "default", "float32", _SINGLE)
+    return found
 
 
 def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], Any]:
@@ -180,33 +278,16 @@ def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], An
     return lambda: jitted(scene)
 
 
-def _run_to(scene: Scene, end: float, tolerance: float, solver: Any, mode: int | None) -> Callable[[], Run]:
-    start: Any = "rest" if mode is None else "jam"
-    chosen = None if solver is None else solver()
-    return lambda: simulate(
-        scene, end, start=start, mode=mode, save="window", tolerance=tolerance, solver=chosen, estimate=False, throw=False
-    )
+def _final_state(ask: _Ask, end: float | None) -> Cost:
+    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+    best = functools.cache(lambda: simulate(ask.scene, end, save="window", tolerance=1e-13))
 
+    def error(run: Run) -> float:
+        return _largest(_scaled(ask.scene, run) - _scaled(ask.scene, best()))
 
-def _final_state(scene: Scene, end: float, tolerances: Sequence[float], repeats: int) -> Cost:
-    best = simulate(scene, end, save="window", tolerance=1e-13)
-    reference = _scaled(scene, best)
-    rows = []
-    for name, solver in _SOLVERS.items():
-        for tolerance in tolerances:
-            run = _run_to(scene, end, tolerance, solver, None)
-            found, seconds, compiling = _timed(run, repeats)
-            error = _largest(_scaled(scene, found) - reference)
-            rows.append(CostRow("full", name, "float64", f"{tolerance:.0e}", error, seconds, compiling))
-    with jax.enable_x64(False):
-        single = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), scene)
-        for tolerance in tolerances:
-            if tolerance >= 2e-6:
-                run = _run_to(single, end, tolerance, None, None)
-                found, seconds, compiling = _timed(run, repeats)
-                error = _largest(_scaled(single, found) - reference)
-                rows.append(CostRow("full", "written out, order 8", "float32", f"{tolerance:.0e}", error, seconds, compiling))
-    return Cost("final_state", reference.tolist(), float(best.error), rows)
+    rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)
+    reason = "leading order, exact orbit, envelope: they know no phase, which is a part of the final state"
+    return Cost("final_state", _scaled(ask.scene, best()).tolist(), float(best().error), rows, (reason,))
 
 
 def _scaled(scene: Scene, run: Run) -> np.ndarray:
@@ -225,43 +306,64 @@ def _largest(difference: np.ndarray) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _gradient(scene: Scene, mode: int, end: float, repeats: int) -> Cost:
-    stiffness = scene.machine.stiffness  # pyright: ignore[reportAttributeAccessIssue]
+def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
+    mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
+    stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
+    end = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
+    few, more, most = (_whole(scene, points) for points in (16, 24, 32))
+    tolerance = f"{_GRADIENT_TOLERANCE:.0e}"
+    max_steps = min(enough_steps(scene, jnp.asarray(end)), _MOST_NOTED)
 
     def at(k: Any) -> Scene:
-        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k)
+        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
 
-    def exact(k: Any, points: int = 16) -> Any:
+    def exact(k: Any, points: int = few) -> Any:
         return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
 
     def leading(k: Any) -> Any:
         return jnp.max(jam_modes(at(k)).select(mode).amplitude)
 
     def full(k: Any, adjoint: Any = None) -> Any:
-        run = simulate(
-            at(k), end, start="jam", mode=mode, save="window", tolerance=1e-8, adjoint=adjoint, max_steps=2**17, throw=False
-        )
-        return jnp.max(run.amplitude)
+        asked = dict(start="jam", mode=mode, save="window", tolerance=_GRADIENT_TOLERANCE, max_steps=max_steps, throw=False)
+        return jnp.max(simulate(at(k), end, adjoint=adjoint, **asked).amplitude)  # pyright: ignore[reportArgumentType]
 
-    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (32, 24))
-    forward = diffrax.ForwardMode()
+    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
     value = eqx.filter_jit(full)
-
-    def differences() -> np.ndarray:
-        steps = 1e-5 * np.asarray(stiffness)
-        moves = [np.eye(len(steps))[k] * step for k, step in enumerate(steps) if step > 0.0]
-        found = [(float(value(stiffness + m)) - float(value(stiffness - m))) / (2.0 * np.sum(m)) for m in moves]
-        whole = np.zeros(len(steps))
-        whole[steps > 0.0] = found
-        return whole
-
     ways: list[tuple[str, str, str, Callable[..., Any]]] = [
-        ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))),
-        ("exact orbit", "implicit, reverse", "16 points", jax.jit(jax.grad(exact))),
-        ("exact orbit", "implicit, forward", "16 points", jax.jit(jax.jacfwd(exact))),
-        ("full", "forward", "1e-08", jax.jit(jax.jacfwd(lambda k: full(k, forward)))),
-        ("full", "reverse", "1e-08", jax.jit(jax.grad(full))),
-        ("full", "finite differences", "1e-08", lambda _: differences()),
+        ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
+        ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
     ]
-    rows = [_row(tier, method, setting, lambda f=f: f(stiffness), fine, repeats) for tier, method, setting, f in ways]
-    return Cost("gradient", fine.tolist(), _relative(coarse, fine), rows)
+    left_out: list[str] = []
+    light = jam_modes(scene).select(mode, throw=False).status
+    if not bool(light == JamStatus.found):
+        left_out = [f"leading order, full, which starts from it: {JamStatus[light]}"]  # pyright: ignore
+    else:
+        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
+        if not bool(jam.fine.stable):
+            left_out = [_unstable("full", jam)]
+        else:
+            ways += [
+                ("full", "forward", tolerance, jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
+                ("full", "reverse", tolerance, jax.jit(jax.grad(full))),
+                ("full", "finite differences", tolerance, lambda k: _differences(value, k)),
+            ]
+    rows = [
+        row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
+        for tier, method, setting, f in ways
+    ]
+    return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
+
+
+def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
+    """Central differences, each number moved by 1e-5 of itself; 0 for those that are 0."""
+    steps = 1e-5 * np.asarray(at)
+    whole = np.zeros(len(steps))
+    for k in np.flatnonzero(steps):
+        move = np.eye(len(steps))[k] * steps[k]
+        whole[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
+    return whole
+
+
+def _unstable(tiers: str, jam: _Jam) -> str:
+    multiplier = float(jam.fine.multiplier)
+    return f"{tiers}: jam mode {jam.mode} is unstable (largest Floquet multiplier {multiplier:.4g}), a run leaves it"

@@ -1,0 +1,97 @@
+"""Gradients: of a run by every way there is, their memory over long runs, and of leading-order designs.
+
+Run by engine.py. The machine and its start are those of single.py.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import best, first, published, say, thrown
+
+import jaxvib as jv
+
+NAMES = ("stiffness", "damping", "link_stiffness", "link_damping")
+
+
+def gradient(quick: bool = False) -> None:
+    """What a user writes: `simulate` under `jit`, `jacfwd` and `grad`; a displacement at the end by 6 numbers."""
+    end = 40.0 if quick else 200.0
+    scene, start = published(), thrown()
+    values = jnp.concatenate([getattr(scene.machine, name) for name in NAMES])
+
+    def value(x: jax.Array, adjoint: Any = None, **steps: Any) -> jax.Array:
+        moved = eqx.tree_at(lambda s: [getattr(s.machine, name) for name in NAMES], scene, [x[:2], x[2:4], x[4:5], x[5:6]])
+        run = jv.simulate(moved, end, start=start, save="window", adjoint=adjoint, max_steps=2**13, **steps)
+        return run.window.state.displacement[-1, 1]
+
+    for how, steps in (("tolerance 1e-8", dict(tolerance=1e-8)), ("equal steps", dict(steps=int(5 * end)))):
+        group = f"gradient, {how}"
+        print(f"{group}: the end state of simulate by 6 numbers, T = {end:g}")
+        run = jax.jit(lambda x, steps=steps: value(x, **steps))
+        compiling = first(lambda run=run: run(values))
+        base = best(lambda run=run: run(values), 15)
+        say(group, "the run itself, jitted", base, base, None, compiling)
+
+        def differences(x: jax.Array, run: Any = run) -> jax.Array:
+            moves = 1e-5 * jnp.diag(x)
+            return jnp.stack([(run(x + m) - run(x - m)) / (2e-5 * x[k]) for k, m in enumerate(moves)])
+
+        ways = (
+            ("forward mode", jax.jit(jax.jacfwd(lambda x, s=steps: value(x, diffrax.ForwardMode(), **s)))),
+            ("reverse mode", jax.jit(jax.grad(lambda x, s=steps: value(x, **s)))),
+            ("finite differences, 12 runs", differences),
+        )
+        reference = None
+        for name, call in ways:
+            compiling = first(lambda call=call: call(values))
+            found = np.asarray(call(values))
+            off = None if reference is None else float(np.max(np.abs(found - reference)) / np.max(np.abs(reference)))
+            reference = found if reference is None else reference
+            seconds = best(lambda call=call: call(values), 7)
+            say(group, name, seconds, base, off, compiling, "" if off is None else "error: to forward mode")
+
+
+def memory(quick: bool = False) -> None:
+    group = "memory of a reverse gradient"
+    print(f"{group}: temporary arrays of the compiled program, by turns of the rotor; tolerance 1e-6")
+    scene, start = published(), thrown()
+    for turns in (30, 100) if quick else (100, 300, 1000, 3000, 10_000):
+        end = 2.0 * np.pi * turns / float(scene.drive.speed)
+
+        def value(n: jax.Array, end: float = end, turns: int = turns) -> jax.Array:
+            moved = eqx.tree_at(lambda s: s.drive.speed, scene, n)
+            asked = dict(start=start, save="window", tolerance=1e-6, max_steps=16 * turns)
+            run = jv.simulate(moved, end, **asked)
+            return run.window.state.displacement[-1, 1]
+
+        compiled = jax.jit(jax.grad(value)).lower(scene.drive.speed).compile()
+        finite = bool(jnp.isfinite(compiled(scene.drive.speed)))
+        analysis = compiled.memory_analysis()
+        size = None if analysis is None else analysis.temp_size_in_bytes
+        seconds = best(lambda compiled=compiled: compiled(scene.drive.speed), 2)
+        note = ("" if size is None else f"{size / 2**20:.3f} MiB") + ("" if finite else ", did not finish")
+        say(group, f"{turns} turns", seconds, None, None, None, note, turns=turns, bytes=size)
+
+
+def designs(quick: bool = False) -> None:
+    count, group = (10_000, "leading-order designs") if quick else (200_000, "leading-order designs")
+    scene, rng = published(), np.random.default_rng(0)
+    stiffness = jnp.asarray(rng.uniform(0.05, 0.2, (count, 2)))
+
+    def one(k: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.value_and_grad(
+            lambda k: jv.jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
+        )(k)
+
+    call = jax.jit(lambda k: jax.lax.map(jax.vmap(one), k.reshape(-1, 1000, 2)))
+    compiling = first(lambda: call(stiffness))
+    each = best(lambda: call(stiffness)) / count
+    print(group)
+    note = f"{1.0 / each:.2e} a second on one device"
+    say(group, "value and gradient of the jam's rotor speed", each, None, None, compiling, note, per_second=1.0 / each)

@@ -1,0 +1,111 @@
+"""What ways of computing one quantity cost: rows of a table, the cheapest of them, the figure."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "timed"]
+
+WANTED = (1e-2, 1e-4, 1e-6)
+"""Errors for which tables and figures name the cheapest way."""
+
+_PATIENCE = 1.0
+"""Seconds after which a timing is not repeated any more."""
+
+
+class CostRow(NamedTuple):
+    """One way of computing the quantity: `tier`, `method`, `dtype`, `setting` (a tolerance or a number of points, in words),
+    its relative `error`, the `seconds` it took once compiled, and what the first call took besides, `compile`."""
+
+    tier: str
+    method: str
+    dtype: str
+    setting: str
+    error: float
+    seconds: float
+    compile: float
+
+
+class Cost(NamedTuple):
+    """What a quantity costs: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
+    (`reference_error`, relative), the `rows`, and which tiers are `left_out`, a sentence with the reason for each."""
+
+    quantity: str
+    reference: list[float]
+    reference_error: float
+    rows: list[CostRow]
+    left_out: tuple[str, ...] = ()
+
+    def cheapest(self, error: float) -> CostRow | None:
+        """The fastest way to that relative error; None if there is none here, or the reference is not good enough to tell."""
+        if not self.reference_error < error:
+            return None
+        able = [row for row in self.rows if row.error + self.reference_error <= error]
+        return min(able, key=lambda row: row.seconds, default=None)
+
+    def plot(self) -> Figure:
+        """Error against seconds, a line for each method; see `cost_figure`. **Returns** a matplotlib figure."""
+        return cost_figure({"": self})
+
+
+def cost_figure(costs: Mapping[str, Cost]) -> Figure:
+    """Error against seconds, a panel for each of `costs` by its title, a line for each method, the same in all panels.
+
+    Rings mark the cheapest way to each of the errors `WANTED`. **Returns** a matplotlib figure.
+    """
+    from jaxvib.draw.comparison import CostPanel, cost_chart  # slow to import: only who draws pays
+
+    def panel(cost: Cost) -> CostPanel:
+        names = list(dict.fromkeys(row[:3] for row in cost.rows))
+        lines = {
+            ", ".join(part for part in name if part): np.array([row[5:3:-1] for row in cost.rows if row[:3] == name])
+            for name in names
+        }
+        chosen = [row for row in map(cost.cheapest, WANTED) if row is not None]
+        best = np.reshape(np.array([row[5:3:-1] for row in chosen]), (-1, 2))
+        return CostPanel(lines, cost.reference_error, cost.quantity.replace("_", " "), best)
+
+    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED)
+
+
+def timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
+    """A result, the seconds of its fastest computation, and what the first one took besides."""
+    begun = time.perf_counter()
+    value = jax.block_until_ready(call())
+    first, best, spent = time.perf_counter() - begun, np.inf, 0.0
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        value = jax.block_until_ready(call())
+        took = time.perf_counter() - begun
+        best, spent = min(best, took), spent + took
+        if spent > _PATIENCE:
+            break
+    return value, best, max(first - best, 0.0)
+
+
+def relative(value: Any, reference: np.ndarray) -> float:
+    """The largest difference, relative to the largest entry; infinite for what is not finite."""
+    difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
+    return difference if np.isfinite(difference) else np.inf
+
+
+def row_of(
+    tier: str,
+    method: str,
+    setting: str,
+    call: Callable[[], Any],
+    error: Callable[[Any], float],
+    repeats: int,
+    dtype: str = "float64",
+) -> CostRow:
+    """The row of what `call` computes; its `error` is asked for after it was timed."""
+    value, seconds, compiling = timed(call, repeats)
+    return CostRow(tier, method, dtype, setting, error(value), seconds, compiling)
