@@ -16,7 +16,7 @@ from jax.extend import core
 
 from jaxvib.motion.dynamics import Dynamics, State
 from jaxvib.motion.scalars import Unwritten, on_numbers, split
-from jaxvib.motion.solver import WrittenOut
+from jaxvib.motion.solver import Wrapped, WrittenOut
 
 __all__ = ["Motion", "Tolerance"]
 
@@ -74,9 +74,8 @@ class Motion(eqx.Module):
 
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
-        if self.wrapped or self.size <= _MOST_WRITTEN:
-            return WrittenOut(lanes=lanes, wrap=self._wrap if self.wrapped else None)
-        return diffrax.Dopri8()
+        wrap = self._wrap if self.wrapped else None
+        return WrittenOut(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else Wrapped(wrap=wrap)
 
     def held(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["WrittenOut"]
+__all__ = ["Wrapped", "WrittenOut"]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _STAGES = len(_TABLEAU.b_sol) - 1
@@ -81,6 +81,19 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
         k = jax.tree.map(lambda *k: jnp.stack([dt * value for value in k]), *stages, last)
         end = y1 if self.wrap is None else self.wrap(y1)
         return end, error, dict(y0=y0, y1=y1, k=k), last, diffrax.RESULTS.successful
+
+
+class Wrapped(diffrax.Dopri8):
+    """`diffrax.Dopri8`, after each of whose steps `wrap` is done to the state: see `WrittenOut`."""
+
+    wrap: Callable[[Any], Any] | None = None
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
+        """As `WrittenOut.step`."""
+        y1, error, dense, last, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return y1 if self.wrap is None else self.wrap(y1), error, dense, last, result
 
 
 def _weighted(weights: Any, values: Any) -> Array:
