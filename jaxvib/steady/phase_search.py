@@ -306,7 +306,8 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     order = np.concatenate([places[cut:], places[:cut][::-1]])
     followed = _followed(scene, jam.phase, jnp.asarray(speeds[order]), jnp.asarray(places == speeds.size - cut))
     values = (value[np.argsort(order)] for value in followed)
-    return PhaseBranch(jnp.asarray(speeds), *values, scene.drive.speed, jnp.broadcast_to(loads.drag, (loads.count,)))
+    drag = jnp.broadcast_to(loads.drag, (loads.count,))
+    return PhaseBranch(jnp.asarray(speeds), *values, rotor_speed=scene.drive.speed, drag=drag)
 
 
 @eqx.filter_jit
