@@ -65,6 +65,13 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
+    assert "loads can stay jammed at 164.63 rad/s (together)" in typed("modes", "rotor.toml")[1]
+    (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
+    for words in (("modes", "--exact"), ("criterion",), ("cost",)):
+        code, out, err = typed(words[0], "stations.toml", *words[1:])
+        assert (code, out) == (2, "") and "machine.stations differ; this holds for loads that run at one point" in err
+    code, _, err = typed("whirl", "stations.toml", "--speed", "-5")
+    assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
 
 def test_modes_speed_option_replaces_the_scene_s(typed):

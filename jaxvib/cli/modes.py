@@ -126,7 +126,11 @@ def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
         speed = float(scene.drive.speed)
         head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "force on bed, N"]
         title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
-        return table(title, head, rows) if rows else f"no jam at {speed:.5g} rad/s"
+        if not rows:
+            return f"no jam at {speed:.5g} rad/s"
+        kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({jam.pattern_label})" for jam in jams if jam.stable)
+        said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
+        return table(title, head, rows) + "\n" + said
 
     output.done(document, text, "modes")
 
