@@ -39,6 +39,9 @@ _GRID = 240
 _SHOWN = 30.0
 """So many times the scene's drag, and the same part of it, a figure of all jams reaches."""
 
+_SAME_LINE = 5e-3
+"""Unstable patterns whose drags differ by less, relative, are drawn once."""
+
 _JUMP = 0.3
 """Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
 
@@ -88,7 +91,11 @@ class PhaseJams(PhaseJam):
             jam = self.select(k)
             if not any(_passes(branch, place, jam.growth) for branch in branches):
                 branches.append(phase_branch(self.scene, jam, jnp.asarray(speeds)))
-                curves.append((jam.pattern_label, *_curve(branches[-1])))
+                factor, at, stable = _curve(branches[-1])
+                for _, other, _, _ in curves:
+                    # Dashes on other dashes would look like a line that is not broken.
+                    factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE * factor), np.nan, factor)
+                curves.append((jam.pattern_label, factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
         label = "drag, times the scene's"
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit)
