@@ -216,7 +216,8 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     """
     carrier = scene.machine.carrier()
     if carrier.gyroscopic is not None and speed is None:
-        raise InputError("machine.kind", f"is {scene.machine.kind!r}; leading-order jams hold for machines of platforms")
+        problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
+        raise InputError("machine.kind", f"is {scene.machine.kind!r}; {problem}")
     force = jammed_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
     return small_solve(dynamic_stiffness(scene, omega, speed), force)
 
