@@ -53,8 +53,7 @@ def test_sines_have_exact_derivatives_of_any_order():
 @pytest.mark.parametrize("machine", ["one_mass", "two_mass", "three_mass"])
 @pytest.mark.parametrize("load", sorted(loads()))
 @pytest.mark.parametrize("effects", [(), (jv.Gravity(),)])
-def test_on_numbers_the_equations_are_the_same(machine, load, effects, monkeypatch):
-    monkeypatch.setattr("jaxvib.motion.engine._MOST_NUMBERS", 100)
+def test_on_numbers_the_equations_are_the_same(machine, load, effects):
     s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
     state, field = some_state(s), jv.vector_field(s)
     motion = Motion(field, state)
@@ -228,19 +227,20 @@ def test_ensembles_that_cannot_be(change, says):
 
 
 def test_single_precision_keeps_its_phase():
-    """A load that turns with its rotor for ten thousand turns: an angle of 6e4 rad would be good to 4e-3 only."""
+    """A load that turns with its rotor for 1e5 turns: an angle of 6e5 rad would be good to 0.06 only, and each step would round
+    it anew; so the only error is that of the time itself."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     with jax.enable_x64(False):
         free = jv.Scene(machine32(machine), jv.pendulums(count=1, mass=1e-6, radius=0.1, drag=1e-4), jv.ConstantSpeed(100.0))
         start = eqx.tree_at(lambda y: (y.angle, y.rate), jv.initial_state(free), ((jnp.zeros(1),), (jnp.full(1, 100.0),)))
-        run = jv.simulate(free, 628.3185, start=start, save="window", tolerance=1e-5, estimate=False, max_steps=2**20)
+        run = jv.simulate(free, 6283.185, start=start, save="window", tolerance=1e-5, estimate=False)
         phase = np.asarray(run.window.state.angle[0][:, 0], float) - 100.0 * np.asarray(run.window.time, float)
         assert run.amplitude.dtype == jnp.float32
         # A mean speed is an angle over a time between two samples, each of whose times is rounded by up to a spacing.
         times = np.asarray(run.window.time)
         bound = 2.0 * float(np.spacing(times[-1])) / float(times[-1] - times[0])
         np.testing.assert_allclose(float(run.omega), 100.0, rtol=bound)
-    assert np.max(np.abs(phase)) < 0.02  # what single precision can say of an angle and of a time so large
+    assert np.max(np.abs((phase + np.pi) % (2.0 * np.pi) - np.pi)) < 100.0 * float(np.spacing(times[-1]))
 
 
 def machine32(machine):
@@ -252,7 +252,9 @@ def test_wrapping_counts_every_turn():
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
     for together in (False, True):
         motion = Motion(jv.vector_field(s), state, wrapped=True, together=together)
-        held = motion.wrap(motion.held(state))
+        method = motion.method()
+        assert isinstance(method, WrittenOut) and method.wrap is not None
+        held = method.wrap(motion.held(state))
         if not together:
             assert float(jnp.max(jnp.abs(motion._angles(held[0])[0]))) <= np.pi
         back, since = motion.states(jax.tree.map(lambda x: x[None], held))

@@ -274,3 +274,14 @@ def test_wrong_questions_are_refused():
         jv.jam_orbit(scene, mode=1)
     with pytest.raises(jv.InputError, match=r"loads\.drag"):
         jv.jam_orbit(eqx.tree_at(lambda s: s.loads.drag, scene, 0.0), omega=0.9)
+
+
+def test_tiers_differ_in_proportion_to_the_loads_mass():
+    """Leading order means just that; where a tier has no answer it says why."""
+    found = jv.compare_tiers(published().scene(), (0.1, 1.0, 1e3), mode=3)
+    apart = np.abs(found.leading.omega / found.exact.omega - 1.0)
+    np.testing.assert_allclose(apart[1] / apart[0], 10.0, rtol=0.05)
+    for tier, word in ((found.leading, "mode"), (found.exact, "periodic motion")):
+        assert word in tier.message[0] and "does not exist" in tier.message[2]
+        assert np.isfinite(tier.amplitude[:2]).all() and np.isnan(tier.amplitude[2]).all()
+    assert found.plot().axes[0].get_xlabel() == "mass of a load, kg"

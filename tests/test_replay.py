@@ -98,6 +98,14 @@ def test_every_lane_of_a_batch_has_its_own_steps():
     np.testing.assert_allclose(jax.jit(jax.vmap(slopes))(factors), each, rtol=1e-10)
 
 
+def test_any_adaptive_controller_will_do():
+    def value(args, adjoint=None):
+        return run(args, end=30.0, controller=diffrax.PIDController(rtol=1e-7, atol=1e-7), adjoint=adjoint)
+
+    forward = jax.jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(value))(ARGS), forward, atol=1e-9)
+
+
 @pytest.mark.parametrize("controller", [diffrax.ConstantStepSize(), diffrax.StepTo(jnp.linspace(0.0, 30.0, 301))])
 def test_given_steps_need_no_noting(controller):
     def value(args, adjoint=None):

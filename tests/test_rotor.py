@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.motion.engine import Motion
 
 STATIONS = (0.28, 0.25, -0.25, -0.28)
 MASS, ECCENTRICITY, LEAN, GAMMA = 37.0, 2.2e-4, 3e-4, 0.7
@@ -258,6 +259,28 @@ def test_equations_are_lagranges(name):
         t = jnp.asarray(0.7)
         field = jv.vector_field(s)(t, state)
         np.testing.assert_allclose(residual(s, t, state, field), 0.0, atol=2e-12)
+
+
+@pytest.mark.parametrize("name", ["imbalance, spin-up", "imbalance, dc", "supports", "friction, run-up"])
+def test_equations_are_the_same_on_numbers(name):
+    """As they are integrated."""
+    s = case(name)
+    state, t = rotor_state(s, 5), jnp.asarray(0.7)
+    motion = Motion(jv.vector_field(s), state)
+    assert motion.few
+    rates = motion.term.vf(t, motion.held(state), motion.args)
+    ours, _ = motion.states(jax.tree.map(lambda x: x[None], rates))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jv.vector_field(s)(t, state)), strict=True):
+        np.testing.assert_allclose(a[0], b, rtol=1e-11, atol=1e-12 * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("name", ["friction, exact, dc", "contact"])
+def test_equations_that_are_many_or_cut_arrays_up_stay_on_arrays(name):
+    s = case(name)
+    state = rotor_state(s, 5)
+    motion = Motion(jv.vector_field(s), state)
+    assert not motion.few
+    assert motion.held(state) is state
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -153,14 +153,13 @@ class Dynamics(eqx.Module):
         answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
         across = {axis: [column[axis] for column in columns] for axis in axes}
         # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
-        onto = [(axis, None) for axis in axes]
-        if self.stations is not None:
-            onto += [(axis, self.stations) for axis in axes]
-        weight = [
-            [self._total(m * (1.0 if i == k else 0.0) - m * _dot(across[i], answers[k]), first, second) for k, second in onto]
-            for i, first in onto
-        ]
-        reaction = [self._total(m * (_dot(across[i], free) + curvature[i]), arm) for i, arm in onto]
+        arms = self._arms()
+        onto = [(axis, arm) for arm in range(len(arms)) for axis in axes]
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * _dot(across[i], answers[k]) for i in axes for k in axes}
+        moments = {(i, k, n): self._total(own[i, k], *arms[1:2] * n) for i, k in own for n in range(2 * len(arms) - 1)}
+        weight = [[moments[i, k, first + second] for k, second in onto] for i, first in onto]
+        push = {i: m * (_dot(across[i], free) + curvature[i]) for i in axes}
+        reaction = [self._total(push[i], *arms[1:2] * n) for i, n in onto]
         return _Eliminated(free, answers, weight, reaction, drag, pull)
 
     def _with_rotor(
@@ -174,8 +173,8 @@ class Dynamics(eqx.Module):
         free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
-            arms = [None] if self.stations is None else [None, self.stations]
-            row = [self._total(part.pull[axis], arm) / self.drive.inertia for arm in arms for axis in self.axes]
+            arms = self._arms()
+            row = [self._total(part.pull[i], *arms[1:2] * n) / self.drive.inertia for n in range(len(arms)) for i in self.axes]
         if throw is None:
             return part.weight, part.reaction, (free, row)
         along, bend = throw
@@ -230,9 +229,13 @@ class Dynamics(eqx.Module):
             return dict(zip(self.axes, a[:n], strict=True))
         return {axis: a[k] + self.stations * a[n + k] for k, axis in enumerate(self.axes)}
 
-    def _total(self, values: Array, *arms: Array | None) -> Array:
+    def _arms(self) -> list[Any]:
+        """The levers of the port's rows: 1, and where loads have stations those, for the tilts."""
+        return [1.0] if self.stations is None else [1.0, self.stations]
+
+    def _total(self, values: Array, *arms: Array) -> Array:
         for arm in arms:
-            values = values if arm is None else values * arm
+            values = values * arm
         return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 from jax import Array
+from jax.extend import core
 
 from jaxvib.motion.dynamics import Dynamics, State
 from jaxvib.motion.scalars import Unwritten, on_numbers, split
@@ -21,8 +22,8 @@ __all__ = ["Motion", "Tolerance"]
 
 _TURN = 2.0 * math.pi
 
-_MOST_NUMBERS = 32
-"""Above so many numbers in a state, equations written out on each of them take too long to compile for what they save."""
+_MOST_NUMBERS, _MOST_OPERATIONS = 32, 1200
+"""With more numbers in a state, or operations on them, equations written out take too long to compile for what they save."""
 
 _MOST_WRITTEN = 8
 """The same for the method's stages, written out one after another: they take 13 times as long to compile."""
@@ -37,11 +38,12 @@ class Motion(eqx.Module):
     **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
     the same turns, so that their differences stay.
 
-    **Attributes**: `few` whether numbers are held; `size` how many there are; `args` the arguments of `term`.
+    **Attributes**: `program` the equations on numbers, None where the state is held itself; `size` how many numbers it has;
+    `args` the arguments of `term`.
     """
 
     args: Any
-    few: bool = eqx.field(static=True)
+    program: Any = eqx.field(static=True)
     size: int = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: Any = eqx.field(static=True)
@@ -53,16 +55,17 @@ class Motion(eqx.Module):
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
-        self.few = self.size <= _MOST_NUMBERS
-        self.args = field
-        if self.few:
-            try:
-                on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
-            except Unwritten:
-                self.few = False
+        self.args, self.program = field, None
+        if self.size <= _MOST_NUMBERS:
+            self.program = _written(field, state)
         if self.few:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
-            self.args = (field, [[leaf[i] for i in np.ndindex(*leaf.shape)] for leaf in jax.tree.leaves(field)])
+            self.args = [leaf[i] for leaf in jax.tree.leaves(field) for i in np.ndindex(*leaf.shape)]
+
+    @property
+    def few(self) -> bool:
+        """Whether numbers are held."""
+        return self.program is not None
 
     @property
     def term(self) -> diffrax.ODETerm:
@@ -145,17 +148,40 @@ class Motion(eqx.Module):
         return self._plain_rates(t, y, args)
 
     def _plain_rates(self, t: Any, y: Any, args: Any) -> Any:
-        if not self.few:
+        if self.program is None:
             return args(t, y)
-        field, numbers = args
-        leaves, rest = jax.tree.flatten(field)
-        cells = jax.tree.unflatten(rest, [_arranged(n, leaf.shape) for n, leaf in zip(numbers, leaves, strict=True)])
-        rows = iter(y)
-        state = jax.tree.unflatten(self.like, [_arranged([next(rows) for _ in np.ndindex(*s)], s) for s in self.shapes])
-        dtype = y[0].dtype
-        like = jax.tree.map(lambda c: jax.ShapeDtypeStruct(c.shape, dtype), state, is_leaf=_is_cells)
-        written = on_numbers(lambda t, y, f: f(t, y), jax.ShapeDtypeStruct((), dtype), like, field)
-        return tuple(jnp.asarray(x, dtype) for x in _numbers(written(_arranged([jnp.asarray(t, dtype)], ()), state, cells)))
+        return tuple(core.jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))
+
+
+def _written(field: Dynamics, state: State) -> core.ClosedJaxpr | None:
+    """The equations as a program on numbers: time, those of the state, those of the field; None where they are too many."""
+    leaves, like = jax.tree.flatten(state)
+    cells, rest = jax.tree.flatten(field)
+    dtype = leaves[0].dtype
+    try:
+        written = on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), dtype), state, field)
+    except Unwritten:
+        return None
+
+    def rates(*numbers: Any) -> tuple[Any, ...]:
+        given = iter(numbers)
+
+        def arranged(shape: tuple[int, ...]) -> np.ndarray:
+            out = np.empty(shape, dtype=object)
+            for index in np.ndindex(*shape):
+                out[index] = next(given)
+            return out
+
+        t = arranged(())
+        y = jax.tree.unflatten(like, [arranged(leaf.shape) for leaf in leaves])
+        found = written(t, y, jax.tree.unflatten(rest, [arranged(leaf.shape) for leaf in cells]))
+        return tuple(jnp.asarray(x, dtype) for x in _numbers(found))
+
+    shapes = [
+        jax.ShapeDtypeStruct((), leaf.dtype) for leaf in [jnp.zeros((), dtype), *leaves, *cells] for _ in range(leaf.size)
+    ]
+    program = jax.make_jaxpr(rates)(*shapes)
+    return program if len(program.jaxpr.eqns) <= _MOST_OPERATIONS else None
 
 
 def _is_cells(x: Any) -> bool:
@@ -164,13 +190,6 @@ def _is_cells(x: Any) -> bool:
 
 def _numbers(cells: Any) -> tuple[Any, ...]:
     return tuple(leaf[i] for leaf in jax.tree.leaves(cells, is_leaf=_is_cells) for i in np.ndindex(*leaf.shape))
-
-
-def _arranged(entries: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    cells = np.empty(shape, dtype=object)
-    for index, entry in zip(np.ndindex(*shape), entries, strict=True):
-        cells[index] = entry
-    return cells
 
 
 class Tolerance(diffrax.AbstractAdaptiveStepSizeController):

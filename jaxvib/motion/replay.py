@@ -8,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix
 from jax import Array
 
 __all__ = ["solve"]
@@ -43,7 +44,8 @@ def solve(
     rest = (solver, max_steps, diffrax.NoProgressMeter() if progress is None else progress)
     if adjoint is not None:
         return _solve(inputs, controller, adjoint, *rest)
-    return _once(inputs, jax.lax.stop_gradient(controller), *rest)
+    numbers, others = eqx.partition(controller, eqx.is_array)
+    return _once(inputs, eqx.combine(jax.lax.stop_gradient(numbers), others), *rest)
 
 
 def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: int, progress: Any) -> diffrax.Solution:
@@ -120,15 +122,15 @@ class _Noted(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
+        return getattr(self.controller, "rtol", 0.0)  # a controller without one has no implicit method to serve
 
     @property
     def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
+        return getattr(self.controller, "atol", 0.0)
 
     @property
     def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
-        return self.controller.norm
+        return getattr(self.controller, "norm", optimistix.rms_norm)
 
     def wrap(self, direction: Any) -> _Noted:
         return self

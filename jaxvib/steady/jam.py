@@ -73,6 +73,11 @@ class Jam(eqx.Module):
     amplitude: Array
     foundation_force: Array
 
+    @property
+    def message(self) -> str:
+        """What is known of this mode, a sentence."""
+        return JamStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
 
 class JamModes(Jam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.

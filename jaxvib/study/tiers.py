@@ -23,12 +23,13 @@ __all__ = ["Tier", "Tiers", "compare_tiers"]
 
 class Tier(NamedTuple):
     """One tier's answers, NaN where it has none: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
-    `stable` (n,)."""
+    `stable` (n,); `message` (n sentences) says of each whether it is there, or why not."""
 
     omega: np.ndarray
     amplitude: np.ndarray
     foundation_force: np.ndarray
     stable: np.ndarray
+    message: tuple[str, ...]
 
 
 class Tiers(NamedTuple):
@@ -54,7 +55,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     """A jam mode by the leading order and exactly, for loads heavier and lighter than the scene's by the given factors.
 
     Drag grows with the square of the mass, which leaves the leading-order balance n(Omega) as it is, but for the loads'
-    share in the mass of their platform.
+    share in the mass of their platform. Dry friction grows as the mass does, as in a machine: with it the balance moves too.
 
     **Arguments**: `factors` on the mass (and inertia) of the loads; `mode` a jam mode, see `jam_modes`.
 
@@ -81,6 +82,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
 
     def tier(which: int) -> Tier:
         jams = [answer[which] for answer in answers]
-        return Tier(*(np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in Tier._fields))
+        numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in Tier._fields[:-1])
+        return Tier(*numbers, message=tuple(jam.message for jam in jams))
 
     return Tiers(float(jnp.mean(loads.mass)) * np.asarray(factors, dtype=float), tier(0), tier(1))
