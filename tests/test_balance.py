@@ -61,16 +61,15 @@ def test_arrangements_cancel_and_know_their_neutral_directions(mass, rows, dimen
 
 @pytest.mark.parametrize(("count", "dimension", "directions"), [(1, 0, 0), (2, 0, 0), (3, 1, 1), (4, 2, 2)])
 def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
-    s = loaded(count=count)
-    imbalance = 0.03 if count == 1 else 0.013
-    states = jv.balanced_states(s, imbalance=imbalance)
+    moment = 0.03 if count == 1 else 0.013
+    states = jv.balanced_states(loaded(count=count, effects=(jv.StaticImbalance(moment, angle=0.7),)))
     assert states.dimension == dimension and "turn of all loads" not in states.names
+    assert len(states.angles) > 0
     for angles, neutral in zip(states.angles, states.neutral, strict=True):
-        assert abs(np.sum(0.03 * np.exp(1j * angles)) + imbalance) < 1e-13
+        assert abs(np.sum(0.03 * np.exp(1j * angles)) + moment * np.exp(0.7j)) < 1e-13
         assert neutral.shape == (count, directions)
-    with pytest.raises(jv.InputError, match="imbalance is -1"):
-        jv.balanced_states(s, imbalance=-1.0)
-    assert jv.balanced_states(s, imbalance=1.0).status == jv.BalanceStatus.outweighed
+    too_large = loaded(count=count, effects=(jv.StaticImbalance(1.0),))
+    assert jv.balanced_states(too_large).status == jv.BalanceStatus.outweighed
 
 
 @pytest.mark.parametrize(
@@ -256,31 +255,67 @@ def test_map_refuses_what_is_no_range():
         jv.criterion_map(loaded(), speeds=[20.0], mass=[1.0, -1.0], drag=[1.0])
 
 
-@pytest.mark.parametrize("speed", [24.0, 40.0])
-def test_imbalance_is_a_load_that_cannot_leave_the_rotor(speed):
-    """The third load of a balanced three, held to the rotor by a strong drag, is the rotor's imbalance to the other two."""
+def two_mass():
+    """Two platforms, and with the held load on the exciter's; nothing tilts."""
     machine = machines()["two_mass"]
-    heavier = eqx.tree_at(lambda m: m.mass, machine, machine.mass.at[machine.exciter - 1].add(0.2))
-    two = jv.Scene(heavier, jv.balls(count=2, mass=0.3, radius=0.1, drag=1.0), jv.ConstantSpeed(speed))
+    return machine, eqx.tree_at(lambda m: m.mass, machine, machine.mass.at[machine.exciter - 1].add(0.2)), None
+
+
+def tilting(station=0.1):
+    """A rotor with its loads off the mass centre, which the held load shifts; the place of the loads from the new one."""
+    shift = 0.2 * station / 37.2
+
+    def machine(mass, inertia, shift):
+        position = (0.165 - shift, -0.155 - shift)
+        numbers = dict(polar_inertia=0.093, stiffness=(6e4, 5e4), damping=(80.0, 90.0), position=position)
+        return jv.rotor(mass=mass, transverse_inertia=inertia, stations=station - shift, **numbers)
+
+    inertia = 0.479 + 37.0 * 0.2 / 37.2 * station**2
+    return machine(37.0, 0.479, 0.0), machine(37.2, inertia, shift), station - shift
+
+
+@pytest.mark.parametrize(
+    ("machines", "speed", "weak"),
+    [(two_mass, 24.0, 300.0), (two_mass, 40.0, 300.0), (tilting, 80.0, 5e3)],
+    ids=["two_mass, 24", "two_mass, 40", "rotor"],
+)
+def test_imbalance_is_a_load_that_cannot_leave_the_rotor(machines, speed, weak):
+    """The third load of a balanced three, held to the rotor by a strong drag, is the rotor's imbalance to the other two."""
+    loads = jv.balls(count=2, mass=0.3, radius=0.1, drag=1.0)
+    machine, heavier, place = machines()
+
+    def two(angle):
+        effects = [jv.StaticImbalance(0.2 * 0.1, angle)]
+        if place is not None:
+            effects.append(jv.MomentImbalance(0.2 * 0.1 * place, angle))
+        return jv.Scene(heavier, loads, jv.ConstantSpeed(speed), tuple(effects))
+
     off = []
-    for drag in (300.0, 3000.0):
+    for drag in (weak, 10.0 * weak):
         held = jv.balls(count=3, mass=[0.2, 0.3, 0.3], radius=0.1, drag=[drag, 1.0, 1.0])
         three = jv.Scene(machine, held, jv.ConstantSpeed(speed))
         angles = jv.balanced_states(three).angles[0]
-        found = jv.balanced_stability(two, angles[1:] - angles[0], imbalance=0.2 * 0.1)
+        found = jv.balanced_stability(two(angles[0] + 0.3), angles[1:] + 0.3)
         whole = jv.balanced_stability(three, angles, steps=3072).multipliers
         moving = found.multipliers[np.abs(found.multipliers) > 1e-3]
         off.append(max(np.min(np.abs(whole - multiplier)) for multiplier in moving))
         assert found.neutral == 0
     # What is left of the held load's freedom goes as 1/drag.
-    assert off[1] < 3e-5
+    assert off[1] < 3e-5, off
     np.testing.assert_allclose(off[0] / off[1], 10.0, rtol=0.1)
-    np.testing.assert_allclose(jv.balanced_stability(two, imbalance=0.02).growth, found.growth, rtol=1e-6)
+    np.testing.assert_allclose(jv.balanced_stability(two(0.0)).growth, found.growth, rtol=1e-6)
 
 
-def test_imbalance_that_the_angles_do_not_cancel_is_refused():
+def test_imbalance_that_loads_cannot_cancel_is_refused():
+    unbalanced = (jv.StaticImbalance(0.01),)
     with pytest.raises(jv.InputError, match="leave an unbalance"):
-        jv.balanced_stability(loaded(), [0.0, np.pi], imbalance=0.01)
+        jv.balanced_stability(loaded(effects=unbalanced), [0.0, np.pi])
+    moment = (jv.MomentImbalance(1e-3),)
+    for station, effects in ((0.0, moment), (0.2, moment), (0.2, unbalanced)):
+        machine, *_ = tilting(station)
+        s = jv.Scene(machine, jv.balls(count=2, mass=0.3, radius=0.1, drag=1.0), jv.ConstantSpeed(80.0), effects)
+        with pytest.raises(jv.InputError, match="effects tilt the rotor: loads at one point cannot cancel"):
+            jv.balanced_states(s)
 
 
 def test_a_machine_that_can_drift_is_refused():

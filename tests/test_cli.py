@@ -55,6 +55,29 @@ def test_modes_writes_table_and_picture(typed, tmp_path):
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
 
 
+def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    rotor = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
+    jv.save_scene(rotor, tmp_path / "rotor.toml")
+    code, out, err = typed("modes", "rotor.toml", "--out", "o", "--json")
+    document = json.loads(out)
+    assert code == 0 and err == "" and set(document) == {"rotor_speed", "phase_jams"}
+    np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
+    assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
+    assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
+    assert "loads can stay jammed at 164.63 rad/s (together)" in typed("modes", "rotor.toml")[1]
+    (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
+    for words in (("modes", "--exact"), ("criterion",), ("cost",)):
+        code, out, err = typed(words[0], "stations.toml", *words[1:])
+        assert (code, out) == (2, "") and "machine.stations differ; this holds for loads that run at one point" in err
+    one_plane = TEMPLATES["rotor"].replace("stations = [0.28, 0.25, -0.25, -0.28]", "stations = 0.1")
+    (tmp_path / "one_plane.toml").write_text(one_plane)
+    code, _, err = typed("modes", "one_plane.toml", "--exact")
+    assert code == 2 and "machine.kind is 'rotor'; jam modes are those of platforms; ask phase_jams" in err
+    code, _, err = typed("whirl", "stations.toml", "--speed", "-5")
+    assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
+
+
 def test_modes_speed_option_replaces_the_scene_s(typed):
     _, out, _ = typed("modes", "machine.toml", "--json", "--speed", "600 rpm")
     np.testing.assert_allclose(json.loads(out)["rotor_speed"], 20 * np.pi, rtol=1e-15)

@@ -172,6 +172,38 @@ def test_a_branch_over_the_drag_passes_its_folds():
         jv.phase_branch(scene, jam, [100.0, 500.0])
 
 
+def test_figure_of_a_branch_is_solid_where_it_is_stable():
+    scene = rotor(9.2e-4)
+    omega = np.linspace(140.0, 190.0, 53)
+    branch = jv.phase_branch(scene, jv.phase_jam(scene, 169.6, jnp.zeros(4)), omega)
+    (axis,) = branch.plot(unit="rpm").axes
+    assert axis.get_xlabel() == "drag, N s/m" and axis.get_ylabel() == "speed of loads, rpm"
+    expected = np.stack([np.asarray(branch.drag_factor) * 9.2e-4 / 0.08**2, 30.0 / np.pi * omega], axis=1)
+    lines = [line for line in axis.lines if len(line.get_xdata()) > 2]
+    assert [line.get_linestyle() for line in lines] == ["--", "-", "--"]  # patterns part below 151 and above 170 rad/s
+    changes = np.flatnonzero(np.diff(np.asarray(branch.stable).astype(int)) != 0) + 1
+    for line, start, stop in zip(lines, [0, *changes], [*(changes + 1), 53], strict=True):
+        np.testing.assert_allclose(line.get_xydata(), expected[start:stop], rtol=1e-12)
+    assert {"rotor", "the scene's drag", "unstable"} <= {line.get_label() for line in axis.lines}
+    np.testing.assert_allclose(
+        [line.get_ydata()[0] for line in axis.lines if line.get_label() == "rotor"], 460.0 * 30.0 / np.pi
+    )
+    with pytest.raises(jv.InputError, match="unit is 'Hz'; it must be 'rad/s' or 'rpm'"):
+        branch.plot(unit="Hz")
+
+
+def test_figure_of_all_jams_has_each_on_a_line():
+    jams = jv.phase_jams(planar(), starts=8)
+    (axis,) = jams.plot().axes
+    assert axis.get_xlabel() == "drag, times the scene's" and axis.get_xlim() == (1.0 / 30.0, 30.0)
+    lines = [line.get_xydata() for line in axis.lines if len(line.get_xdata()) > 2 and line.get_linestyle() != "None"]
+    for w in np.asarray(jams.omega):
+        assert any(np.min(np.abs(line - [1.0, w])[np.isfinite(line[:, 0])].sum(axis=1)) < 1e-6 for line in lines)
+    points = {line.get_markerfacecolor(): line.get_ydata() for line in axis.lines if line.get_marker() == "o"}
+    np.testing.assert_allclose(points["black"], [w for w, good in zip(jams.omega, jams.stable, strict=True) if good])
+    assert len(points["white"]) == 2
+
+
 def test_derivatives_are_the_implicit_function_theorems():
     """Central differences, step 1e-5 of each number: their error is about 1e-9."""
     phase = jnp.array([0.0, 0.13, -3.0, 3.14])

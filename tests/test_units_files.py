@@ -261,6 +261,18 @@ WRONG_ROTORS = {
     "no inertia": (lambda: motor(inertia=0.0), r"drive\.inertia is 0 kg m\^2; it must be greater than 0"),
     "terms": (lambda: jv.rotor(**ROTOR, stiffness_terms=(1.0, 2.0)), r"machine\.stiffness_terms has 2 values; 3 are needed"),
     "term's unit": (lambda: jv.rotor(**ROTOR, stiffness_terms=("1 N/m", "2 m", 3.0)), r"stiffness_terms\[1\] is '2 m'"),
+    "terms that no supports have": (
+        lambda: jv.rotor(**ROTOR, stiffness_terms=(1e6, 2e5, 3e4)),
+        r"machine\.stiffness_terms \[1000000\.0, 200000\.0, 30000\.0\] would drive the rotor",
+    ),
+    "negative term": (
+        lambda: jv.rotor(**ROTOR, damping_terms=(8e2, 0.0, -1.0)),
+        r"damping_terms .* the outer two must be at least 0",
+    ),
+    "supports at one place": (
+        lambda: jv.rotor(**{**ROTOR, "position": 0.165}),
+        r"machine\.position puts both supports at 0\.165 m, where nothing holds the rotor's tilt",
+    ),
     "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"goes with a rotor that can tilt"),
     "far platform": (
         lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, platform=3),)),

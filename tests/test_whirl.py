@@ -98,5 +98,7 @@ def test_campbell_diagram_has_both_senses():
 def test_platforms_do_not_whirl():
     with pytest.raises(jv.InputError, match=r"machine\.kind is 'two_mass', which moves up and down only"):
         jv.whirl(platforms("two_mass"))
+    with pytest.raises(jv.InputError, match=r"rotor_speed\[1\] is -5 rad/s; it must be at least 0"):
+        jv.whirl(published_rotor(), [10.0, -5.0])
     with pytest.raises(jv.InputError, match=r"loads is 'some'; allowed: fixed, none"):
         jv.whirl(published_rotor(), loads="some")

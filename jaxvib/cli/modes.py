@@ -24,7 +24,9 @@ _RPM = 30.0 / np.pi
 @click.option("--phases", is_flag=True, help="Jams of loads at unequal phases too; always so for a rotor.")
 @shared
 def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, output: Output) -> None:
-    """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram."""
+    """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
+
+    Of a rotor: every jam of light loads at any phases; --out draws them over the loads' drag."""
     loaded = jv.load_scene(scene)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
@@ -34,7 +36,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
         _exact(loaded, unit, output)
         return
     if phases or loaded.machine.carrier().axes != (1,):
-        _phases(loaded, output)
+        _phases(loaded, unit, output)
         return
     found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
     picture = output.file("branches.png")
@@ -86,9 +88,12 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
     output.done(document, text, "modes")
 
 
-def _phases(scene: jv.Scene, output: Output) -> None:
+def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
     """The jams of light loads at any phases."""
     found = jv.phase_jams(scene)
+    picture = output.file("phases.png")
+    if picture is not None:
+        found.plot(unit=unit).savefig(picture)
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": float(scene.drive.speed),
@@ -121,7 +126,11 @@ def _phases(scene: jv.Scene, output: Output) -> None:
         speed = float(scene.drive.speed)
         head = ["rad/s", "rpm", "", "loads stand", "at, degrees", "force on bed, N"]
         title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
-        return table(title, head, rows) if rows else f"no jam at {speed:.5g} rad/s"
+        if not rows:
+            return f"no jam at {speed:.5g} rad/s"
+        kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({jam.pattern_label})" for jam in jams if jam.stable)
+        said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
+        return table(title, head, rows) + "\n" + said
 
     output.done(document, text, "modes")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.machine.units import to_float
+from jaxvib.machine.units import number
 
 _RPM = 30.0 / np.pi
 
@@ -25,7 +25,7 @@ _RPM = 30.0 / np.pi
 def whirl(scene: Path, speed: str | None, loads: Any, output: Output) -> None:
     """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
     loaded = jv.load_scene(scene)
-    rotor_speed = float(loaded.drive.speed) if speed is None else float(to_float(speed, "rad/s", "--speed"))
+    rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     found = jv.whirl(loaded, [rotor_speed], loads=loads)
     critical = [
         {"speed": float(w), "forward": bool(f)}

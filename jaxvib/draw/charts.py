@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, UNSTABLE, panels, speed_scale
 
-__all__ = ["before_after", "branch_diagram", "convergence", "time_histories"]
+__all__ = ["before_after", "branch_diagram", "convergence", "solid_and_dashed", "time_histories"]
 
 
 def time_histories(
@@ -61,7 +61,7 @@ def branch_diagram(
     Stable parts are solid, unstable ones dashed. `resonances` are drawn as level lines, `marks` as points (label, rotor
     speed, load speed), `at` as an upright line; speeds are given in rad/s and drawn in `unit` ("rad/s" or "rpm").
     """
-    scale = 30.0 / np.pi if unit == "rpm" else 1.0
+    scale = speed_scale(unit)
     figure, axes = panels(1, 3, size=(5.2, 4.2), share_x=True)
     n = scale * rotor_speed
     view = scale * rotor_speed[np.isfinite(rotor_speed)]
@@ -69,7 +69,7 @@ def branch_diagram(
     series += [(axes[1], 1e3 * amplitude[:, k], COLORS[k % len(COLORS)], name) for k, name in enumerate(names)]
     series += [(axes[2], force, COLORS[0], "force")]
     for axis, values, color, label in series:
-        _solid_and_dashed(axis, n, values, stable, color, label)
+        solid_and_dashed(axis, n, values, stable, color, label)
     for k, w in enumerate(resonances):
         axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
     low, high = 0.0, float(np.max(view))
@@ -92,15 +92,26 @@ def branch_diagram(
     return figure
 
 
-def _solid_and_dashed(axis: Axes, x: np.ndarray, y: np.ndarray, stable: np.ndarray, color: str, label: str) -> None:
-    """One line for each unbroken stretch; neighbouring stretches share a point so that no gap shows."""
+def solid_and_dashed(
+    axis: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    stable: np.ndarray,
+    color: str,
+    label: str | None = None,
+    *,
+    widths: tuple[float, float] = (1.4, 1.4),
+) -> None:
+    """One line for each unbroken stretch, solid where `stable`; neighbouring stretches share a point so that no gap shows.
+    `widths` of the solid ones and of the dashed ones."""
     cuts = np.flatnonzero(stable[1:] != stable[:-1]) + 1
     labelled = False
     for start, stop in zip([0, *cuts], [*(cuts + 1), len(x)], strict=True):
         solid = bool(stable[start])
         name = label if solid and not labelled else None
         labelled = labelled or solid
-        axis.plot(x[start:stop], y[start:stop], color=color, ls="-" if solid else (0, (3, 2)), label=name)
+        style, width = ("-", widths[0]) if solid else (UNSTABLE, widths[1])
+        axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name)
 
 
 def before_after(before: Mapping[str, float], after: Mapping[str, float], *, title: str = "") -> Figure:

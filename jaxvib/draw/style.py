@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,10 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "panels"]
+from jaxvib.errors import InputError
+
+__all__ = ["COLORS", "UNSTABLE", "panels", "speed_scale"]
 
 COLORS = ("#1f5aa6", "#c8501e", "#2d8a4e", "#7a4fa3", "#b8860b", "#555555", "#0f8b8d", "#a8324a")
 """Colours told apart by every reader; further series start over."""
+
+UNSTABLE = (0, (3, 2))
+"""The dashes of what is not stable."""
 
 _STYLE: Any = {
     "font.size": 10.0,
@@ -28,6 +34,17 @@ _STYLE: Any = {
     "figure.constrained_layout.use": True,
     "savefig.dpi": 150,
 }
+
+
+def speed_scale(unit: str) -> float:
+    """By what speeds in rad/s are multiplied to be drawn in `unit`. **Raises** `InputError` but for "rad/s" and "rpm".
+
+    >>> round(speed_scale("rpm"), 3)
+    9.549
+    """
+    if unit not in ("rad/s", "rpm"):
+        raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
+    return 30.0 / math.pi if unit == "rpm" else 1.0
 
 
 def panels(

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.units import Number, number, numbers
+from jaxvib.machine.units import Number, number, numbers, traced
 
 __all__ = ["PlanarRotor", "Rotor", "planar_rotor", "rotor"]
 
@@ -104,7 +105,8 @@ def rotor(
     loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3) where they are
     not what the supports make, see `Rotor`.
 
-    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed.
+    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports that are both at
+    one place, and for terms that no supports can have (negative ones, or c2^2 > c1 c3).
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
@@ -117,17 +119,27 @@ def rotor(
         if values is None:
             return None
         numbers([0.0] * len(values) if isinstance(values, (list, tuple)) else values, "", f"machine.{field}", 3)
-        return jnp.stack(
-            [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
-        )
+        given = [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
+        if not any(map(traced, given)):
+            one, two, three = map(float, given)
+            if min(one, three) < 0.0 or two**2 > one * three * (1.0 + 1e-9):
+                problem = (
+                    "would drive the rotor; the outer two must be at least 0, their product at least the middle one's square"
+                )
+                raise InputError(f"machine.{field}", f"{list(map(float, given))} {problem}")
+        return jnp.stack(given)
 
+    places = numbers(position, "m", "machine.position", 2)
+    if stiffness_terms is None and not traced(places) and places[0] == places[1]:
+        problem = "where nothing holds the rotor's tilt; give two places, such as [0.165, -0.155]"
+        raise InputError("machine.position", f"puts both supports at {float(places[0]):g} m, {problem}")
     return Rotor(
         mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
         transverse_inertia=number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True),
         polar_inertia=number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0),
         stiffness=numbers(stiffness, "N/m", "machine.stiffness", 2, low=0.0),
         damping=numbers(damping, "N s/m", "machine.damping", 2, low=0.0),
-        position=numbers(position, "m", "machine.position", 2),
+        position=places,
         stations=numbers(stations, "m", "machine.stations", None, shared=True),
         stiffness_terms=terms(stiffness_terms, ("N/m", "N", "N m"), "stiffness_terms"),
         damping_terms=terms(damping_terms, ("N s/m", "N s", "N m s"), "damping_terms"),

@@ -83,8 +83,8 @@ class Dynamics(eqx.Module):
     effects: tuple[Effect, ...]
     axes: tuple[int, ...] = eqx.field(static=True)
 
-    def __call__(self, t: Array, state: State, port_force: Array | None = None) -> State:
-        """The time derivative of `state` at time `t`, with an outer `port_force` (np,) N if one is given.
+    def __call__(self, t: Array, state: State) -> State:
+        """The time derivative of `state` at time `t`.
 
         Each load is eliminated first. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c it obeys
         u'' = H^-1 (r - E a), a the acceleration of the point that carries it, and pushes that point with -(W a + g),
@@ -93,7 +93,7 @@ class Dynamics(eqx.Module):
         one equation for each row of P, however many platforms and loads there are.
         """
         speed = rotor_speed(self.drive, t, state)
-        unforced = self._unforced(state, speed, port_force)
+        unforced = self._unforced(state, speed)
         throw = self._throw(t, state)
         loads = _kinematics(self.loads, state.angle, state.rate)
 
@@ -113,7 +113,7 @@ class Dynamics(eqx.Module):
         change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
         return State(state.velocity, carrier, state.rate, change, None if spin is None else (speed, spin))
 
-    def _unforced(self, state: State, speed: Array, port_force: Array | None) -> Array:
+    def _unforced(self, state: State, speed: Array) -> Array:
         """Accelerations of the carrier without loads and imbalance."""
         flow = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
         if self.gyroscopic is not None:
@@ -121,8 +121,6 @@ class Dynamics(eqx.Module):
         for support in self.supports:
             x, v = _times(support.rows, state.displacement), _times(support.rows, state.velocity)
             flow = flow - _times(support.push, support.effect.support_force(x, v))
-        if port_force is not None:
-            flow = flow + _times(self.push[:, : len(self.axes)], port_force)
         return flow
 
     def _friction(self, state: State, speed: Array) -> list[Friction]:

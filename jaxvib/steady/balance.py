@@ -13,7 +13,7 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import vector_field
-from jaxvib.steady.balanced_flow import at_constant_speed, balanced_motion, imbalance_force, monodromy
+from jaxvib.steady.balanced_flow import at_constant_speed, balanced_motion, monodromy
 from jaxvib.steady.response import circular_loads, natural_frequencies
 
 __all__ = [
@@ -40,12 +40,13 @@ class BalanceStatus(eqx.Enumeration):
 
 
 class BalancedStates(eqx.Module):
-    """How a set of loads can cancel each other: sum m_j R_j exp(i alpha_j) = 0 in the frame of the rotor.
+    """How a set of loads can cancel each other and the rotor's imbalance, in the frame of the rotor.
 
     **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
-    0 (no rows where nothing cancels); `dimension` of the set of arrangements, the common turn counted: N - 2, or N -
-    1 for two loads; `neutral` (k, N, d) orthonormal changes of the angles that keep each arrangement balanced to
-    first order; and their `names` (d,): "turn of all loads" first, then "shape 1", ...
+    0 unless the rotor is out of balance (no rows where nothing cancels); `dimension` of the set of arrangements, the
+    common turn counted: N - 2, but 1 for two loads on a rotor in balance; `neutral` (k, N, d) orthonormal changes of
+    the angles that keep each arrangement balanced to first order; and their `names` (d,): "turn of all loads" first
+    (not where the rotor is out of balance), then "shape 1", ...
 
     Loads in one line have one neutral direction more than the family has dimensions.
     """
@@ -63,20 +64,18 @@ class BalancedStates(eqx.Module):
         return "\n".join([BalanceStatus[self.status], *rows, directions])
 
 
-def balanced_states(scene: Scene, *, imbalance: float = 0.0) -> BalancedStates:
-    """All arrangements in which the scene's loads cancel each other.
+def balanced_states(scene: Scene) -> BalancedStates:
+    """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`.
 
-        sum_j m_j R_j exp(i alpha_j) + imbalance = 0
+        sum_j m_j R_j exp(i alpha_j) + M e exp(i angle) = 0
 
     Two loads cancel if equal, opposite each other. Three do in one triangle and its mirror image. From four on there
     is a family with N - 2 dimensions; the arrangement given for it spreads the loads most (the sides m_j R_j of a
     polygon inscribed in a circle: equal loads are evenly spaced), and its mirror image; `neutral` says where the
-    family goes.
+    family goes. A rotor's imbalance is one more side of the polygon, and the loads then have no common turn.
 
-    **Arguments**: `imbalance` kg m, the rotor's own, at angle 0 of its frame. Where there is one it counts as one more
-    side of the polygon, and the loads have no common turn.
-
-    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle, a negative imbalance.
+    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle at one point, and for an
+    imbalance that tilts the rotor, of a moment or static elsewhere on its axis, which they cannot cancel.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -87,14 +86,21 @@ def balanced_states(scene: Scene, *, imbalance: float = 0.0) -> BalancedStates:
       0, 90, 233.1 deg
       0, 270, 126.9 deg
     neutral directions: turn of all loads
+    >>> loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
+    >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
+    the loads cancel in one arrangement, up to a common turn and a mirror image
+      210, 330 deg
+      330, 210 deg
+    neutral directions: none
 
     Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
     """
     loads = _sides(circular_loads(scene))
     n = loads.size
-    sides = loads if imbalance == 0.0 else np.append(loads, imbalance)
-    if not imbalance >= 0.0:
-        raise InputError("imbalance", f"is {imbalance:g} kg m; it must be at least 0")
+    imbalance = _imbalance(scene)
+    free = imbalance == 0.0
+    sides = loads if free else np.append(loads, abs(imbalance))
     largest = sides.max()
     rest = sides.sum() - largest
     rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
@@ -106,18 +112,34 @@ def balanced_states(scene: Scene, *, imbalance: float = 0.0) -> BalancedStates:
         one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
     else:
         one = _inscribed(sides) * np.array([[1.0], [-1.0]])
-    fixed = 0 if imbalance == 0.0 else n
-    angles = np.mod(one - one[:, fixed, None], 2.0 * np.pi)[:, :n]
-    neutral = [_neutral(loads, row, turns=imbalance == 0.0) for row in angles]
-    turn = ("turn of all loads",) if imbalance == 0.0 else ()
+    fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
+    angles = np.mod(one - one[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
+    neutral = [_neutral(loads, row, turns=free) for row in angles]
+    turn = ("turn of all loads",) if free else ()
     names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
     status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
-    dimension = max(n - 2, 1 if imbalance == 0.0 else 0)
+    dimension = max(n - 2, 1 if free else 0)
     return BalancedStates(status, angles, dimension, neutral, names)
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
     return np.asarray(jnp.broadcast_to(loads.mass * loads.radius, (loads.count,)))
+
+
+def _imbalance(scene: Scene) -> complex:
+    """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
+    thrown = [effect.throw(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
+    static = [complex(*map(float, each.static)) for each in thrown if each is not None]
+    lean = [complex(*map(float, each.lean)) for each in thrown if each is not None]
+    seat = scene.machine.carrier().seat
+    lean += [] if seat is None else [float(seat) * each for each in static]
+    if abs(sum(lean)) > 1e-9 * max(map(abs, lean), default=0.0):
+        problem = (
+            "tilt the rotor: loads at one point cannot cancel a moment imbalance, nor a static one away from them "
+            "(it sits at the rotor's mass centre); leave it out, or simulate"
+        )
+        raise InputError("effects", problem)
+    return sum(static, 0j)
 
 
 def _inscribed(sides: np.ndarray) -> np.ndarray:
@@ -181,21 +203,18 @@ class BalancedStability(eqx.Module):
     error: float
 
 
-def balanced_stability(
-    scene: Scene, angles: ArrayLike | None = None, *, imbalance: float = 0.0, steps: int = 48
-) -> BalancedStability:
-    """Exact stability of the motion in which the loads turn with the rotor and cancel each other.
+def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
+    """Exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
     The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
     for heavy loads or weak drag, as the criterion does.
 
-    **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel; left out, the first of
-    `balanced_states`. `imbalance` kg m, the rotor's own, at angle 0 of its frame, that the loads cancel too (its mass belongs
-    to the machine's). `steps` of a sixth-order Magnus method over one turn.
+    **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel each other and the scene's
+    `StaticImbalance`; left out, the first of `balanced_states`. `steps` of a sixth-order Magnus method over one turn.
 
     **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, for a machine
-    that can drift, and for effects that disturb the balanced motion (gravity); `ComputationError` with the status of
-    `balanced_states` if nothing cancels.
+    that can drift, for effects that disturb the balanced motion (gravity), and as `balanced_states`; `ComputationError`
+    with its status if nothing cancels.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -205,8 +224,8 @@ def balanced_stability(
 
     Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
     """
-    angles, neutral = _arrangement(scene, angles, imbalance)
-    matrix = _monodromies(scene, jnp.asarray(angles), jnp.asarray(imbalance), steps)
+    angles, neutral = _arrangement(scene, angles)
+    matrix = _monodromies(scene, jnp.asarray(angles), steps)
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
@@ -216,12 +235,10 @@ def balanced_stability(
     return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
 
 
-def balanced_growth(
-    scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, imbalance: float = 0.0, steps: int = 48
-) -> np.ndarray:
+def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int = 48) -> np.ndarray:
     """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
 
-    **Arguments**: `speeds` rad/s, any shape; `angles`, `imbalance`, `steps` as `balanced_stability`. The scene's own
+    **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own
     speed is not used.
 
     **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
@@ -232,20 +249,18 @@ def balanced_growth(
     >>> jv.balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
-    angles, neutral = _arrangement(scene, angles, imbalance)
+    angles, neutral = _arrangement(scene, angles)
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
-    flows = _flows(at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(imbalance), jnp.asarray(padded), steps)[
-        : flat.size
-    ]
+    flows = _flows(at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(padded), steps)[: flat.size]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
 @eqx.filter_jit
-def _flows(scene: Scene, angles: Array, imbalance: Array, speeds: Array, steps: int) -> Array:
+def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
     def flow(speed: Array) -> Array:
-        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, imbalance, steps)
+        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
 
     return jax.lax.map(flow, speeds, batch_size=_BATCH)
 
@@ -257,7 +272,6 @@ def balanced_intervals(
     angles: ArrayLike | None = None,
     *,
     points: int = 200,
-    imbalance: float = 0.0,
     steps: int = 48,
 ) -> list[list[float]]:
     """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
@@ -276,8 +290,8 @@ def balanced_intervals(
     if not 0.0 < low < high:
         raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")
     grid = np.linspace(low, high, points)
-    stable = balanced_growth(scene, grid, angles, imbalance=imbalance, steps=steps) < 0.0
-    changes = stability_changes(scene, grid, stable, angles, imbalance=imbalance, steps=steps).tolist()
+    stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
+    changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
     return [[float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True)]
 
@@ -289,7 +303,6 @@ def stability_changes(
     angles: ArrayLike | None = None,
     *,
     close: float = 1e-7,
-    imbalance: float = 0.0,
     steps: int = 48,
 ) -> np.ndarray:
     """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
@@ -300,28 +313,28 @@ def stability_changes(
     left, right = speeds[change], speeds[change + 1]
     while left.size and np.max((right - left) / right) > close:
         middle = (left + right) / 2.0
-        same = (balanced_growth(scene, middle, angles, imbalance=imbalance, steps=steps) < 0.0) == stable[change]
+        same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
         left, right = np.where(same, middle, left), np.where(same, right, middle)
     return (left + right) / 2.0
 
 
-def _arrangement(scene: Scene, angles: ArrayLike | None, imbalance: float) -> tuple[np.ndarray, int]:
+def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
     """Angles at which the loads are known to cancel, and how many neutral directions they have."""
-    sides = _sides(circular_loads(scene))
+    sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
     if not float(jnp.min(natural_frequencies(scene))) > 0.0:
         problem = (
             "lets the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
         )
         raise InputError("machine.stiffness", problem)
     if angles is None:
-        states = balanced_states(scene, imbalance=imbalance)
+        states = balanced_states(scene)
         if not len(states.angles):
             raise ComputationError(_name(states.status), BalanceStatus[states.status])
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
     if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
         raise InputError("angles", "leave an unbalance; take them from balanced_states(scene).angles")
-    _require_undisturbed(scene, angles, imbalance)
+    _require_undisturbed(scene, angles)
     return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
 
 
@@ -336,19 +349,15 @@ def _name(status: BalanceStatus) -> str:
     return next(name for name in ("unique", "family", "alone", "outweighed") if getattr(BalanceStatus, name) == status)
 
 
-def _require_undisturbed(scene: Scene, angles: np.ndarray, imbalance: float) -> None:
+def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
     field = vector_field(at_constant_speed(scene))
     speed = float(scene.drive.speed)
     for turn in (0.0, 1.0, 2.0):
-        turned = jnp.asarray(turn)
-        change = field(
-            jnp.zeros(()), balanced_motion(scene, jnp.asarray(angles), turned), imbalance_force(scene, imbalance, turned)
-        )
+        change = field(jnp.asarray(turn / speed), balanced_motion(scene, jnp.asarray(angles), jnp.asarray(turn)))
         if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
-            problem = "disturb the balanced motion (gravity does); leave them out, and give a static imbalance as imbalance="
-            raise InputError("effects", problem)
+            raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
 
 
 @eqx.filter_jit
-def _monodromies(scene: Scene, angles: Array, imbalance: Array, steps: int) -> tuple[Array, Array]:
-    return monodromy(scene, angles, imbalance, steps), monodromy(scene, angles, imbalance, steps // 2)
+def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
+    return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)

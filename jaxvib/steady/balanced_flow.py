@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State, vector_field
 from jaxvib.steady.response import circular_loads
 
-__all__ = ["at_constant_speed", "balanced_motion", "imbalance_force", "monodromy"]
+__all__ = ["at_constant_speed", "balanced_motion", "monodromy"]
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
@@ -27,20 +25,13 @@ def at_constant_speed(scene: Scene) -> Scene:
     return Scene(scene.machine, scene.loads, ConstantSpeed(scene.drive.speed), scene.effects)
 
 
-def imbalance_force(scene: Scene, imbalance: ArrayLike, turn: Array) -> Array:
-    """The force of the rotor's imbalance at the port when it has turned by `turn`, (np,) N."""
-    point = jnp.stack([jnp.cos(turn), jnp.sin(turn)])[np.asarray(scene.machine.carrier().axes)]
-    return jnp.asarray(imbalance) * scene.drive.speed**2 * point
-
-
-def monodromy(scene: Scene, angles: Array, imbalance: Array, steps: int) -> Array:
+def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
     """What one turn of the rotor makes of small errors of the balanced motion, (2 (nd + N), 2 (nd + N)).
 
         x' = A(n t) x,  x = (q / R, q' / (R n), dphi, dphi' / n),     monodromy = x(turn) for x(0) = 1
 
-    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `imbalance` kg m of the rotor; `steps` of the Magnus
-    method, static. `jit`,
-    `vmap` and `grad` go through it; whoever calls it makes sure that the loads cancel.
+    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of the Magnus method, static. `jit`, `vmap`
+    and `grad` go through it; whoever calls it makes sure that the loads cancel each other and the rotor's imbalance.
     """
     scene = at_constant_speed(scene)
     field = vector_field(scene)
@@ -54,7 +45,7 @@ def monodromy(scene: Scene, angles: Array, imbalance: Array, steps: int) -> Arra
         base = balanced_motion(scene, angles, turn)
         e = x * sizes
         state = State(e[:nd], e[nd : 2 * nd], (base.angle[0] + e[2 * nd : 2 * nd + n],), (base.rate[0] + e[2 * nd + n :],))
-        change = field(turn / speed, state, imbalance_force(scene, imbalance, turn))
+        change = field(turn / speed, state)
         return jnp.concatenate([change.displacement, change.velocity, change.angle[0], change.rate[0]]) / (sizes * speed)
 
     def generator(turn: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,10 +28,22 @@ from jaxvib.steady.phases import (
     torques_at,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 __all__ = ["PhaseBranch", "PhaseJams", "phase_branch", "phase_jams"]
 
 _GRID = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
+
+_SHOWN = 30.0
+"""So many times the scene's drag, and the same part of it, a figure of all jams reaches."""
+
+_SAME_LINE = 5e-3
+"""Unstable patterns whose drags differ by less, relative, are drawn once."""
+
+_JUMP = 0.3
+"""Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
 
 _HALVINGS = 6
 """Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
@@ -39,9 +51,10 @@ _HALVINGS = 6
 
 class PhaseJams(PhaseJam):
     """Every jam that was found: the arrays of `PhaseJam` with a leading axis, by falling speed of the loads, stable ones first
-    where speeds are equal; `starts` (n,): how many of the starts led to each."""
+    where speeds are equal; `starts` (n,): how many of the starts led to each; and the `scene`."""
 
     starts: Array
+    scene: Scene
 
     def select(self, index: int) -> PhaseJam:
         """The jam of that place, counted from 0. **Raises** `InputError` where there are not so many."""
@@ -61,6 +74,31 @@ class PhaseJams(PhaseJam):
             stable = "stable" if bool(jam.stable) else "unstable"
             lines.append(f"Omega {float(jam.omega):.6g} rad/s, {stable} ({float(jam.growth):.3g} 1/s), {name}: {phases} deg")
         return "\n".join(lines) or "no jam"
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
+        """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
+        scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
+
+        **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+        """
+        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
+
+        omega = np.asarray(self.omega)
+        speeds = np.unique(np.concatenate([_load_speeds(parts_of(self.scene)), omega]))
+        branches: list[PhaseBranch] = []
+        curves = []
+        for k, place in enumerate(np.searchsorted(speeds, omega)):
+            jam = self.select(k)
+            if not any(_passes(branch, place, jam.growth) for branch in branches):
+                branches.append(phase_branch(self.scene, jam, jnp.asarray(speeds)))
+                factor, at, stable = _curve(branches[-1])
+                for _, other, _, _ in curves:
+                    # Dashes on other dashes would look like a line that is not broken.
+                    factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE * factor), np.nan, factor)
+                curves.append((jam.pattern_label, factor, at, stable))
+        top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
+        label = "drag, times the scene's"
+        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit)
 
 
 def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
@@ -117,7 +155,7 @@ def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
         jams, keep, reached = [jam_from(scene, parts.speed, jnp.asarray(phases[0]))], [], []
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[np.asarray(keep, dtype=int)], *jams)
     fields = {name: getattr(stacked, name) for name in PhaseJam.__dataclass_fields__}
-    return PhaseJams(**fields, starts=jnp.asarray([reached[k] for k in keep], dtype=int))
+    return PhaseJams(**fields, starts=jnp.asarray([reached[k] for k in keep], dtype=int), scene=scene)
 
 
 def _starts(
@@ -212,7 +250,8 @@ class PhaseBranch(NamedTuple):
     """One phase pattern over the loads' speed, at a given rotor speed.
 
     **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): at how many times the scene's drag the loads jam there,
-    NaN where the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`.
+    NaN where the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
+    `rotor_speed` rad/s, and `drag` (count,) N s/m that the factor multiplies.
     """
 
     omega: Array
@@ -220,13 +259,39 @@ class PhaseBranch(NamedTuple):
     phase: Array
     growth: Array
     stable: Array
+    rotor_speed: Array
+    drag: Array
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
+        """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
+        solid, unstable dashed. **Returns** a matplotlib figure. **Raises** `InputError` for another unit."""
+        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
+
+        alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
+        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")
+        factor, omega, stable = _curve(self)
+        curve = ("loads", times * factor, omega, stable)
+        return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit)
+
+
+def _curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drag factor, load speed and stability to be drawn: the factor is NaN where phases jump to another pattern."""
+    turned = np.exp(1j * np.diff(np.asarray(branch.phase), axis=0))
+    jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _JUMP)
+    return np.where(jump, np.nan, np.asarray(branch.drag_factor)), np.asarray(branch.omega), np.asarray(branch.stable)
+
+
+def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
+    """Whether the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
+    near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
+    return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
 
 
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     """The phase pattern of `jam` followed over load speeds `omega` (n,) rad/s, ascending, below the rotor's.
 
     The drag is explicit in the load speed, so that there is no turning back at folds: where the drag factor has an extremum
-    over `omega`, two jams of the pattern merge.
+    over `omega`, two jams of the pattern merge. Where a pattern ends, what comes next may be another one: phases jump there.
 
     **Returns** `PhaseBranch`. **Raises** `InputError` for speeds that do not ascend or are not between 0 and the rotor's.
 
@@ -238,21 +303,28 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     >>> [round(float(x), 3) for x in branch.drag_factor], [bool(x) for x in branch.stable]
     ([0.212, 1.0, 2.21], [True, True, True])
     """
-    loads_with_drag(scene)
+    loads = loads_with_drag(scene)
     speeds = np.asarray(omega, dtype=float)
     top = float(scene.drive.speed)
     if speeds.ndim != 1 or not np.all((speeds > 0.0) & (speeds < top)) or not np.all(np.diff(speeds) > 0.0):
         raise InputError("omega", f"must be a list of load speeds that ascend, above 0 and below the rotor's {top:g}")
-    cut = int(np.searchsorted(speeds, float(jam.omega)))
-    up, down = (_followed(scene, jam.phase, jnp.asarray(part)) for part in (speeds[cut:], speeds[:cut][::-1]))
-    return PhaseBranch(jnp.asarray(speeds), *(jnp.concatenate([low[::-1], high]) for low, high in zip(down, up, strict=True)))
+    # From the jam upward, then from the jam downward.
+    places, cut = np.arange(speeds.size), int(np.searchsorted(speeds, float(jam.omega)))
+    order = np.concatenate([places[cut:], places[:cut][::-1]])
+    followed = _followed(scene, jam.phase, jnp.asarray(speeds[order]), jnp.asarray(places == speeds.size - cut))
+    values = (value[np.argsort(order)] for value in followed)
+    drag = jnp.broadcast_to(loads.drag, (loads.count,))
+    return PhaseBranch(jnp.asarray(speeds), *values, rotor_speed=scene.drive.speed, drag=drag)
 
 
 @eqx.filter_jit
-def _followed(scene: Scene, phase: Array, omega: Array) -> tuple[Array, ...]:
+def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
+    """The pattern at load speeds (n,), each from that of the one before, or from `phase` itself where `anew` (n,)."""
     parts = parts_of(scene)
 
-    def step(start: Array, w: Array) -> tuple[Array, tuple[Array, ...]]:
+    def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
+        w, begins = at
+        start = jnp.where(begins, phase, last)
         influence, answer = influence_of(parts, w)
         factor, angles, good = _phases(parts, influence, w, start)
         braked = parts._replace(drag=factor * parts.drag)
@@ -260,7 +332,7 @@ def _followed(scene: Scene, phase: Array, omega: Array) -> tuple[Array, ...]:
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
-    return jax.lax.scan(step, phase, omega)[1]
+    return jax.lax.scan(step, phase, (omega, anew))[1]
 
 
 def _load_speeds(parts: Parts) -> np.ndarray:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.response import natural_frequencies
 
@@ -39,8 +38,6 @@ def picture(
 
     **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
     """
-    if unit not in ("rad/s", "rpm"):
-        raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
     from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
 
     at = float(branch.scene.drive.speed)

@@ -147,18 +147,25 @@ def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple
 
 def circular_loads(scene: Scene) -> CircularLoads:
     """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
-    return _at_one_point(scene, turning_loads(scene))
+    loads = turning_loads(scene)
+    require_one_point(scene)
+    return loads
 
 
 def jammed_loads(scene: Scene) -> CircularLoads:
     """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
-    return _at_one_point(scene, turning_loads(scene, (*_EFFECTS, DryFriction)))
-
-
-def _at_one_point(scene: Scene, loads: CircularLoads) -> CircularLoads:
-    if scene.machine.carrier().stations is not None:
-        raise InputError("machine.stations", "differ; loads that do not run at one point do not jam together: see phase_jams")
+    loads = turning_loads(scene, (*_EFFECTS, DryFriction))
+    require_one_point(scene)
     return loads
+
+
+def require_one_point(scene: Scene) -> None:
+    """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
+    if scene.machine.carrier().stations is not None:
+        problem = (
+            "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
+        )
+        raise InputError("machine.stations", problem)
 
 
 _EFFECTS = (Gravity, StaticImbalance, MomentImbalance, LoadContact)
@@ -209,7 +216,8 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     """
     carrier = scene.machine.carrier()
     if carrier.gyroscopic is not None and speed is None:
-        raise InputError("machine.kind", f"is {scene.machine.kind!r}; leading-order jams hold for machines of platforms")
+        problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
+        raise InputError("machine.kind", f"is {scene.machine.kind!r}; {problem}")
     force = jammed_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
     return small_solve(dynamic_stiffness(scene, omega, speed), force)
 

@@ -17,6 +17,7 @@ from jaxvib.steady.response import (
     loaded_mass,
     magnitude,
     relative_to,
+    require_one_point,
     root_or_zero,
     small_solve,
     turning,
@@ -115,7 +116,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     many machines.
 
     **Raises** `InputError` where no coordinate moves the port, a spring is too stiff beside the others for the
-    precision, or a gyroscopic carrier has a motion that no spring holds.
+    precision, a gyroscopic carrier has a motion that no spring holds, or loads have stations of their own.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
@@ -128,6 +129,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
     Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints mended, for any carrier.
     """
+    require_one_point(scene)
     _require_port_that_moves(scene)
     return _characteristic_speeds(scene)
 

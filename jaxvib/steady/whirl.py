@@ -81,7 +81,7 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
     Source: Artyunin 2013, section IV; free motion of equation (1).
     """
     carrier = _two_directions(scene)
-    speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None)
+    speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
     speeds = jnp.atleast_1d(speeds)
     mass = _mass(scene, loads)
     nd = mass.shape[0]

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["RunUps", "run_ups"]
 
+_FEWEST = 2**20
+"""Steps that a run may take at least, so that run-ups of any usual length share one program."""
+
 
 class RunUps(NamedTuple):
     """What became of run-ups over nd drags and ns starts.
@@ -47,10 +50,28 @@ class RunUps(NamedTuple):
             raise InputError("kind", f"is {kind!r}; allowed: {', '.join(REGIMES)}")
         return np.mean(self.kind == kind, axis=1)
 
+    def summary(self) -> str:
+        """A line for each drag: shares of the kinds of motion that its starts came to, and where they jammed."""
+        lines = [f"of {len(self.angle)} starts at each drag"]
+        for k, drag in enumerate(self.drag):
+            said = []
+            for kind in (kind for kind in REGIMES if np.any(self.kind[k] == kind)):
+                speeds = self.omega[k][self.kind[k] == kind]
+                at = f" at {_span(speeds)} rad/s" if kind == "jammed" else ""
+                said.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
+            lines.append(f"drag {drag:.4g} N s/m: {', '.join(said)}")
+        return "\n".join(lines)
+
     def plot(self) -> Figure:
         """Shares of the kinds of motion, and the speeds of the loads, over drag."""
         shares = {kind: self.fraction(kind) for kind in REGIMES if np.any(self.kind == kind)}
         return regime_chart(self.drag, shares, self.omega, float(np.max(self.regime.rotor_speed)))
+
+
+def _span(values: np.ndarray) -> str:
+    """One number where all are the same to a thousandth, else the smallest and the largest."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
 
 
 def run_ups(
@@ -75,15 +96,20 @@ def run_ups(
       rad. Without either all loads start together at the bottom
     - `tolerance`: error of a step, as `simulate`; `batch`: so many runs go side by side
 
-    **Returns** `RunUps`. **Raises** `InputError` for values that are not allowed.
+    **Returns** `RunUps`, whose `fraction` says how many of the starts came to a kind of motion. From few starts a share is
+    known to 1 / sqrt(starts) only. **Raises** `InputError` for values that are not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
     ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.SpinUp(60.0, duration=1.0))
-    >>> found = jv.run_ups(scene, 4.0, drag=[0.2, 5.0], tolerance=1e-5)
-    >>> found.kind.shape
-    (2, 1)
+    >>> found = jv.run_ups(scene, 4.0, drag=[0.05, 5.0], starts=6, tolerance=1e-5)
+    >>> found.kind.shape, found.fraction("jammed").tolist()
+    ((2, 6), [0.0, 1.0])
+    >>> print(found.summary())
+    of 6 starts at each drag
+    drag 0.05 N s/m: 100 % unsettled
+    drag 5 N s/m: 100 % jammed at 41... rad/s
 
     Source: Artyunin 2013, section V, where one set of angles stands for all.
     """
@@ -113,7 +139,7 @@ def run_ups(
     size = min(batch, shape[0] * shape[1])
     end = number(until, "s", "until", low=0.0, open_low=True)
     if max_steps is None:
-        max_steps = enough_steps(scene, end)
+        max_steps = max(_FEWEST, enough_steps(scene, end))
     named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
     code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
     kind = np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)]
