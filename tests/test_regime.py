@@ -55,6 +55,23 @@ def test_regimes_of_made_up_motions(name):
     assert str(jv.RegimeName[found.name]) in found.summary()
 
 
+@pytest.mark.parametrize(("effects", "label"), [((), "balanced"), ((jv.MomentImbalance(2e-3),), "unbalanced")])
+def test_loads_at_one_station_cannot_balance_what_tilts_their_rotor(effects, label):
+    _, motion = made([0.0, np.pi, np.pi, 0.0], 460.0)
+    rotor = jv.rotor(
+        mass=37.0,
+        transverse_inertia=0.479,
+        polar_inertia=0.093,
+        stiffness=(6e5, 6e5),
+        damping=(400.0, 400.0),
+        position=(0.16, -0.15),
+        stations=0.05,
+    )
+    loads = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=1.0)
+    found = jv.regime(jv.Scene(rotor, loads, jv.ConstantSpeed(460.0), effects), motion)
+    assert found.label == label
+
+
 def test_ripple_is_half_of_peak_to_peak():
     found = jv.regime(*made([0.0, 0.0, 0.0, 0.0], 170.0, wobble=0.03))
     np.testing.assert_allclose(found.ripple, 3.0, rtol=1e-3)

@@ -209,19 +209,27 @@ def _relative(angle: Array, half: int) -> tuple[Array, Array]:
 
 
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
-    """What is left out of balance when loads stand at `phase` to the rotor, relative to all of them at one angle."""
+    """What is left out of balance when loads stand at `phase` to the rotor, relative to all of them at one angle.
+
+    Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
+    none to the rotor's radius of gyration.
+    """
     carrier, loads = scene.machine.carrier(), scene.loads
     across, up = loads.position(*(jnp.zeros((loads.count,), phase.dtype),))
     each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
     thrown = [throw for throw in (effect.throw(origin) for effect in scene.effects) if throw is not None]
-    static = sum((throw.static[0] + 1j * throw.static[1] for throw in thrown), jnp.sum(each))
-    left = jnp.abs(static) / jnp.sum(jnp.abs(each))
-    if carrier.stations is None:
+    own = sum((throw.static[0] + 1j * throw.static[1] for throw in thrown), jnp.zeros_like(each[0]))
+    size = jnp.sum(jnp.abs(each))
+    left = jnp.abs(jnp.sum(each) + own) / size
+    if carrier.tilt is None:
         return left
-    lean = sum((throw.lean[0] + 1j * throw.lean[1] for throw in thrown), jnp.sum(carrier.stations * each))
-    whole = jnp.sum(jnp.abs(carrier.stations * each))
-    return jnp.maximum(left, jnp.where(whole > 0.0, jnp.abs(lean) / jnp.where(whole > 0.0, whole, 1.0), 0.0))
+    stations = jnp.zeros_like(phase) if carrier.stations is None else carrier.stations
+    lean = sum((throw.lean[0] + 1j * throw.lean[1] for throw in thrown), jnp.sum(stations * each))
+    lean = lean if carrier.seat is None else lean + carrier.seat * own
+    rows = [jnp.linalg.solve(carrier.mass, row[0]) @ row[0] for row in (carrier.port, carrier.tilt)]
+    whole = jnp.sum(jnp.abs(stations * each))
+    return jnp.maximum(left, jnp.abs(lean) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
