@@ -35,6 +35,7 @@ def light():
     return jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
 
 
+@pytest.mark.slow
 def test_runs_are_long_enough_to_forget_their_start():
     """Had they half the time, the square root of the tolerance would be left of the start."""
     cost = jv.accuracy(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["Tsit5"], repeats=1)
@@ -49,6 +50,7 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
     assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
 
 
+@pytest.mark.slow
 def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
     """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
     scene = published(speed=5.19, eps=0.05).scene()

@@ -162,6 +162,7 @@ def test_theories_without_dry_friction_refuse_it():
             ask(scene, 20.0)
 
 
+@pytest.mark.slow
 def test_exact_branch_of_a_gyroscopic_rotor():
     """Of two forward resonances (127, 149 rad/s) the fold between them, an extremum of the motions themselves."""
     scene = on_a_rotor()

@@ -73,9 +73,9 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
         stages = [first]
         for row, c in zip(_TABLEAU.a_lower[: _STAGES - 1], nodes[1:], strict=False):
             y = fence(_moved(y0, dt, row, stages))
-            stages.append(fence(terms.vf(t0 + float(c) * dt, y, args)))
+            stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         y1 = fence(_moved(y0, dt, _TABLEAU.b_sol[:_STAGES], stages))
-        last = fence(terms.vf(t1, y1, args))
+        last = _fenced(fence, terms.vf(t1, y1, args), y1)
         error = jax.tree.map(lambda *k: dt * _weighted(_ERROR[:_STAGES], k), *stages)
         # As increments over the step, as diffrax's interpolant takes them; the compiler drops what nobody asks for.
         k = jax.tree.map(lambda *k: jnp.stack([dt * value for value in k]), *stages, last)
@@ -107,6 +107,15 @@ def _weighted(weights: Any, values: Any) -> Array:
 
 def _moved(y0: Any, dt: Array, weights: Any, stages: list[Any]) -> Any:
     return jax.tree.map(lambda y, *k: y + dt * _weighted(weights, k), y0, *stages)
+
+
+def _fenced(fence: Callable[[Any], Any], rates: Any, y: Any) -> Any:
+    """Rates behind a fence, but those that are part of `y`, as velocities are, and have been behind one."""
+    leaves, rest = jax.tree.flatten(rates)
+    new = [k for k, leaf in enumerate(leaves) if not any(leaf is known for known in jax.tree.leaves(y))]
+    for k, leaf in zip(new, fence([leaves[k] for k in new]) if new else [], strict=True):
+        leaves[k] = leaf
+    return jax.tree.unflatten(rest, leaves)
 
 
 def _fence_of(lanes: bool, one: Array) -> Callable[[Any], Any]:
