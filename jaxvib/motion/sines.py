@@ -62,7 +62,9 @@ def sine_and_cosine(x: Array) -> tuple[Array, Array]:
     odd = (quarter == 1.0) | (quarter == 3.0)
     sign_s = jnp.where(quarter >= 2.0, -1.0, 1.0)
     sign_c = jnp.where((quarter == 1.0) | (quarter == 2.0), -1.0, 1.0)
-    return (jnp.where(odd, c, s) * sign_s).astype(x.dtype), (jnp.where(odd, s, c) * sign_c).astype(x.dtype)
+    # A division by a 1 that the compiler cannot know: without it every use of a sine computes it anew.
+    one = jnp.where(z < 4.0, 1.0, z)
+    return (jnp.where(odd, c, s) * sign_s / one).astype(x.dtype), (jnp.where(odd, s, c) * sign_c / one).astype(x.dtype)
 
 
 @sine_and_cosine.defjvp
