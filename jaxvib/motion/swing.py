@@ -224,7 +224,9 @@ def swing_states(
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
-        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12)),
+        # `moving` falls through 0. That is said, for where the last step ends a rounding short of it the search would not find
+        # two signs at its ends.
+        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
     )
     assert solution.ts is not None and solution.ys is not None
     (f, slip), ((end,), (end_slip,)) = solution.ys
