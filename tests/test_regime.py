@@ -57,19 +57,9 @@ def test_regimes_of_made_up_motions(name):
 
 @pytest.mark.parametrize(("effects", "label"), [((), "balanced"), ((jv.MomentImbalance(2e-3),), "unbalanced")])
 def test_loads_at_one_station_cannot_balance_what_tilts_their_rotor(effects, label):
-    _, motion = made([0.0, np.pi, np.pi, 0.0], 460.0)
-    rotor = jv.rotor(
-        mass=37.0,
-        transverse_inertia=0.479,
-        polar_inertia=0.093,
-        stiffness=(6e5, 6e5),
-        damping=(400.0, 400.0),
-        position=(0.16, -0.15),
-        stations=0.05,
-    )
-    loads = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=1.0)
-    found = jv.regime(jv.Scene(rotor, loads, jv.ConstantSpeed(460.0), effects), motion)
-    assert found.label == label
+    s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0, effects=effects)
+    machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.05))
+    assert jv.regime(jv.Scene(machine, s.loads, s.drive, effects), motion).label == label
 
 
 def test_ripple_is_half_of_peak_to_peak():

@@ -81,7 +81,8 @@ def simulate(
       reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
       `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `diffrax.Dopri8`.
       For forward derivatives give `diffrax.ForwardMode()`
-    - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest
+    - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
+      transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
     - `progress`: shows a bar on the error stream
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
 
