@@ -96,7 +96,7 @@ class Averaged(eqx.Module):
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """The time derivative of `state` at time `t`."""
         n = self.drive.speed_at(t)
-        at = jnp.exp(1j * state.phase)
+        at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
         free = self.drag * (n - state.rate) / self.inertia
         unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
         if self.gyroscopic is not None:

@@ -15,18 +15,16 @@ from jax import Array
 from jax.extend import core
 
 from jaxvib.motion.dynamics import Dynamics, State
-from jaxvib.motion.scalars import Unwritten, on_numbers, split
-from jaxvib.motion.solver import Wrapped, WrittenOut
+from jaxvib.motion.looped import Looped
+from jaxvib.motion.scalars import MOST_NUMBERS, numbers_of, program_on_numbers
+from jaxvib.motion.solver import WrittenOut
 
 __all__ = ["Motion", "Tolerance"]
 
 _TURN = 2.0 * math.pi
 
-_MOST_NUMBERS, _MOST_OPERATIONS = 32, 1200
-"""With more numbers in a state, or operations on them, equations written out take too long to compile for what they save."""
-
 _MOST_WRITTEN = 8
-"""The same for the method's stages, written out one after another: they take 13 times as long to compile."""
+"""With more numbers in a state, the method's stages written out one after another take too long to compile as well."""
 
 
 class Motion(eqx.Module):
@@ -56,11 +54,11 @@ class Motion(eqx.Module):
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
         self.args, self.program = field, None
-        if self.size <= _MOST_NUMBERS:
-            self.program = _written(field, state)
+        if self.size <= MOST_NUMBERS:
+            self.program = program_on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
         if self.few:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
-            self.args = [leaf[i] for leaf in jax.tree.leaves(field) for i in np.ndindex(*leaf.shape)]
+            self.args = numbers_of(field)
 
     @property
     def few(self) -> bool:
@@ -75,11 +73,11 @@ class Motion(eqx.Module):
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
         wrap = self._wrap if self.wrapped else None
-        return WrittenOut(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else Wrapped(wrap=wrap)
+        return WrittenOut(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else Looped(wrap=wrap)
 
     def held(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""
-        y = _numbers(jax.tree.map(split, state)) if self.few else state
+        y = tuple(numbers_of(state)) if self.few else state
         return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
     def states(self, held: Any) -> tuple[State, State]:
@@ -150,45 +148,6 @@ class Motion(eqx.Module):
         if self.program is None:
             return args(t, y)
         return tuple(core.jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))
-
-
-def _written(field: Dynamics, state: State) -> core.ClosedJaxpr | None:
-    """The equations as a program on numbers: time, those of the state, those of the field; None where they are too many."""
-    leaves, like = jax.tree.flatten(state)
-    cells, rest = jax.tree.flatten(field)
-    dtype = leaves[0].dtype
-    try:
-        written = on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), dtype), state, field)
-    except Unwritten:
-        return None
-
-    def rates(*numbers: Any) -> tuple[Any, ...]:
-        given = iter(numbers)
-
-        def arranged(shape: tuple[int, ...]) -> np.ndarray:
-            out = np.empty(shape, dtype=object)
-            for index in np.ndindex(*shape):
-                out[index] = next(given)
-            return out
-
-        t = arranged(())
-        y = jax.tree.unflatten(like, [arranged(leaf.shape) for leaf in leaves])
-        found = written(t, y, jax.tree.unflatten(rest, [arranged(leaf.shape) for leaf in cells]))
-        return tuple(jnp.asarray(x, dtype) for x in _numbers(found))
-
-    shapes = [
-        jax.ShapeDtypeStruct((), leaf.dtype) for leaf in [jnp.zeros((), dtype), *leaves, *cells] for _ in range(leaf.size)
-    ]
-    program = jax.make_jaxpr(rates)(*shapes)
-    return program if len(program.jaxpr.eqns) <= _MOST_OPERATIONS else None
-
-
-def _is_cells(x: Any) -> bool:
-    return isinstance(x, np.ndarray)
-
-
-def _numbers(cells: Any) -> tuple[Any, ...]:
-    return tuple(leaf[i] for leaf in jax.tree.leaves(cells, is_leaf=_is_cells) for i in np.ndindex(*leaf.shape))
 
 
 class Tolerance(diffrax.AbstractAdaptiveStepSizeController):

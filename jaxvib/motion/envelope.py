@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.extend import core
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import IdealDrive
@@ -21,6 +22,7 @@ from jaxvib.motion.dynamics import State
 from jaxvib.motion.observables import Measured
 from jaxvib.motion.replay import solve
 from jaxvib.motion.rosenbrock import Rodas4
+from jaxvib.motion.scalars import MOST_NUMBERS, numbers_of, program_on_numbers
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.steady.response import magnitude, natural_frequencies
 
@@ -233,8 +235,8 @@ def envelope(
         scene,
         end,
         state,
-        Rodas4() if solver is None else solver,
-        diffrax.PIDController(rtol=tolerance, atol=tolerance) if controller is None else controller,
+        solver,
+        jnp.asarray(tolerance, end.dtype) if controller is None else controller,
         adjoint,
         samples if save == "all" else 0,
         turns,
@@ -250,8 +252,8 @@ def _run(
     scene: Scene,
     end: Array,
     state: State | None,
-    solver: diffrax.AbstractSolver,
-    controller: diffrax.AbstractStepSizeController,
+    solver: diffrax.AbstractSolver | None,
+    control: diffrax.AbstractStepSizeController | Array,
     adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
     turns: int,
@@ -271,17 +273,16 @@ def _run(
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
 
-    def term(t: Any, y: Array, args: tuple[Averaged, _Units]) -> Array:
-        field, units = args
-        return units.pack(field(t, units.unpack(y, nd)))
+    controller = diffrax.PIDController(rtol=control, atol=control) if isinstance(control, Array) else control
 
+    rates, args = _rates(units.pack(begin), (field, units), nd)
     solution = solve(
-        diffrax.ODETerm(term),
-        solver,
+        diffrax.ODETerm(rates),
+        Rodas4() if solver is None else solver,
         end=end,
         first_step=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
         y0=units.pack(begin),
-        args=(field, units),
+        args=args,
         saveat=diffrax.SaveAt(subs=saves),
         controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
         adjoint=adjoint,
@@ -311,6 +312,23 @@ def _run(
         rejected=solution.stats["num_rejected_steps"],
         scene=scene,
     )
+
+
+def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
+    """The averaged equations on the integrator's vector, and their arguments: on single numbers, where there are few."""
+
+    def on_arrays(t: Any, y: Array, args: tuple[Averaged, _Units]) -> Array:
+        field, units = args
+        return units.pack(field(t, units.unpack(y, nd)))
+
+    program = program_on_numbers(on_arrays, jnp.zeros((), y.dtype), y, args) if y.size <= MOST_NUMBERS else None
+    if program is None:
+        return on_arrays, args
+
+    def on_numbers(t: Any, y: Array, args: list[Array]) -> Array:
+        return jnp.stack(core.jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
+
+    return on_numbers, numbers_of(args)
 
 
 def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:

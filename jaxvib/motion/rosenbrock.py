@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -9,28 +11,34 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
+
+from jaxvib.motion.directions import VECTOR
 
 __all__ = ["Rodas4", "written_inverse"]
 
-_A = (
-    (),
-    (1.544,),
-    (0.9466785280815826, 0.2557011698983284),
-    (3.314825187068521, 2.896124015972201, 0.9986419139977817),
-    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895),
-    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895, 1.0),
+_A = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.544, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.9466785280815826, 0.2557011698983284, 0.0, 0.0, 0.0, 0.0],
+        [3.314825187068521, 2.896124015972201, 0.9986419139977817, 0.0, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895, 1.0, 0.0],
+    ]
 )
-_C = (
-    (),
-    (-5.6688,),
-    (-2.430093356833875, -0.2063599157091915),
-    (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
-    (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.7089089320616),
-    (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
+_C = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [-5.6688, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [-2.430093356833875, -0.2063599157091915, 0.0, 0.0, 0.0, 0.0],
+        [-0.1073529058151375, -9.594562251023355, -20.47028614809616, 0.0, 0.0, 0.0],
+        [7.496443313967647, -10.24680431464352, -33.99990352819905, 11.7089089320616, 0.0, 0.0],
+        [8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054, 0.0],
+    ]
 )
-_NODES = (0.0, 0.386, 0.21, 0.63, 1.0, 1.0)
-_SLOPES = (0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0)
+_NODES = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
+_SLOPES = np.array([0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0])
 _GAMMA = 0.25
 _DENSE = (
     (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
@@ -112,21 +120,34 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     def step(self, terms: Any, t0: Any, t1: Any, y0: Array, args: Any, solver_state: None, made_jump: Any) -> Any:
         """One step from t0 to t1."""
         h = t1 - t0
-        columns = jnp.eye(y0.shape[0], dtype=y0.dtype)
         # A padded step has no length; its inverse must not be a division by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
-        _, along = jax.linearize(lambda t, y: terms.vf(t, y, args), t0, y0)
-        jacobian = jax.vmap(lambda v: along(jnp.zeros_like(t0), v), out_axes=1)(columns)
-        change = along(jnp.ones_like(t0), jnp.zeros_like(y0))
-        inverse = written_inverse(per_step / _GAMMA * columns - jacobian)
+        jacobian, change = _slopes(terms, t0, y0, args)
+        inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
 
-        stages: list[Array] = []
-        for a, c, node, slope in zip(_A, _C, _NODES, _SLOPES, strict=True):
-            y = y0 + sum((x * k for x, k in zip(a, stages, strict=True)), jnp.zeros_like(y0))
-            right = terms.vf(t0 + node * h, y, args) + slope * h * change
-            right = right + sum((x * per_step * k for x, k in zip(c, stages, strict=True)), jnp.zeros_like(y0))
-            stages.append(jnp.sum(inverse * right[None, :], axis=1))
-        y1 = y0 + sum(x * k for x, k in zip(_A[-1], stages[:-1], strict=True)) + stages[-1]
-        bend, twist = (sum(x * k for x, k in zip(row, stages[:-1], strict=True)) for row in _DENSE)
+        def mixed(weights: Any, stages: Array) -> Array:
+            return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))
+
+        def stage(i: Array, stages: Array) -> Array:
+            a, c, node, slope = (jnp.asarray(table, y0.dtype)[i] for table in (_A, _C, _NODES, _SLOPES))
+            right = terms.vf(t0 + node * h, y0 + mixed(a, stages), args) + slope * h * change + per_step * mixed(c, stages)
+            return lax.dynamic_update_index_in_dim(stages, jnp.sum(inverse * right[None, :], axis=1), i, 0)
+
+        stages = lax.fori_loop(0, len(_A), stage, jnp.zeros((len(_A), *y0.shape), y0.dtype))
+        y1 = y0 + mixed(_A[-1], stages) + stages[-1]
+        bend, twist = (mixed(row, stages) for row in np.asarray(_DENSE))
         dense = dict(y0=y0, y1=y1, bend=bend, twist=twist)
         return y1, stages[-1], dense, None, diffrax.RESULTS.successful
+
+
+def _slopes(terms: Any, t: Array, y: Array, args: Any) -> tuple[Array, Array]:
+    """df/dy (n, n) and df/dt (n,): derivatives of numbers in directions along a last axis, filled up to whole vectors."""
+    n = y.shape[0]
+    directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
+
+    def slope(*direction: Array) -> Array:
+        numbers = (t, *(y[i] for i in range(n)))
+        return jax.jvp(lambda t, *y: terms.vf(t, jnp.stack(y), args), numbers, direction)[1]
+
+    found = jax.vmap(slope, in_axes=-1, out_axes=-1)(*directions)
+    return found[:, 1 : n + 1], found[:, 0]

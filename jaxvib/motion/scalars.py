@@ -14,12 +14,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.extend import core
 
 from jaxvib.motion.sines import sine_and_cosine
 
-__all__ = ["Unwritten", "on_numbers"]
+__all__ = ["MOST_NUMBERS", "Unwritten", "numbers_of", "on_numbers", "program_on_numbers"]
+
+MOST_NUMBERS, _MOST_OPERATIONS = 32, 1200
+"""With more numbers in a state, or operations on them, equations written out take too long to compile for what they save."""
 
 Cells = np.ndarray
 """An array of dtype object: every entry is a traced scalar, or a NumPy number that is known while tracing."""
@@ -47,6 +50,40 @@ def on_numbers(function: Callable[..., Any], *arguments: Any) -> Callable[..., A
         return jax.tree.unflatten(rest, _run(closed.jaxpr, closed.consts, [_cells(leaf) for leaf in leaves], {}))
 
     return run
+
+
+def program_on_numbers(function: Callable[..., Any], *arguments: Any) -> core.ClosedJaxpr | None:
+    """`on_numbers`, traced once: a program that takes the numbers of all arguments and gives those of the result, in order.
+
+    **Returns** None where an operation has no rule here, or where there are too many of them.
+    """
+    leaves, rest = jax.tree.flatten(arguments)
+    try:
+        written = on_numbers(function, *arguments)
+    except Unwritten:
+        return None
+
+    def run(*numbers: Any) -> list[Any]:
+        given = iter(numbers)
+
+        def arranged(leaf: Any) -> Cells:
+            cells = np.empty(leaf.shape, dtype=object)
+            for index in np.ndindex(*leaf.shape):
+                cells[index] = next(given)
+            return cells
+
+        found = written(*jax.tree.unflatten(rest, [arranged(leaf) for leaf in leaves]))
+        cells = jax.tree.leaves(found, is_leaf=lambda x: isinstance(x, np.ndarray))
+        return [jnp.asarray(x, leaves[0].dtype) for array in cells for x in array.ravel()]
+
+    shapes = [jax.ShapeDtypeStruct((), leaf.dtype) for leaf in leaves for _ in range(leaf.size)]
+    program = jax.make_jaxpr(run)(*shapes)
+    return program if len(program.jaxpr.eqns) <= _MOST_OPERATIONS else None
+
+
+def numbers_of(tree: Any) -> list[Array]:
+    """All numbers of a tree of arrays, in order."""
+    return [leaf[index] for leaf in jax.tree.leaves(tree) for index in np.ndindex(*leaf.shape)]
 
 
 def split(value: Any) -> Cells:
@@ -146,7 +183,7 @@ _ELEMENTWISE: dict[str, Callable[..., Any]] = {
         for name in (
             *("max", "min", "abs", "sign", "sqrt", "rsqrt", "exp", "log", "tanh", "atan2", "tan", "pow", "log1p", "expm1"),
             *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "floor", "ceil", "round", "rem", "is_finite", "clamp"),
-            *("logistic", "asin", "acos", "atan", "sinh", "cosh", "erf", "cbrt", "exp2"),
+            *("real", "imag", "complex", "conj", "logistic", "asin", "acos", "atan", "sinh", "cosh", "erf", "cbrt", "exp2"),
         )
     },
 }

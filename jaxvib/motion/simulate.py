@@ -20,6 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
+from jaxvib.motion.looped import Looped
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 
@@ -79,8 +80,8 @@ def simulate(
       unless said otherwise it is where numbers are known, and not under a JAX transformation
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
       reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
-      `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `diffrax.Dopri8`.
-      For forward derivatives give `diffrax.ForwardMode()`
+      `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `Looped`.
+      For forward derivatives give `diffrax.ForwardMode()`: up to about ten parameters they take less time than reverse ones
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
       transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
     - `progress`: shows a bar on the error stream
@@ -118,7 +119,7 @@ def simulate(
     known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if solver is None and not known and end.dtype.itemsize >= 8:
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
-        solver = diffrax.Dopri8()
+        solver = Looped(slopes=isinstance(adjoint, diffrax.ForwardMode))
 
     def run(control: StepControl) -> Run:
         chosen = control if controller is None else controller

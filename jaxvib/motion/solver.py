@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -12,11 +14,68 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["Wrapped", "WrittenOut"]
+__all__ = ["ERROR", "NODES", "ROWS", "Between", "WrittenOut", "mixed", "packed", "unpacked"]
 
 _TABLEAU = diffrax.Dopri8.tableau
-_STAGES = len(_TABLEAU.b_sol) - 1
-_ERROR = np.asarray(_TABLEAU.b_error)
+_POLYNOMIALS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
+_HEARD = tuple(np.flatnonzero(np.any(_POLYNOMIALS, axis=1)).tolist())
+
+NODES = np.asarray(_TABLEAU.c)
+"""At which share of the step each stage but the first is."""
+
+ROWS = np.stack([np.concatenate([row, np.zeros(len(NODES) - len(row))]) for row in _TABLEAU.a_lower])
+"""With what weights those before make each stage but the first; the last stage is the end of the step."""
+
+ERROR = np.asarray(_TABLEAU.b_error)
+"""With what weights stages make the error of the step."""
+
+
+def packed(tree: Any, directions: int = 0) -> Array:
+    """The numbers of a tree as a vector (n,), or (n, directions) where there is that last axis."""
+    return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
+
+
+def unpacked(flat: Array, like: Any) -> Any:
+    """The inverse of `packed`; `like` tells structure and shapes."""
+    leaves, rest = jax.tree.flatten(like)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [
+        flat[end - leaf.size : end].reshape(*leaf.shape, *flat.shape[1:]) if leaf.shape else flat[end - 1]
+        for end, leaf in zip(ends, leaves, strict=True)
+    ]
+    return jax.tree.unflatten(rest, parts)
+
+
+def mixed(weights: Array, stages: Any) -> Array:
+    """sum_j weights_j stages_j over the stages that states within a step are made of."""
+    return functools.reduce(operator.add, (weights[j] * stages[j] for j in _HEARD))
+
+
+class Between(diffrax.AbstractLocalInterpolation):
+    """The motion within a step: y0 + (t - t0) sum_j w_j(s) k_j, s the share of the step that is done, k_j the stages' rates.
+
+    The polynomials w_j are diffrax's. Each stage is a vector of numbers, see `packed`.
+    """
+
+    t0: Any
+    t1: Any
+    y0: Any
+    stages: tuple[Array, ...]
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        """The state at `t0`, or by how much it changes from there to `t1`."""
+        if t1 is not None:
+            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+        span = self.t1 - self.t0
+        share = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
+        weights = jnp.zeros(len(_POLYNOMIALS), share.dtype)
+        for column in _POLYNOMIALS.T:
+            weights = weights * share + jnp.asarray(column, share.dtype)
+        return self.moved(share * span * weights)
+
+    def moved(self, weights: Array) -> Any:
+        """y0 + sum_j weights_j k_j."""
+        return jax.tree.map(lambda y, change: y + change, self.y0, unpacked(mixed(weights, self.stages), self.y0))
 
 
 class WrittenOut(diffrax.AbstractAdaptiveSolver):
@@ -26,7 +85,7 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
     compiles into one piece of code; and a fence after each stage, without which XLA's fusion computes each stage anew for
     each use of it (a step of 900 multiplications becomes one of 4500).
 
-    Compiling takes several times as long as for `diffrax.Dopri8`, which needs about 1.6 times the time for each step.
+    Compiling takes longer than for `Looped`, several times as long where derivatives are taken.
 
     **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them; the fence is then
     a division by a 1 that the compiler cannot know, otherwise a detour through memory that costs less for single numbers;
@@ -47,7 +106,7 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
 
     term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar[Callable[..., Any]] = diffrax.Dopri8.interpolation_cls
+    interpolation_cls: ClassVar[Callable[..., Any]] = Between
 
     def order(self, terms: Any) -> int:
         """8."""
@@ -69,31 +128,14 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
         fence = _fence_of(self.lanes, jnp.where(t1 > t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
-        nodes = np.concatenate([[0.0], np.asarray(_TABLEAU.c)])
         stages = [first]
-        for row, c in zip(_TABLEAU.a_lower[: _STAGES - 1], nodes[1:], strict=False):
-            y = fence(_moved(y0, dt, row, stages))
+        y = y0
+        for row, c in zip(ROWS, NODES, strict=True):
+            y = fence(_moved(y0, dt, row[: len(stages)], stages))
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
-        y1 = fence(_moved(y0, dt, _TABLEAU.b_sol[:_STAGES], stages))
-        last = _fenced(fence, terms.vf(t1, y1, args), y1)
-        error = jax.tree.map(lambda *k: dt * _weighted(_ERROR[:_STAGES], k), *stages)
-        # As increments over the step, as diffrax's interpolant takes them; the compiler drops what nobody asks for.
-        k = jax.tree.map(lambda *k: jnp.stack([dt * value for value in k]), *stages, last)
-        end = y1 if self.wrap is None else self.wrap(y1)
-        return end, error, dict(y0=y0, y1=y1, k=k), last, diffrax.RESULTS.successful
-
-
-class Wrapped(diffrax.Dopri8):
-    """`diffrax.Dopri8`, after each of whose steps `wrap` is done to the state: see `WrittenOut`."""
-
-    wrap: Callable[[Any], Any] | None = None
-
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
-        """As `WrittenOut.step`."""
-        y1, error, dense, last, result = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        return y1 if self.wrap is None else self.wrap(y1), error, dense, last, result
+        error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
+        end = y if self.wrap is None else self.wrap(y)
+        return end, error, dict(y0=y0, stages=tuple(map(packed, stages))), stages[-1], diffrax.RESULTS.successful
 
 
 def _weighted(weights: Any, values: Any) -> Array:

@@ -1,0 +1,90 @@
+"""Forward derivatives in many directions at once, laid out as vector instructions want them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+__all__ = ["VECTOR", "flat_slopes", "in_all_directions"]
+
+VECTOR = 8
+"""Directions are filled up to a multiple of this: what a processor works on at a time."""
+
+Slopes = Any
+"""A tree like that of values, its arrays with a last axis over directions; None where a slope is 0 in all of them."""
+
+
+def in_all_directions(function: Callable[[Any], Any], beside: Callable[[Any, Slopes], Any]) -> Callable[[Any], Any]:
+    """`function` with forward derivatives by `beside`, and no reverse ones.
+
+    Under `jacfwd` JAX maps the derivative in one direction over all of them, and puts the axis of the directions before all
+    others. Here `beside` is called once for all directions instead, which lie along a last axis: every number of the program
+    becomes a vector of directions, contiguous in memory.
+
+    **Arguments**: `beside(x, slopes)`: `function(x)` and its slopes, `slopes` and the slopes as `Slopes`.
+
+    >>> import jax, jax.numpy as jnp
+    >>> square = in_all_directions(lambda x: x**2, lambda x, slope: (x**2, 2.0 * x[:, None] * slope))
+    >>> jax.jacfwd(square)(jnp.asarray([1.0, 3.0])).tolist()
+    [[2.0, 0.0], [0.0, 6.0]]
+    """
+
+    @eqx.filter_custom_jvp
+    def call(x: Any) -> Any:
+        return function(x)
+
+    @call.def_jvp
+    def _(primals: Any, tangents: Any) -> Any:
+        leaves, rest = jax.tree.flatten(primals[0])
+        slopes = rest.flatten_up_to(tangents[0])  # pyright: ignore[reportAttributeAccessIssue]
+        arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
+        places = [k for k, slope in enumerate(slopes) if slope is not None]
+
+        def on_arrays(arrays: Any, slopes: Any) -> Any:
+            inputs = [leaf if array is None else array for array, leaf in zip(arrays, leaves, strict=True)]
+            given = dict(zip(places, slopes, strict=True))
+            return beside(
+                jax.tree.unflatten(rest, inputs), jax.tree.unflatten(rest, [given.get(k) for k in range(len(leaves))])
+            )
+
+        return _along_last(on_arrays)(arrays, [slopes[k] for k in places])
+
+    return call
+
+
+def flat_slopes(slopes: Slopes, like: Any) -> list[Array | None]:
+    """Slopes of the leaves of `like`, in order."""
+    return jax.tree.structure(like).flatten_up_to(slopes)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _along_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """f(x, slopes) for one direction, of a function for directions along a last axis: called once where f is mapped."""
+
+    def single(x: Any, slopes: Any) -> Any:
+        y, out = function(x, jax.tree.map(lambda s: s[..., None], slopes))
+        return y, jax.tree.map(lambda s: s[..., 0], out)
+
+    mapped = jax.custom_batching.custom_vmap(single)
+
+    @mapped.def_vmap
+    def _(size: int, is_mapped: Any, x: Any, slopes: Any) -> Any:
+        if any(jax.tree.leaves(is_mapped[0])):
+            axes = jax.tree.map(lambda which: 0 if which else None, is_mapped)
+            out = jax.vmap(single, in_axes=tuple(axes))(x, slopes)
+            return out, jax.tree.map(lambda _: True, out)
+        filled = -(-size // VECTOR) * VECTOR
+
+        def last(slope: Array, along: bool) -> Array:
+            all_of_them = jnp.moveaxis(slope, 0, -1) if along else jnp.repeat(slope[..., None], size, axis=-1)
+            return jnp.pad(all_of_them, [(0, 0)] * (all_of_them.ndim - 1) + [(0, filled - size)])
+
+        y, out = function(x, jax.tree.map(last, slopes, is_mapped[1]))
+        out = jax.tree.map(lambda slope: jnp.moveaxis(slope[..., :size], -1, 0), out)
+        return (y, out), (jax.tree.map(lambda _: False, y), jax.tree.map(lambda _: True, out))
+
+    return mapped
