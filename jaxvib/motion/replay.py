@@ -92,7 +92,8 @@ def _backwards(times: Array | None, slopes: Any, perturbed: Any, inputs: Any, co
 
     def again(wanted: Any) -> Any:
         way = controller if times is None else _along(controller, times)
-        solution = _solve(eqx.combine(wanted, fixed), way, diffrax.RecursiveCheckpointAdjoint(), *rest)
+        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(inputs[2], rest[1]))
+        solution = _solve(eqx.combine(wanted, fixed), way, adjoint, *rest)
         return eqx.filter(solution, eqx.is_inexact_array)
 
     solution, transposed = jax.vjp(again, wanted)
@@ -101,6 +102,13 @@ def _backwards(times: Array | None, slopes: Any, perturbed: Any, inputs: Any, co
     given = rest.flatten_up_to(slopes)  # pyright: ignore[reportAttributeAccessIssue]
     whole = [jnp.zeros_like(leaf) if slope is None else slope for leaf, slope in zip(leaves, given, strict=True)]
     return transposed(jax.tree.unflatten(rest, whole))[0]
+
+
+def _checkpoints(y0: Any, max_steps: int) -> int | None:
+    """As many as take 1 MiB, for steps between checkpoints are computed once more; not fewer than diffrax's own, None."""
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
+    room = min(2**20 // (3 * size), max_steps)  # the state, its rates, and about as much of the loop's own
+    return room if room > (2.0 * max_steps) ** 0.5 else None
 
 
 def _nothing(t: Any, y: Any, args: Any) -> None:
