@@ -3,7 +3,7 @@
     pip install numba scipy mujoco jitcode scikit-sundae      # those that are missing are left out
     python benchmarks/engine.py [--only single ensemble ...] [--quick] [--out FOLDER]
 
-Prints each measurement as it comes and, at the end, the table of the README. --out adds engine.json, the table as engine.md,
+Prints each measurement as it comes and, at the end, the table of the README. --out adds engine.json, table and figure as text in engine.md,
 the figure of all ratios as engine.png and that of the memory of a reverse gradient as memory.png. --quick runs everything
 small, to see that it runs: its figures say nothing. The other benchmarks (cost, rotor, criterion) are commands of their own.
 """
@@ -30,7 +30,7 @@ from many import ensemble  # noqa: E402
 from orbits import orbits  # noqa: E402
 from single import growth_with_length, single  # noqa: E402
 from slopes import designs, gradient, memory  # noqa: E402
-from table import figures, markdown, whole  # noqa: E402
+from table import bars, figures, markdown, whole  # noqa: E402
 
 GROUPS = dict(
     single=single,
@@ -69,7 +69,7 @@ def main() -> None:
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "engine.json").write_text(json.dumps(document, indent=2), encoding="utf-8")
-        (options.out / "engine.md").write_text(f"{text}\n{whole(document)}", encoding="utf-8")
+        (options.out / "engine.md").write_text(f"{text}\n{bars(document)}\n{whole(document)}", encoding="utf-8")
         for file, figure in figures(document).items():
             figure.savefig(options.out / file)
 

@@ -59,6 +59,21 @@ def whole(document: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def bars(document: dict[str, Any], wide: int = 40) -> str:
+    """The comparisons with other ways as text: time as a multiple of jaxvib's own on a logarithmic scale, a decade 10 signs."""
+    lines = []
+    for group, rows in _groups(document).items():
+        own = next((row for row in rows if row["name"].startswith(OWN)), None)
+        if own is None or own["ratio"] is None or all(row["name"].startswith(OWN) for row in rows):
+            continue
+        lines += ["", f"{group}{_within(own)}"]
+        for row in rows:
+            times = row["seconds"] / own["seconds"]
+            length = min(max(round(10.0 * np.log10(10.0 * times)), 1), wide)
+            lines.append(f"  {row['name']:48s} {'#' * length} {_times(times)}")
+    return "\n".join(["```text", *lines[1:], "```"]) + "\n"
+
+
 def _said(row: dict[str, Any]) -> str:
     return _time(row["seconds"]) + (f", {row['note']}" if "bytes" in row or "per_second" in row else "")
 
@@ -135,7 +150,7 @@ def memory(rows: list[dict[str, Any]]) -> Figure:
 def main() -> None:
     path = Path(sys.argv[1])
     document = json.loads(path.read_text(encoding="utf-8"))
-    path.with_suffix(".md").write_text(f"{markdown(document)}\n{whole(document)}", encoding="utf-8")
+    path.with_suffix(".md").write_text(f"{markdown(document)}\n{bars(document)}\n{whole(document)}", encoding="utf-8")
     for file, figure in figures(document).items():
         figure.savefig(path.with_name(file))
 
