@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.draw.style import COLORS, panels
 
@@ -82,7 +83,11 @@ def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Ma
     axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([floor, *errors, 1e-2]))
     for error in wanted:
         axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
-    axes.set_xlabel("seconds, once compiled")
+    axes.set_xlabel("time, once compiled")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100.0 * low else (1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(EngFormatter(unit="s"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel(f"relative error of {panel.quantity}")
 
 
