@@ -144,7 +144,7 @@ def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[
     count = len(ROWS)
     known = jax.tree.map(lambda k: jnp.zeros((count + 1, *k.shape), k.dtype).at[0].set(k), first)
     # A division by a 1 that the compiler cannot know keeps it from computing the state anew for each use of it.
-    one = lax.stop_gradient(jnp.where(dt > 0.0, 1.0, dt))
+    one = lax.stop_gradient(jnp.where(dt >= 0.0, 1.0, dt))
 
     def weighted(known: Any, weights: Any) -> Any:
         heard = np.flatnonzero(weights) if isinstance(weights, np.ndarray) else range(len(weights))

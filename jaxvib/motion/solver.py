@@ -126,7 +126,7 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
         """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
         # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        fence = _fence_of(self.lanes, jnp.where(t1 > t0, 1.0, t1 - t0))
+        fence = _fence_of(self.lanes, jnp.where(t1 >= t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
         stages = [first]
         y = y0
