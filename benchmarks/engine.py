@@ -3,9 +3,10 @@
     pip install numba scipy mujoco jitcode scikit-sundae      # those that are missing are left out
     python benchmarks/engine.py [--only single ensemble ...] [--quick] [--out FOLDER]
 
-Prints each measurement as it comes and, at the end, the table of the README. --out adds engine.json, table and figure as text in engine.md,
-the figure of all ratios as engine.png and that of the memory of a reverse gradient as memory.png. --quick runs everything
-small, to see that it runs: its figures say nothing. The other benchmarks (cost, rotor, criterion) are commands of their own.
+Prints each measurement as it comes and, at the end, the table. --out adds engine.json, the table and the README's figure (as
+text) in engine.md, the figure of all ratios as engine.png and that of the memory of a reverse gradient as memory.png. --quick
+runs everything small, to see that it runs: its figures say nothing. The other benchmarks (cost, rotor, criterion) are commands
+of their own.
 """
 
 from __future__ import annotations

@@ -78,7 +78,15 @@ def compare(name: str, scene: jv.Scene, until: float, runs: int) -> None:
         return first(lambda: call(numbers)), best(lambda: call(numbers), count)
 
     compiling, base = seconds_of(lambda s: jv.envelope(s, until, tolerance=tolerance, save="window"), 10 * runs)
-    say(group, "envelope", base, base, off, compiling, f"tolerance {tolerance:.1e}, {turns / float(slow.steps):.1f} turns a step")
+    say(
+        group,
+        "envelope",
+        base,
+        base,
+        off,
+        compiling,
+        f"tolerance {tolerance:.1e}, {turns / float(slow.steps):.1f} turns a step",
+    )
     for title, solver in (
         ("full, as simulate does it under jit", None),
         ("full, the step written out", WrittenOut()),

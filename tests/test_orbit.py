@@ -1,6 +1,8 @@
 """Exact jams against the full equations, solved by other means."""
 
 import functools
+import subprocess
+import sys
 
 import equinox as eqx
 import jax
@@ -260,6 +262,16 @@ def test_modes_that_the_leading_order_lacks_or_has_in_vain():
     for k in (3, 4):
         with pytest.raises(jv.ComputationError, match="absent"):
             jv.jam_orbit(within, mode=k)
+
+
+def test_single_precision_answers_as_well_as_it_can():
+    """In a process of its own: the tests' one counts in double precision."""
+    ask = "import jaxvib as jv; print(jv.jam_orbit(jv.Dimensionless('antiphase', **{}).scene(), mode=3).omega.item())"
+    form = dict(natural=(1 / 3, 1 / 3), damping=(0.01, 0.01), link_natural=2 / 3, link_damping=0.01)
+    form |= dict(rho=1.0, beta=1.0, eps=0.05, speed=1.5)
+    done = subprocess.run([sys.executable, "-c", ask.format(form)], capture_output=True, text=True, check=True)
+    exact = float(jv.jam_orbit(jv.Dimensionless("antiphase", **form).scene(), mode=3).omega)
+    assert abs(float(done.stdout) / exact - 1.0) < 1e-6 and float(done.stdout) != exact
 
 
 def test_wrong_questions_are_refused():

@@ -37,7 +37,7 @@ def jam_orbit(
     mode: int | None = None,
     omega: Number | None = None,
     near: Number | None = None,
-    accuracy: float = 1e-9,
+    accuracy: float | None = None,
     points: int | None = None,
     throw: bool = True,
 ) -> Orbit:
@@ -60,7 +60,8 @@ def jam_orbit(
       leading order lacks it or is too far from it, the whole exact branch is searched (not under a JAX transformation)
     - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
     - `near`: a load speed to start from: a motion at the scene's rotor speed
-    - `accuracy`: harmonics are added until the estimated relative error is below it
+    - `accuracy`: harmonics are added until the estimated relative error is below it (1e-9 unless said otherwise, in single
+      precision 1e-3)
     - `points`: a fixed number of collocation points (on half a period without gravity, else on a period) in place of that.
       Under `jit` and `vmap` shapes cannot follow numbers: there it is 16 (33) unless said otherwise, the status tells
     - `throw`: raise where there is no such motion; else, and under a JAX transformation, the status says so
@@ -89,6 +90,8 @@ def jam_orbit(
     frozen = jax.lax.stop_gradient(scene)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+    if accuracy is None:
+        accuracy = 1e-9 if floor < 1e-9 else 1e-3
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
     drag = jammed_loads(frozen).drag_sum()
