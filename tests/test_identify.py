@@ -13,6 +13,7 @@ from scipy.integrate import quad, solve_ivp
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.machine.friction import sliding_sign
+from jaxvib.motion.swing import SwingStatus, swing_states
 from jaxvib.study.identify import first_guess, fit_swing, steps_for, student_quantile
 
 T = 0.05 * np.arange(400)
@@ -270,6 +271,24 @@ def test_both_frictions_are_held_in_their_intervals():
     records, truth = trials(200, t, np.random.default_rng(4), 2e-3, 0.02)
     for held, spread in coverage(many(records, t, True), truth, ["viscous", "dry"], t.size):
         assert 184 <= held <= 197 and 0.85 < spread < 1.15
+
+
+@pytest.mark.parametrize("wrong", [dict(angle=jnp.nan), dict(dry=jnp.inf), dict(g=-9.81)])
+def test_a_swing_that_does_not_exist_leaves_those_beside_it_alone(wrong):
+    """As where a fit's step leads into nothing; their stops and slopes are looked for together."""
+
+    def swing(x):
+        pendulum = eqx.tree_at(lambda p: p.g, ROD, x["g"])
+        given = (x["angle"], jnp.zeros(()), jnp.asarray(1e-3), x["dry"], jnp.asarray(1e-3))
+        run = swing_states(pendulum, T[:200], *given, 1e-8, diffrax.Tsit5(), diffrax.ForwardMode(), 4096)
+        return run.angle, run.status
+
+    right = dict(angle=0.3, dry=0.02, g=9.81)
+    both = {name: jnp.asarray([value, wrong.get(name, value)]) for name, value in right.items()}
+    (value, status), slope = jax.jit(jax.vmap(lambda x: (swing(x), jax.jacfwd(swing, has_aux=True)(x)[0])))(both)
+    assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1]))
+    assert all(np.all(np.isfinite(s[0])) and np.any(s[0]) for s in jax.tree.leaves(slope))
+    assert np.asarray(status == SwingStatus.no_start).tolist() == [False, True]
 
 
 def test_a_whole_swing_down_to_rest_gives_both_frictions():

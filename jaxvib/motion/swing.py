@@ -79,6 +79,7 @@ class SwingStatus(eqx.Enumeration):
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction brought the pendulum to a stop and holds it"
     max_steps_reached = "the swing did not reach its last time in the steps it was allowed"
+    no_start = "the swing does not exist: a number of it is not finite, or the pendulum would not hang"
 
 
 class Swing(eqx.Module):
@@ -187,6 +188,12 @@ def swing_states(
     max_steps: int,
 ) -> Swing:
     """`swing` without a look at its arguments; `dry` may be negative here, as a fit to noise may want it."""
+    given = (pendulum.frequency, angle, rate, viscous) if dry is None else (pendulum.frequency, angle, rate, viscous, dry)
+    exists = jnp.all(jnp.isfinite(jnp.stack(jnp.broadcast_arrays(*given))))
+    # A swing that does not exist (a fit's step into nothing in one lane of a batch) must not fail the others' search for stops.
+    angle, rate, viscous = (jnp.where(exists, value, 0.0) for value in (angle, rate, viscous))
+    dry = None if dry is None else jnp.where(exists, dry, 0.0)
+    pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
     frequency = pendulum.frequency
     if dry is not None and width is None:
         zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
@@ -244,10 +251,12 @@ def swing_states(
         after = stopped & ~jnp.isfinite(f)
         f = jnp.where(after, middle + way * reach * jnp.cos(phase), f)
         slip = jnp.where(after, way * reach * frequency * jnp.sin(phase), slip)
-    good = stopped | (solution.result == diffrax.RESULTS.successful)
+    finished = stopped | (solution.result == diffrax.RESULTS.successful)
     status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
+    status = SwingStatus.where(finished, status, SwingStatus.max_steps_reached)
+    good = exists & finished
     return Swing(
-        status=SwingStatus.where(good, status, SwingStatus.max_steps_reached),
+        status=SwingStatus.where(exists, status, SwingStatus.no_start),
         time=times,
         angle=jnp.where(good, f, jnp.nan),
         rate=jnp.where(good, slip, jnp.nan),
