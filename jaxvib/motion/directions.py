@@ -41,7 +41,7 @@ def in_all_directions(function: Callable[[Any], Any], beside: Callable[[Any, Slo
     @call.def_jvp
     def _(primals: Any, tangents: Any) -> Any:
         leaves, rest = jax.tree.flatten(primals[0])
-        slopes = rest.flatten_up_to(tangents[0])  # pyright: ignore[reportAttributeAccessIssue]
+        slopes = flat_slopes(tangents[0], primals[0])
         arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
         places = [k for k, slope in enumerate(slopes) if slope is not None]
 

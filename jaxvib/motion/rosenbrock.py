@@ -134,8 +134,8 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
             return lax.dynamic_update_index_in_dim(stages, jnp.sum(inverse * right[None, :], axis=1), i, 0)
 
         stages = lax.fori_loop(0, len(_A), stage, jnp.zeros((len(_A), *y0.shape), y0.dtype))
-        y1 = y0 + mixed(_A[-1], stages) + stages[-1]
-        bend, twist = (mixed(row, stages) for row in np.asarray(_DENSE))
+        y1 = y0 + mixed(_A[-1].tolist(), stages) + stages[-1]
+        bend, twist = (mixed(row, stages) for row in _DENSE)
         dense = dict(y0=y0, y1=y1, bend=bend, twist=twist)
         return y1, stages[-1], dense, None, diffrax.RESULTS.successful
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["ERROR", "NODES", "ROWS", "Between", "WrittenOut", "mixed", "packed", "unpacked"]
+__all__ = ["ERROR", "NODES", "ROWS", "Between", "Prince8", "WrittenOut", "mixed", "packed", "unpacked"]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _POLYNOMIALS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
@@ -78,7 +78,27 @@ class Between(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(lambda y, change: y + change, self.y0, unpacked(mixed(weights, self.stages), self.y0))
 
 
-class WrittenOut(diffrax.AbstractAdaptiveSolver):
+class Prince8(diffrax.AbstractAdaptiveSolver):
+    """What the forms of Dormand and Prince's pair share: all but the step, and what finds states within one."""
+
+    wrap: Callable[[Any], Any] | None = None
+    tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    def order(self, terms: Any) -> int:
+        """8."""
+        return 8
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        """The rates at the start: the last stage of a step is the first of the next one."""
+        return terms.vf(t0, y0, args)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """The vector field, for the choice of the first step."""
+        return terms.vf(t0, y0, args)
+
+
+class WrittenOut(Prince8):
     """Dormand and Prince's pair of order 8(7), its 13 stages written out one after another.
 
     The same numbers as `diffrax.Dopri8`, in another form: no loop over stages, no arrays of stages, so that a small time loop
@@ -102,23 +122,7 @@ class WrittenOut(diffrax.AbstractAdaptiveSolver):
     """
 
     lanes: bool = eqx.field(static=True, default=False)
-    wrap: Callable[[Any], Any] | None = None
-    tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
-
-    term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., Any]] = Between
-
-    def order(self, terms: Any) -> int:
-        """8."""
-        return 8
-
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
-        """The rates at the start: the last stage of a step is the first of the next one."""
-        return terms.vf(t0, y0, args)
-
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
-        """The vector field, for the choice of the first step."""
-        return terms.vf(t0, y0, args)
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
