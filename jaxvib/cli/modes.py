@@ -35,7 +35,8 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
     if exact:
         _exact(loaded, unit, output)
         return
-    if phases or loaded.machine.carrier().axes != (1,):
+    structure = loaded.machine.structure()
+    if phases or structure.axes != (1,):
         _phases(loaded, unit, output)
         return
     found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
@@ -61,7 +62,6 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
     }
 
     def text() -> str:
-        names = loaded.machine.carrier().coordinates
         rows = [
             [
                 f"{int(jam.mode)}",
@@ -75,7 +75,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
         ]
         speed = float(loaded.drive.speed)
         resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
-        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in names), "force on bed, N"]
+        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in structure.coordinates), "force on bed, N"]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
             table("jam modes of light loads; amplitudes and force zero to peak", head, rows) if rows else "no jam mode here",
@@ -167,7 +167,7 @@ def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
     }
 
     def text() -> str:
-        names = scene.machine.carrier().coordinates
+        names = scene.machine.structure().coordinates
         rows = [
             [
                 f"{k}",

@@ -60,3 +60,7 @@ class Machine(eqx.Module):
     @abc.abstractmethod
     def carrier(self) -> Carrier:
         """The machine as a linear structure, see `Carrier`."""
+
+    def structure(self) -> Carrier:
+        """The carrier's names, directions and shapes, without computing its numbers."""
+        return eqx.filter_eval_shape(self.carrier)

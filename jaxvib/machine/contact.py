@@ -49,7 +49,7 @@ class LoadContact(Effect):
         """Loads on one circle that have a size."""
         if not isinstance(loads, CircularLoads) or loads.own_radius is None:
             raise InputError("effects.load_contact", "needs loads that have a size: give balls or rollers their own_radius")
-        if machine.carrier().stations is not None:
+        if machine.structure().stations is not None:
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:

@@ -53,7 +53,7 @@ class Scene(eqx.Module):
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
-        stations = machine.carrier().stations
+        stations = machine.structure().stations
         if stations is not None and stations.shape != (loads.count,):
             raise InputError(
                 "machine.stations", f"has {stations.shape[0]} values; one for all loads or {loads.count} are needed"

@@ -93,7 +93,7 @@ class Envelope(Measured):
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
-        names = self.scene.machine.carrier().coordinates
+        names = self.scene.machine.structure().coordinates
         amplitude = ", ".join(f"{n} {float(a):.4g} m" for n, a in zip(names, self.amplitude, strict=True))
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled"
@@ -115,7 +115,7 @@ class Envelope(Measured):
         kept = self.window if self.trajectory is None else self.trajectory
         return time_histories(
             *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
-            names=self.scene.machine.carrier().coordinates,
+            names=self.scene.machine.structure().coordinates,
         )
 
 

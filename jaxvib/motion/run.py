@@ -72,7 +72,7 @@ class Run(Measured):
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
-        names = self.scene.machine.carrier().coordinates
+        names = self.scene.machine.structure().coordinates
         units = ["rad" if n in ("theta", "psi") else "m" for n in names]
         amplitude = ", ".join(f"{n} {float(a):.4g} {u}" for n, a, u in zip(names, self.amplitude, units, strict=True))
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
@@ -111,7 +111,7 @@ class Run(Measured):
             np.asarray(kept.state.rate[0]),
             np.asarray(kept.foundation_force),
             np.asarray(kept.rotor_speed),
-            names=self.scene.machine.carrier().coordinates,
+            names=self.scene.machine.structure().coordinates,
         )
 
     def to_xarray(self) -> xarray.Dataset:
@@ -121,7 +121,7 @@ class Run(Measured):
         except ImportError as error:
             raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
         kept = self._kept()
-        names = list(self.scene.machine.carrier().coordinates)
+        names = list(self.scene.machine.structure().coordinates)
         loads = range(1, self.scene.loads.count + 1)
 
         def column(value: Array, dimension: str, unit: str) -> tuple[tuple[str, str], np.ndarray, dict[str, str]]:

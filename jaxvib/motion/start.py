@@ -108,7 +108,7 @@ def whole_state(scene: Scene, state: State, mode: int | None) -> State:
     """
     if mode is not None:
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
-    nd, n = scene.machine.carrier().mass.shape[0], scene.loads.count
+    nd, n = scene.machine.structure().mass.shape[0], scene.loads.count
     if isinstance(scene.drive, Motor) != (state.rotor is not None):
         needed = (
             "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"

@@ -83,7 +83,7 @@ def rotor_torque(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array)
     `a` (np, ...): the port's acceleration, m/s^2.
     """
     loads, u, rates = scene.loads, (jnp.asarray(phi),), (rate,)
-    at = dict(zip(scene.machine.carrier().axes, a, strict=True))
+    at = dict(zip(scene.machine.structure().axes, a, strict=True))
     g = sum(effect.g for effect in scene.effects if isinstance(effect, Gravity))
     found = (effect.friction(loads, u, rates, speed, g) for effect in scene.effects)
     torque = loads.resistance(u, rates, speed)[0]
@@ -132,5 +132,5 @@ def light_friction(scene: Scene, omega: Array, speed: Array) -> Array:
 def circle(scene: Scene, phi: Points) -> tuple[Array, Array]:
     """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
     cos, sin = jnp.cos(phi), jnp.sin(phi)
-    axes = scene.machine.carrier().axes
+    axes = scene.machine.structure().axes
     return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])

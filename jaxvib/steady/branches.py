@@ -106,7 +106,7 @@ def branches(
         raise InputError("least", "goes with exact=True only; light loads have a branch down to speed 0")
     count(points, "points", low=2)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
-    per_side = max(2, math.ceil(points / (2 * scene.machine.carrier().mass.shape[0])))
+    per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))
     return _branches(scene, top, points, per_side)
 
 

@@ -53,7 +53,7 @@ def picture(
         force=np.asarray(branch.foundation_force),
         resonances=np.asarray(natural_frequencies(branch.scene)),
         marks=[(kind.replace("_", " "), points[:, 1], points[:, 0]) for kind, points in shown.items()],
-        names=branch.scene.machine.carrier().coordinates,
+        names=branch.scene.machine.structure().coordinates,
         at=at,
         unit=unit,
     )

@@ -161,7 +161,7 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
-    if scene.machine.carrier().stations is not None:
+    if scene.machine.structure().stations is not None:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
         )
