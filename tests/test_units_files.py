@@ -10,7 +10,7 @@ from scenes import loads, machines, scene
 
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES, scene_from_tables
-from jaxvib.machine.units import number, numbers, to_float
+from jaxvib.machine.units import _FACTORS, number, numbers, to_float
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
@@ -44,6 +44,16 @@ def test_numbers_come_in_any_unit(given, unit, expected):
     value = number(given, unit, "field")
     assert value.shape == () and value.dtype == jnp.float64
     np.testing.assert_allclose(value, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("unit", "text"), [(unit, text) for unit, known in _FACTORS.items() for text in known])
+def test_units_known_by_heart_are_those_of_the_library(unit, text):
+    """A quantity goes through the library, a text of a common unit does not."""
+    np.testing.assert_allclose(
+        to_float(f"3 {text}", unit, "field"),
+        to_float(pint.get_application_registry().Quantity(3.0, text), unit, "field"),
+        rtol=1e-15,
+    )
 
 
 def test_pint_quantities_come_in():

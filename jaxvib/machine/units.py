@@ -24,6 +24,17 @@ Number = Any
 _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_](?:(?!\s\d)[^,;()])*)")
 """One number with a decimal point, then one unit: everything else a unit library might make a number of is a slip."""
 
+_FACTORS = {
+    "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "N/m": {"N/m": 1.0, "N/mm": 1e3, "kN/m": 1e3, "kN/mm": 1e6},
+    "N s/m": {"N s/m": 1.0, "N s/mm": 1e3, "kN s/m": 1e3},
+    "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
+    "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
+}
+"""What most drawings are written in. pint reads everything else, and takes half a second to get ready for it."""
+
 FIELD_UNITS = {
     "mass": "kg",
     "stiffness": "N/m",
@@ -80,20 +91,19 @@ def to_float(value: Number, unit: str, field: str) -> Any:
         except ValueError:
             pass
     if isinstance(value, str) or hasattr(value, "m_as"):
-        import pint  # slow to import, and needed only for text and quantities
-
         wrong = InputError(
             field,
             f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}",
         )
+        parts = _TEXT.fullmatch(value.strip()) if isinstance(value, str) else None
+        if isinstance(value, str) and parts is None:
+            raise wrong
+        if parts is not None and parts[2] in _FACTORS.get(unit, ()):
+            return float(parts[1]) * _FACTORS[unit][parts[2]]
+        import pint
+
         try:
-            if isinstance(value, str):
-                parts = _TEXT.fullmatch(value.strip())
-                if parts is None:
-                    raise wrong
-                given = pint.get_application_registry().Quantity(float(parts[1]), parts[2])
-            else:
-                given = value
+            given: Any = value if parts is None else pint.get_application_registry().Quantity(float(parts[1]), parts[2])
             magnitude = given.m_as(unit or "dimensionless")
         except (pint.PintError, AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError) as error:
             raise wrong from error
