@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -97,7 +98,7 @@ class JamModes(Jam):
 
     def mode_numbers(self) -> list[int]:
         """The numbers of the modes that exist."""
-        return [int(k) for k, there in zip(self.mode, self.exists, strict=True) if there]
+        return [int(k) for k, there in zip(np.asarray(self.mode), np.asarray(self.exists), strict=True) if there]
 
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """The jam mode of that number.
@@ -110,7 +111,7 @@ class JamModes(Jam):
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
         jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
-        if throw and not traced(self.omega) and not bool(self.exists[mode - 1]):
+        if throw and not traced(self.omega) and not np.asarray(self.exists)[mode - 1]:
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",
@@ -286,12 +287,13 @@ def _pieces(scene: Scene) -> _Pieces:
     frozen = jax.lax.stop_gradient(scene)
     grid, resonances = fold_points(frozen, _POINTS)
     nd = resonances.shape[0]
-    grid = _with_close_folds(lambda w: _slope(frozen, w), grid, 2 * nd)
-    falling = jax.vmap(lambda w: _slope(frozen, w))(grid) < 0.0
+    grid, slopes = _with_close_folds(lambda w: _slope(frozen, w), grid, 2 * nd)
+    falling = slopes < 0.0
     (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
-    omega = jax.vmap(lambda lo, hi: bracketed_root(lambda w: _slope(scene, w), lo, hi))(grid[change], grid[change + 1])
+    ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
+    omega = jax.vmap(partial(bracketed_root, lambda w: _slope(scene, w)))(*ends)
     speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
@@ -380,8 +382,9 @@ def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
     return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
 
 
-def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> Array:
-    """The grid with points added where the slope comes closest to 0 and turns back: two folds may hide in one interval."""
+def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
+    """The grid and the slope at it, with points added where that comes closest to 0 and turns back: two folds may hide in one
+    interval."""
     value = jax.vmap(slope)(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
@@ -400,7 +403,9 @@ def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -
         a, b = jax.lax.fori_loop(0, 16, narrow, (low, high))
         return (a + b) / 2.0
 
-    return jnp.sort(jnp.concatenate([grid, jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])]))
+    added = jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])
+    order = jnp.argsort(jnp.concatenate([grid, added]))
+    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, jax.vmap(slope)(added)])[order]
 
 
 def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
@@ -409,6 +414,7 @@ def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array
     def gap(w: Array) -> Array:
         return jam_rotor_speed(scene, w) - scene.drive.speed
 
-    gap_low = jnp.where(low > 0.0, gap(jnp.where(low > 0.0, low, high)), -scene.drive.speed)
-    exists = (high > low) & (gap_low * gap(high) <= 0.0)
-    return bracketed_root(gap, low, high), exists
+    gap_low, gap_high = jax.vmap(gap)(jnp.stack([jnp.where(low > 0.0, low, high), high]))
+    gap_low = jnp.where(low > 0.0, gap_low, -scene.drive.speed)
+    exists = (high > low) & (gap_low * gap_high <= 0.0)
+    return bracketed_root(gap, low, high, (gap_low, gap_high)), exists

@@ -11,8 +11,10 @@ from jax import Array
 __all__ = ["bracketed_root"]
 
 
-def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
+def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: tuple[Array, Array] | None = None) -> Array:
     """The root of `f` between `low` and `high` (scalars), where f changes sign once, to the last digits.
+
+    `ends`: f(low) and f(high), for whoever knows them already.
 
     Inverse quadratic interpolation where it is safe, halving elsewhere (Chandrupatla, Adv. Eng. Software 28, 1997).
     Derivatives of any order by the implicit function theorem.
@@ -47,7 +49,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
             share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
             return steps + 1, a, fa, b, fb, share, best, least
 
-        f_low, f_high = jax.vmap(g)(jnp.stack([low, high]))  # one copy of g in the program, not two
+        # Both ends at once: one copy of g in the program, not two.
+        f_low, f_high = jax.vmap(g)(jnp.stack([low, high])) if ends is None else ends
         # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
         # from that of the other and the bracket is lost: then the point where |g| was least is the root.
         best = jnp.where(size(f_low) < size(f_high), low, high)
@@ -55,7 +58,7 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array) -> Arra
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
         return jax.lax.while_loop(open_, step, start)[6]
 
-    low, high = jax.lax.stop_gradient((low, high))
+    low, high, ends = jax.lax.stop_gradient((low, high, ends))
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
 
 
