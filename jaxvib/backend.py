@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import platform
 import re
 import sys
 from pathlib import Path
 
 from jaxvib.errors import InputError
 
-__all__ = ["prepare_cpu"]
+__all__ = ["prepare_cpu", "processor"]
 
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
@@ -67,7 +69,13 @@ def _started() -> bool:
 
 
 def _has_wide_vectors() -> bool:
-    try:
-        return re.search(r"^flags\s*:.*\bavx512f\b", Path("/proc/cpuinfo").read_text(), re.MULTILINE) is not None
-    except OSError:
-        return False
+    return re.search(r"\bavx512f\b", processor()) is not None
+
+
+def processor() -> str:
+    """The kind of processor this is, with its instruction sets where the system tells them."""
+    told = ""
+    with contextlib.suppress(OSError):  # Linux only
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        told = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return f"{platform.machine()} {platform.processor()} {told}"

@@ -1,4 +1,4 @@
-"""Traced programs kept on disk, so that the next process that asks the same question need not trace it again."""
+"""Compiled programs kept on disk, so that the next process that asks the same question neither traces nor compiles."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import os
 import pickle
 import re
 import tempfile
+import uuid
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import jax.export
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.experimental import serialize_executable
+
+from jaxvib.backend import processor
 
 __all__ = ["keep_programs", "kept"]
 
@@ -64,9 +68,7 @@ class _Kept(Generic[P, T]):
         """All that the traced program depends on; None where that cannot be told, as with a function made on the spot."""
         shown = [f"{x.dtype}{x.shape}{jax.typeof(x).weak_type}" if eqx.is_array(x) else repr(x) for x in leaves]
         modes = [str(jax.config.values[name]) for name in ("jax_enable_x64", "jax_numpy_rank_promotion")]
-        said = "\n".join(
-            [self.function.__module__, _sources(), jax.__version__, jax.default_backend(), *modes, str(rest), *shown]
-        )
+        said = "\n".join([self.function.__module__, _sources(), jax.__version__, _machine(), *modes, str(rest), *shown])
         said = re.sub(r"<function ([\w.]+) at 0x[0-9a-f]+>", r"\1", said)
         return None if re.search(r" at 0x|<lambda>|<locals>", said) else hashlib.sha256(said.encode()).hexdigest()[:32]
 
@@ -80,20 +82,22 @@ class _Kept(Generic[P, T]):
             skeleton[:] = [jax.tree.map(lambda leaf: _ARRAY if eqx.is_array(leaf) else leaf, out)]
             return [jnp.asarray(leaf) for leaf in jax.tree.leaves(out) if eqx.is_array(leaf)]
 
+        # A name of its own keeps JAX's compilation cache away: what that has loaded cannot be written again.
+        flat.__name__ = f"{self.function.__name__}_{uuid.uuid4().hex}"
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        jitted = jax.jit(flat)
+        compiled = jax.jit(flat).lower(*arrays).compile()
         try:
-            exported = jax.export.export(jitted)(*arrays)
-            written = pickle.dumps((bytes(exported.serialize()), skeleton[0]))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                file.write(written)
-            os.replace(file.name, path)  # at once: another process never reads half a program
-            return jax.jit(exported.call), skeleton[0]
-        except (NotImplementedError, ValueError, OSError, pickle.PicklingError, AttributeError):
-            # A program that holds a callback or a library call of no fixed form, or a folder that cannot be written.
-            jax.eval_shape(jitted, *arrays)
-            return jitted, skeleton[0]
+            calls = set(re.findall(r'custom_call_target="(\w+)"', compiled.as_text() or ""))
+            if all(name.startswith("lapack_") for name in calls):  # anything else may be an address in this process
+                program, given, given_back = serialize_executable.serialize(compiled)
+                written = pickle.dumps((program, given, given_back, bool(calls), skeleton[0]))
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                    file.write(written)
+                os.replace(file.name, path)  # at once: another process never reads half a program
+        except (RuntimeError, ValueError, TypeError, OSError, pickle.PicklingError, AttributeError):
+            pass  # a program of no fixed form, or a folder that cannot be written: this process has it all the same
+        return compiled, skeleton[0]
 
 
 class _Array:
@@ -108,8 +112,14 @@ _ARRAY = _Array()
 
 def _read(path: Path) -> tuple[Callable[..., list[Any]], Any] | None:
     try:
-        program, skeleton = pickle.loads(path.read_bytes())
-        return jax.jit(jax.export.deserialize(bytearray(program)).call), skeleton
+        program, given, given_back, lapack, skeleton = pickle.loads(path.read_bytes())
+        with ThreadPoolExecutor(1) as beside:
+            loaded = beside.submit(
+                serialize_executable.deserialize_and_load, program, given, given_back, execution_devices=jax.devices()[:1]
+            )
+            if lapack:  # JAX binds the library only when it lowers a call of it; an unbound call would end the process
+                jax.jit(jnp.linalg.eigvalsh).lower(jax.ShapeDtypeStruct((1, 1), float))
+            return loaded.result(), skeleton
     except Exception:  # no such file, or whatever a damaged one makes of its reader: it is written anew
         return None
 
@@ -122,10 +132,16 @@ def _sources() -> str:
     return f"{versions} {[(file.st_size, file.st_mtime_ns) for file in files]}"
 
 
+@functools.cache
+def _machine() -> str:
+    """What a compiled program can run on."""
+    return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
+
+
 def kept(function: Callable[P, T]) -> Callable[P, T]:
-    """Compiles a function of pytrees, as `equinox.filter_jit` does, and keeps its traced programs where a folder is named.
+    """Compiles a function of pytrees, as `equinox.filter_jit` does, and keeps its programs where a folder is named.
 
     Under a JAX transformation it is just the compiled function. The key holds everything a program depends on: the shapes,
-    the static parts of the arguments, the versions, and when the sources were changed.
+    the static parts of the arguments, the processor, the versions, and when the sources were changed.
     """
     return _Kept(function)

@@ -85,6 +85,31 @@ def test_what_cannot_be_kept_still_runs(folder):
     assert not [file for file in folder.iterdir() if file.name.startswith("told")]
 
 
+def test_a_library_call_outlives_its_process(tmp_path):
+    """LAPACK must be bound before a kept program calls it, and what JAX's own cache has loaded must not be kept."""
+    code = """
+import sys, pathlib, jax, jax.numpy as jnp
+from jaxvib import programs
+jax.config.update("jax_compilation_cache_dir", sys.argv[1] + "/jax")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+folder = pathlib.Path(sys.argv[1]) / "kept"
+programs.keep_programs(folder)
+def values(x):
+    print("traced")
+    return jnp.linalg.eigvalsh(x @ x.T)
+total = programs.kept(values)(jnp.arange(16.0).reshape(4, 4)).sum()
+print(round(float(total)), len(list(folder.iterdir())))
+"""
+    said = []
+    for k in range(4):
+        if k == 2:
+            (file,) = (tmp_path / "kept").iterdir()
+            file.unlink()
+        done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, capture_output=True, text=True)
+        said.append(done.stdout.split())
+    assert said == [["traced", "1240", "1"], ["1240", "1"]] * 2
+
+
 def test_derivatives_go_through_kept_functions(folder):
     slope = jax.grad(lambda x: programs.kept(doubled)(Pair(x, "a"), 2.0)[0].first.sum())(jnp.arange(3.0))
     np.testing.assert_array_equal(slope, [2.0, 2.0, 2.0])

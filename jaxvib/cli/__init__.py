@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -11,10 +12,15 @@ __all__ = ["main"]
 
 def main() -> None:
     """The command `jaxvib`; exit code 0 done, 1 the computation failed, 2 bad input."""
+    gc.disable()
     prepare()
     from jaxvib.cli.app import run
 
-    sys.exit(run(sys.argv[1:]))
+    gc.freeze()  # modules stay: looking through them again and again, and at the end, takes a fifth of a short command
+    gc.enable()
+    code = run(sys.argv[1:])
+    gc.freeze()
+    sys.exit(code)
 
 
 def prepare() -> None:
@@ -34,4 +40,4 @@ def prepare() -> None:
 
     from jaxvib.programs import keep_programs
 
-    keep_programs(Path(str(jax.config.values["jax_compilation_cache_dir"])) / "traced")
+    keep_programs(Path(str(jax.config.values["jax_compilation_cache_dir"])) / "programs")
