@@ -16,7 +16,7 @@ import jaxvib as jv
 from jaxvib.motion.engine import Motion
 from jaxvib.motion.integrate import integrate
 from jaxvib.motion.looped import Looped
-from jaxvib.motion.scalars import Unwritten, on_numbers
+from jaxvib.motion.scalars import Unwritten, on_numbers, program_on_numbers
 from jaxvib.motion.sines import sine_and_cosine
 from jaxvib.motion.solver import WrittenOut
 
@@ -63,6 +63,23 @@ def test_on_numbers_the_equations_are_the_same(machine, load, effects):
     ours, _ = motion.states(jax.tree.map(lambda x: x[None], rates))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(field(jnp.asarray(0.3), state)), strict=True):
         np.testing.assert_allclose(a[0], b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
+
+
+def test_complex_numbers_are_written_in_their_parts():
+    """Every operation on complex numbers that has a rule, with real ones among them; a factor i costs no multiplication."""
+
+    def mixed(x, w):
+        real, imag = x
+        z = real + 1j * imag
+        chosen = jnp.where(x[0] > 0.0, z * w, jnp.conj(z))
+        return jnp.stack([z * jnp.conj(w) / x[1] - x[0], w / z + 2.0, -(z**2) + z**3, jnp.square(w) * chosen, 1j - jnp.exp(z)])
+
+    x, w = jnp.asarray([0.7, -1.3]), jnp.asarray(0.4 - 0.9j)
+    cells = [np.array([*x], dtype=object), np.full((), w, dtype=object)]
+    np.testing.assert_allclose([complex(v) for v in on_numbers(mixed, x, w)(*cells)], mixed(x, w), rtol=1e-14)
+
+    turned = program_on_numbers(lambda a, b: (1j * (a + 1j * b)).real, x[0], x[1])
+    assert turned is not None and [e.primitive.name for e in turned.jaxpr.eqns] == ["neg"]
 
 
 def test_an_operation_without_a_rule_is_named():

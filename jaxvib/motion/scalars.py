@@ -47,7 +47,8 @@ def on_numbers(function: Callable[..., Any], *arguments: Any) -> Callable[..., A
 
     def run(*cells: Any) -> Any:
         leaves = jax.tree.leaves(cells, is_leaf=lambda x: isinstance(x, np.ndarray))
-        return jax.tree.unflatten(rest, _run(closed.jaxpr, closed.consts, [_cells(leaf) for leaf in leaves], {}))
+        found = _run(closed.jaxpr, closed.consts, [_cells(leaf) for leaf in leaves], {})
+        return jax.tree.unflatten(rest, [_elementwise(_joined, [value], {}) for value in found])
 
     return run
 
@@ -114,19 +115,64 @@ def _known(x: Any) -> bool:
     return isinstance(x, (np.generic, int, float, bool))
 
 
+class _Pair:
+    """A complex number by its parts, of which one is often known to be 0; XLA multiplies that out."""
+
+    __slots__ = ("imag", "real")
+
+    def __init__(self, real: Any, imag: Any):
+        self.real, self.imag = real, imag
+
+
+def _is_complex(x: Any) -> bool:
+    return isinstance(x, _Pair) or jnp.iscomplexobj(x)
+
+
+def _parts(x: Any) -> tuple[Any, Any]:
+    if isinstance(x, _Pair) or _known(x):
+        return x.real, x.imag
+    return (lax.real(x), lax.imag(x)) if _is_complex(x) else (x, np.zeros((), x.dtype)[()])
+
+
+def _joined(x: Any) -> Any:
+    return lax.complex(*(jnp.asarray(part) for part in _parts(x))) if isinstance(x, _Pair) else x
+
+
+def _by_parts(rule: Callable[..., Any]) -> Callable[..., Any]:
+    """A rule for real numbers, applied to the real and to the imaginary parts."""
+
+    def apply(*x: Any, **params: Any) -> Any:
+        if not any(_is_complex(v) for v in x):
+            return rule(*x, **params)
+        real, imag = zip(*(_parts(v) for v in x), strict=True)
+        return _Pair(rule(*real, **params), rule(*imag, **params))
+
+    return apply
+
+
+@_by_parts
 def _add(x: Any, y: Any, **_: Any) -> Any:
     if _known(x) and _known(y):
         return x + y
     return y if _known(x) and x == 0 else x if _known(y) and y == 0 else x + y
 
 
+@_by_parts
 def _sub(x: Any, y: Any, **_: Any) -> Any:
     if _known(x) and _known(y):
         return x - y
-    return -y if _known(x) and x == 0 else x if _known(y) and y == 0 else x - y
+    return _neg(y) if _known(x) and x == 0 else x if _known(y) and y == 0 else x - y
+
+
+@_by_parts
+def _neg(x: Any, **_: Any) -> Any:
+    return -x
 
 
 def _mul(x: Any, y: Any, **_: Any) -> Any:
+    if _is_complex(x) or _is_complex(y):
+        (a, b), (c, d) = _parts(x), _parts(y)
+        return _Pair(_sub(_mul(a, c), _mul(b, d)), _add(_mul(a, d), _mul(b, c)))
     if _known(x) and _known(y):
         return x * y
     if (_known(x) and x == 0) or (_known(y) and y == 0):  # a term that is not there
@@ -135,6 +181,11 @@ def _mul(x: Any, y: Any, **_: Any) -> Any:
 
 
 def _div(x: Any, y: Any, **_: Any) -> Any:
+    if _is_complex(x) or _is_complex(y):
+        (a, b), (c, d) = _parts(x), _parts(y)
+        if not (_known(d) and d == 0):
+            return _joined(x) / _joined(y)
+        return _Pair(_div(a, c), _div(b, c))
     if _known(x) and (x == 0 or _known(y)):
         return x / y if _known(y) else x
     return x if _known(y) and y == 1 else x / y
@@ -142,7 +193,7 @@ def _div(x: Any, y: Any, **_: Any) -> Any:
 
 def _plain(name: str) -> Callable[..., Any]:
     def apply(*x: Any, **params: Any) -> Any:
-        return getattr(lax, f"{name}_p").bind(*(jnp.asarray(v) for v in x), **params)
+        return getattr(lax, f"{name}_p").bind(*(jnp.asarray(_joined(v)) for v in x), **params)
 
     return apply
 
@@ -150,17 +201,26 @@ def _plain(name: str) -> Callable[..., Any]:
 def _power(x: Any, *, y: int, **_: Any) -> Any:
     if _known(x):
         return x**y
-    return lax.integer_pow(x, y)
+    return _mul(x, x) if y == 2 else lax.integer_pow(_joined(x), y)
 
 
 def _convert(x: Any, *, new_dtype: Any, **_: Any) -> Any:
-    return np.asarray(x, new_dtype)[()] if _known(x) else lax.convert_element_type(x, new_dtype)
+    if _known(x):
+        return np.asarray(x, new_dtype)[()]
+    if jnp.issubdtype(new_dtype, jnp.complexfloating):
+        part = np.empty((), new_dtype).real.dtype
+        return _Pair(*(_convert(v, new_dtype=part) for v in _parts(x)))
+    return lax.convert_element_type(_joined(x), new_dtype)
 
 
 def _select(which: Any, *cases: Any, **_: Any) -> Any:
     if _known(which):
         return cases[int(which)]
-    a, b = cases
+    return _choice(*cases, which=which)
+
+
+@_by_parts
+def _choice(a: Any, b: Any, *, which: Any) -> Any:
     return jnp.where(which, b, a)
 
 
@@ -170,12 +230,16 @@ _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "sub": _sub,
     "mul": _mul,
     "div": _div,
-    "neg": lambda x, **_: -x,
+    "neg": _neg,
     "integer_pow": _power,
     "square": lambda x, **_: _mul(x, x),
     "convert_element_type": _convert,
     "select_n": _select,
-    "stop_gradient": lambda x, **_: lax.stop_gradient(x),
+    "real": lambda x, **_: _parts(x)[0],
+    "imag": lambda x, **_: _parts(x)[1],
+    "complex": lambda x, y, **_: _Pair(x, y),
+    "conj": lambda x, **_: _Pair(_parts(x)[0], _neg(_parts(x)[1])),
+    "stop_gradient": _by_parts(lambda x, **_: lax.stop_gradient(x)),
     "copy": lambda x, **_: x,
     "copy_p": lambda x, **_: x,
     **{
@@ -183,7 +247,7 @@ _ELEMENTWISE: dict[str, Callable[..., Any]] = {
         for name in (
             *("max", "min", "abs", "sign", "sqrt", "rsqrt", "exp", "log", "tanh", "atan2", "tan", "pow", "log1p", "expm1"),
             *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "floor", "ceil", "round", "rem", "is_finite", "clamp"),
-            *("real", "imag", "complex", "conj", "logistic", "asin", "acos", "atan", "sinh", "cosh", "erf", "cbrt", "exp2"),
+            *("logistic", "asin", "acos", "atan", "sinh", "cosh", "erf", "cbrt", "exp2"),
         )
     },
 }
@@ -248,6 +312,7 @@ _STRUCTURAL: dict[str, Callable[..., Cells]] = {
         tuple(slice(a, b, c) for a, b, c in zip(start_indices, limit_indices, strides or [1] * x.ndim, strict=True))
     ],
     "concatenate": lambda *x, dimension: np.concatenate(x, axis=dimension),
+    "stack": lambda *x, axis: np.stack(x, axis),
     "rev": lambda x, *, dimensions: np.flip(x, dimensions),
     "reduce_sum": _reduced(_add, 0.0),
     "reduce_max": _reduced(lambda a, b: jnp.maximum(a, b), None),
@@ -263,7 +328,7 @@ def _require_rules(jaxpr: core.Jaxpr) -> None:
         if name in _INNER:
             inner = equation.params[_INNER[name]]
             _require_rules(getattr(inner, "jaxpr", inner))
-        elif name not in _ELEMENTWISE and name not in _STRUCTURAL and name not in ("iota", "split", "sin", "cos"):
+        elif name not in _ELEMENTWISE and name not in _STRUCTURAL and name not in ("iota", "split", "unstack", "sin", "cos"):
             raise Unwritten(name)
 
 
@@ -288,6 +353,9 @@ def _run(jaxpr: core.Jaxpr, consts: Any, arguments: list[Cells], angles: dict[in
         elif name == "split":
             cuts = np.cumsum(params["sizes"])[:-1]
             results = np.split(given[0], cuts, axis=params["axis"])
+        elif name == "unstack":
+            moved = np.moveaxis(given[0], params["axis"], 0)
+            results = [moved[k, ...] for k in range(moved.shape[0])]
         elif name in _STRUCTURAL:
             results = [_STRUCTURAL[name](*given, **params)]
         elif name in ("sin", "cos"):
