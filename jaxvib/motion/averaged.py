@@ -50,7 +50,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.rosenbrock import written_inverse
-from jaxvib.steady.response import _modes, loaded_mass, magnitude, turning_loads
+from jaxvib.steady.response import _modes, loaded_mass, magnitude, small_solve, turning_loads
 
 __all__ = ["Amplitudes", "Averaged", "amplitudes_of", "averaged_field", "averaged_loads"]
 
@@ -171,7 +171,7 @@ def averaged_field(scene: Scene) -> Averaged:
     n = carrier.mass.shape[0]
     parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
     parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
-    solved = jnp.linalg.solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))
+    solved = small_solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))
     p = port.shape[0] * port.shape[1]
 
     def each(value: Array) -> Array:

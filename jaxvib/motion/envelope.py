@@ -259,7 +259,7 @@ def _run(
     turns: int,
     max_steps: int,
 ) -> Envelope:
-    begin = amplitudes_of(scene, initial_state(scene) if state is None else state)
+    begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = _finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
@@ -312,6 +312,12 @@ def _run(
         rejected=solution.stats["num_rejected_steps"],
         scene=scene,
     )
+
+
+def _at_rest(scene: Scene) -> Amplitudes:
+    rest = initial_state(scene)
+    (angle,), (rate,) = rest.angle, rest.rate
+    return Amplitudes(rest.displacement + 0.0j, rest.velocity + 0.0j, rate, angle - jnp.mean(angle))
 
 
 def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:

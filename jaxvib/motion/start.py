@@ -50,7 +50,8 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
     if start != "jam" and mode is not None:
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out or start in a jam")
     n = scene.loads.count
-    zero = _still(scene)
+    mass = scene.machine.structure().mass
+    zero = jnp.zeros(mass.shape[:1], mass.dtype)
 
     def phases(value: float) -> Array:
         if angles is not None:
@@ -76,12 +77,6 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
         (angle,),
         (jnp.full((n,), jam.omega),),
     )
-
-
-@eqx.filter_jit
-def _still(scene: Scene) -> Array:
-    """0 for each of the carrier's coordinates; compiled, it does not have to put the carrier together."""
-    return jnp.zeros_like(scene.machine.carrier().mass[0])
 
 
 def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
