@@ -23,7 +23,7 @@ def on_arrays(t, y, args):
     return {"x": damping * turned - stiffness * y["x"] ** 3, "scale": force * jnp.cos(t) * y["scale"] * y["x"][0, 1]}
 
 
-def motion(point, *, arrays=False, slopes=True, adaptive=True):
+def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.ForwardMode()):  # noqa: B008
     """States in the middle of a run and at its end; the point moves the equations, the start and the end."""
     y0 = {"x": point[3:7].reshape(2, 2), "scale": point[7]} if arrays else (point[3], point[4])
     end = point[8]
@@ -38,7 +38,7 @@ def motion(point, *, arrays=False, slopes=True, adaptive=True):
         (point[0], point[1], point[2]),
         saveat=diffrax.SaveAt(ts=jnp.stack([0.31 * end, 0.77 * end, end])),
         stepsize_controller=control,
-        adjoint=diffrax.ForwardMode(),
+        adjoint=adjoint,
     )
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(solution.ys)])
 
@@ -70,6 +70,34 @@ def test_batches_inside_and_outside():
     of_all = jax.jit(jax.jacfwd(jax.vmap(motion)))(points)
     np.testing.assert_allclose(jnp.stack([of_all[i, :, i] for i in range(3)]), single, rtol=1e-9, atol=1e-10)
     assert np.all(np.asarray(of_all[0, :, 1]) == 0.0)
+
+
+@pytest.mark.parametrize(("arrays", "slopes"), [(False, False), (True, False), (True, True)])
+def test_a_batch_in_lanes_is_its_runs_one_by_one(arrays, slopes):
+    """All of the point in lanes; the field's numbers alone, the start and the end common; a batch of batches."""
+
+    def run(p):
+        return motion(p, arrays=arrays, slopes=slopes)
+
+    points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1, 0.2)])
+    alone = jax.jit(run)
+    each = jnp.stack([alone(p) for p in points])
+    assert np.max(np.abs(each - each[:1])) > 1e-2
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(points), each, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.vmap(run)))(points.reshape(2, 2, 9)).reshape(4, -1), each, rtol=1e-11)
+    with_force = lambda force: run(POINT.at[0].set(force))  # noqa: E731
+    forces = jnp.asarray([0.7, 0.9])
+    np.testing.assert_allclose(jax.vmap(with_force)(forces), jnp.stack([with_force(f) for f in forces]), rtol=1e-11)
+
+
+def test_reverse_derivatives_of_a_batch_are_those_of_its_runs():
+    def size(p):
+        return jnp.sum(motion(p, slopes=False, adaptive=False, adjoint=diffrax.RecursiveCheckpointAdjoint()) ** 2)
+
+    points = jnp.stack([POINT, POINT + 0.1])
+    ours = jax.jit(jax.vmap(jax.grad(size)))(points)
+    forward = jax.jit(jax.jacfwd(lambda p: jnp.sum(motion(p, adaptive=False) ** 2)))
+    np.testing.assert_allclose(ours, jnp.stack([forward(p) for p in points]), rtol=1e-9)
 
 
 def test_second_derivatives():

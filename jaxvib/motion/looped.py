@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxvib.motion.directions import flat_slopes, in_all_directions
+from jaxvib.motion.directions import flat_slopes, in_all_directions, in_lanes
 from jaxvib.motion.solver import ERROR, NODES, ROWS, Between, Prince8, mixed, packed, unpacked
 
 __all__ = ["Looped"]
@@ -41,28 +42,19 @@ class Looped(Prince8):
     @property
     def interpolation_cls(self) -> Callable[..., Any]:  # pyright: ignore
         """What finds states within a step."""
-        return _Beside if self.slopes else Between
+        return _BESIDE if self.slopes else _ALONE
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
         """As `WrittenOut.step`."""
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        advance = in_all_directions(_advance, _advance_beside) if self.slopes else _advance
+        advance = in_all_directions(_advanced, _advance_beside) if self.slopes else _advanced
         end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
         end = end if self.wrap is None else self.wrap(end)
         if not self.slopes:
             stages = tuple(stages)  # rows of their own are read faster than an array's
         return end, error, dict(y0=y0, stages=stages), last, diffrax.RESULTS.successful
-
-
-class _Beside(Between):
-    """As `Between`, the stages in one array (stages, n), with forward derivatives in all directions at once."""
-
-    def moved(self, weights: Array) -> Any:
-        """As `Between.moved`."""
-        change = in_all_directions(_mixed, _mixed_beside)((weights, self.stages))
-        return jax.tree.map(lambda y, more: y + more, self.y0, unpacked(change, self.y0))
 
 
 def _mixed(inputs: tuple[Array, Array]) -> Array:
@@ -76,6 +68,26 @@ def _mixed_beside(inputs: tuple[Array, Array], slopes: Any) -> tuple[Array, Arra
     return mixed(weights, stages), sum(parts[1:], parts[0])
 
 
+def _mixed_in_lanes(inputs: tuple[Array, Any], mapped: tuple[bool, Any]) -> Array:
+    weights, stages = inputs
+    rows = jax.tree.map(lambda row, along: row if along else row[..., None], stages, mapped[1])
+    return mixed(weights[:, None, :] if mapped[0] else weights, rows)
+
+
+class _Inside(Between):
+    """As `Between`, with derivatives and batches of its own kind."""
+
+    mix: Callable[[tuple[Array, Any]], Array] = eqx.field(static=True)
+
+    def moved(self, weights: Array) -> Any:
+        """As `Between.moved`."""
+        return jax.tree.map(lambda y, more: y + more, self.y0, unpacked(self.mix((weights, self.stages)), self.y0))
+
+
+_ALONE = partial(_Inside, mix=in_lanes(_mixed, _mixed_in_lanes))
+_BESIDE = partial(_Inside, mix=in_all_directions(in_lanes(_mixed, _mixed_in_lanes), _mixed_beside))
+
+
 def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
     """The state at the end of a step, the rates of its stages (stages, n), the last of them, the error of the state."""
     t0, dt, y0, first, args, terms = inputs
@@ -85,6 +97,37 @@ def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
 
     end, stages, error = _stages(packed(y0), packed(first), rates, lambda total: dt * total, dt)
     return _told(end, stages, error, y0)
+
+
+def _advance_in_lanes(inputs: Any, mapped: Any) -> Any:
+    """`_advance` for a batch along a last axis."""
+    t0, dt, y0, first, args, terms = inputs
+    t0_too, dt_too, y0_too, first_too, *others_too = mapped
+    leaves, rest = jax.tree.flatten((t0, dt, args, terms))
+    flags = flat_slopes((t0_too, dt_too, *others_too), (t0, dt, args, terms))
+    places = [k for k, along in enumerate(flags) if along]
+    like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_too)
+    size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, mapped)), strict=True) if along)
+
+    def whole(tree: Any, along: Any) -> Array:
+        spread = lambda leaf, here: leaf if here else jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))  # noqa: E731
+        return packed(jax.tree.map(spread, tree, along), 1)
+
+    def rates(share: Array, y: Array) -> Array:
+        def rate(y: Any, moving: list[Array]) -> Any:
+            given = dict(zip(places, moving, strict=True))
+            t0, dt, args, terms = jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
+            return terms.vf(t0 + share * dt, y, args)
+
+        found = jax.vmap(rate, in_axes=-1, out_axes=-1)(unpacked(y, like), [leaves[k] for k in places])
+        return packed(found, 1)
+
+    dt = dt[None, :] if dt_too else dt
+    end, stages, error = _stages(whole(y0, y0_too), whole(first, first_too), rates, lambda total: dt * total, dt)
+    return _told(end, stages, error, like)
+
+
+_advanced = in_lanes(_advance, _advance_in_lanes)
 
 
 def _advance_beside(inputs: Any, slopes: Any) -> tuple[Any, Any]:
