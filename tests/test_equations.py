@@ -171,6 +171,18 @@ def test_vertical_machine_has_no_sideways_coordinate():
     assert scene("two_mass").machine.carrier().gyroscopic is None
 
 
+def test_structure_is_the_carriers_and_traced_once_for_a_form():
+    for machine in machines().values():
+        carrier, structure = machine.carrier(), machine.structure()
+        assert [x.shape for x in jax.tree.leaves(structure)] == [x.shape for x in jax.tree.leaves(carrier)]
+        assert structure.coordinates == carrier.coordinates and structure.axes == carrier.axes
+        heavier = jax.tree.map(lambda leaf: 2.0 * leaf, machine)
+        assert heavier.structure() is structure
+    assert machines()["one_mass"].structure().mass.dtype == jnp.float64
+    with jax.enable_x64(False):
+        assert jv.one_mass(mass=1.0, stiffness=1.0, damping=0.0).structure().mass.dtype == jnp.float32
+
+
 def test_time_loop_holds_no_library_call():
     """LAPACK, callbacks, scatter and sort would keep the compiler from making one function of a step."""
     s = scene("network", "pendulums", effects=(jv.Gravity(),))

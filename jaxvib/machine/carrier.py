@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import abc
+import functools
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jax import Array
 
 __all__ = ["Carrier", "Machine"]
@@ -63,4 +67,12 @@ class Machine(eqx.Module):
 
     def structure(self) -> Carrier:
         """The carrier's names, directions and shapes, without computing its numbers."""
-        return eqx.filter_eval_shape(self.carrier)
+        leaves, rest = jax.tree.flatten(self)
+        return _structure(rest, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves), jnp.result_type(float))
+
+
+@functools.lru_cache(maxsize=128)
+def _structure(rest: Any, kinds: tuple[Any, ...], precision: Any) -> Carrier:
+    """Traced once for all machines of a form, in the `precision` in force: a trace takes longer than many a run."""
+    machine = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
+    return eqx.filter_eval_shape(lambda machine: machine.carrier(), machine)
