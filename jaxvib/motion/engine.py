@@ -70,6 +70,11 @@ class Motion(eqx.Module):
         """The equations of motion on what the integrator holds."""
         return diffrax.ODETerm(self._rates)
 
+    def rates(self, t: Array, state: State) -> State:
+        """The equations of motion on a state, by what the integrator holds: under `vmap` many times faster than the field."""
+        y = tuple(numbers_of(state)) if self.few else state
+        return self._state(self._plain_rates(t, y, self.args))
+
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
         wrap = self._wrap if self.wrapped else None

@@ -109,7 +109,6 @@ def integrate(
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
-    field = vector_field(scene)
     fastest, slowest = fastest_and_slowest(scene)
     longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
@@ -117,7 +116,7 @@ def integrate(
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wraps(scene, state.displacement.dtype)
-    motion = Motion(field, state, wrapped=single and solver is None, together=together)
+    motion = Motion(vector_field(scene), state, wrapped=single and solver is None, together=together)
     if solver is None:
         solver = motion.method()
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
@@ -140,7 +139,7 @@ def integrate(
     )
     assert solution.ts is not None and solution.ys is not None
     times, (states, since) = solution.ts[0], motion.states(solution.ys[0])
-    measured = measure(scene, field, times, since)
+    measured = measure(scene, motion.rates, times, since)
     finished = solution.result == diffrax.RESULTS.successful
     status = RunStatus.where(
         finished, RunStatus.where(is_finite(states), RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached

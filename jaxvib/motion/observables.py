@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.drive import Motor
 from jaxvib.machine.effects import Gravity
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import Dynamics, State, rotor_angle, rotor_speed, vector_field
+from jaxvib.motion.dynamics import State, rotor_angle, rotor_speed, vector_field
 
 __all__ = ["Measured", "Trajectory", "energy", "foundation_force", "measure", "power"]
 
@@ -171,7 +173,7 @@ def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
     return Trajectory(times, states, force, speed)
 
 
-def measure(scene: Scene, field: Dynamics, times: Array, states: State) -> Measured:
+def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Measured:
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
