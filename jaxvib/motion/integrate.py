@@ -38,6 +38,7 @@ class StepControl(eqx.Module):
     steps: Array | None = None
 
 
+@kept
 def natural_units(scene: Scene) -> State:
     """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
     carrier, loads = scene.machine.carrier(), scene.loads

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -234,9 +235,7 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
 
 
 def _with(run: Run, **values: Any) -> Run:
-    names = list(values)
-    new = [jnp.asarray(values[name], run.error.dtype) for name in names]
-    return eqx.tree_at(lambda r: [getattr(r, name) for name in names], run, new)
+    return dataclasses.replace(run, **{name: jnp.asarray(value, run.error.dtype) for name, value in values.items()})
 
 
 def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
