@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import diffrax
@@ -14,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxvib.motion.directions import flat_slopes, in_all_directions, in_lanes
-from jaxvib.motion.solver import ERROR, NODES, ROWS, Between, Prince8, mixed, packed, unpacked
+from jaxvib.motion.solver import ERROR, NODES, ROWS, Between, Prince8, heard, mixed, packed, unpacked
 
 __all__ = ["Looped"]
 
@@ -52,9 +53,7 @@ class Looped(Prince8):
         advance = in_all_directions(_advanced, _advance_beside) if self.slopes else _advanced
         end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
         end = end if self.wrap is None else self.wrap(end)
-        if not self.slopes:
-            stages = tuple(stages)  # rows of their own are read faster than an array's
-        return end, error, dict(y0=y0, stages=stages), last, diffrax.RESULTS.successful
+        return end, error, dict(y0=y0, stages=heard(stages)), last, diffrax.RESULTS.successful
 
 
 def _mixed(inputs: tuple[Array, Array]) -> Array:
@@ -63,15 +62,14 @@ def _mixed(inputs: tuple[Array, Array]) -> Array:
 
 def _mixed_beside(inputs: tuple[Array, Array], slopes: Any) -> tuple[Array, Array]:
     (weights, stages), (moved, bent) = inputs, slopes
-    parts = [] if moved is None else [mixed(moved[:, None, :], stages[:, :, None])]
+    parts = [] if moved is None else [mixed(moved.T, stages).T]
     parts += [] if bent is None else [mixed(weights, bent)]
     return mixed(weights, stages), sum(parts[1:], parts[0])
 
 
-def _mixed_in_lanes(inputs: tuple[Array, Any], mapped: tuple[bool, Any]) -> Array:
-    weights, stages = inputs
-    rows = jax.tree.map(lambda row, along: row if along else row[..., None], stages, mapped[1])
-    return mixed(weights[:, None, :] if mapped[0] else weights, rows)
+def _mixed_in_lanes(inputs: tuple[Array, Array], mapped: tuple[bool, bool]) -> Array:
+    weights, stages = (x if along else x[..., None] for x, along in zip(inputs, mapped, strict=True))
+    return functools.reduce(operator.add, (w * k for w, k in zip(weights[:, None, :], stages, strict=True)))
 
 
 class _Inside(Between):
@@ -84,8 +82,8 @@ class _Inside(Between):
         return jax.tree.map(lambda y, more: y + more, self.y0, unpacked(self.mix((weights, self.stages)), self.y0))
 
 
-_ALONE = partial(_Inside, mix=in_lanes(_mixed, _mixed_in_lanes))
-_BESIDE = partial(_Inside, mix=in_all_directions(in_lanes(_mixed, _mixed_in_lanes), _mixed_beside))
+_ALONE = functools.partial(_Inside, mix=in_lanes(_mixed, _mixed_in_lanes))
+_BESIDE = functools.partial(_Inside, mix=in_all_directions(in_lanes(_mixed, _mixed_in_lanes), _mixed_beside))
 
 
 def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -14,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["ERROR", "NODES", "ROWS", "Between", "Prince8", "WrittenOut", "mixed", "packed", "unpacked"]
+__all__ = ["ERROR", "NODES", "ROWS", "Between", "Prince8", "WrittenOut", "heard", "mixed", "packed", "unpacked"]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _POLYNOMIALS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
-_HEARD = tuple(np.flatnonzero(np.any(_POLYNOMIALS, axis=1)).tolist())
+_LATE = int(np.flatnonzero(np.any(_POLYNOMIALS, axis=1))[1])
 
 NODES = np.asarray(_TABLEAU.c)
 """At which share of the step each stage but the first is."""
@@ -46,21 +44,30 @@ def unpacked(flat: Array, like: Any) -> Any:
     return jax.tree.unflatten(rest, parts)
 
 
-def mixed(weights: Array, stages: Any) -> Array:
-    """sum_j weights_j stages_j over the stages that states within a step are made of."""
-    return functools.reduce(operator.add, (weights[j] * stages[j] for j in _HEARD))
+def heard(stages: Array) -> Array:
+    """Those stages that states within a step are made of, (10, ...): the first, and from the sixth on all."""
+    return jnp.concatenate([stages[:1], stages[_LATE:]])
+
+
+def mixed(weights: Array, stages: Array) -> Array:
+    """sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
+
+    As a product XLA computes it once, and in vectors; a sum that is written out it computes anew for each number that is taken
+    from it, and the weights with it.
+    """
+    return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
 
 class Between(diffrax.AbstractLocalInterpolation):
     """The motion within a step: y0 + (t - t0) sum_j w_j(s) k_j, s the share of the step that is done, k_j the stages' rates.
 
-    The polynomials w_j are diffrax's. Each stage is a vector of numbers, see `packed`.
+    The polynomials w_j are diffrax's; `stages` is (10, n), see `heard` and `packed`.
     """
 
     t0: Any
     t1: Any
     y0: Any
-    stages: tuple[Array, ...]
+    stages: Array
 
     def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
         """The state at `t0`, or by how much it changes from there to `t1`."""
@@ -68,8 +75,9 @@ class Between(diffrax.AbstractLocalInterpolation):
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         span = self.t1 - self.t0
         share = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
-        weights = jnp.zeros(len(_POLYNOMIALS), share.dtype)
-        for column in _POLYNOMIALS.T:
+        polynomials = np.concatenate([_POLYNOMIALS[:1], _POLYNOMIALS[_LATE:]])
+        weights = jnp.zeros(len(polynomials), share.dtype)
+        for column in polynomials.T:
             weights = weights * share + jnp.asarray(column, share.dtype)
         return self.moved(share * span * weights)
 
@@ -139,7 +147,7 @@ class WrittenOut(Prince8):
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
         end = y if self.wrap is None else self.wrap(y)
-        return end, error, dict(y0=y0, stages=tuple(map(packed, stages))), stages[-1], diffrax.RESULTS.successful
+        return end, error, dict(y0=y0, stages=heard(jnp.stack([packed(k) for k in stages]))), stages[-1], diffrax.RESULTS.successful
 
 
 def _weighted(weights: Any, values: Any) -> Array:
