@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -177,26 +179,11 @@ def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, 
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
-    samples.
+    samples. `field` gives the rates of a state at a time; arrays that carry derivatives it has as a tree, not as a function's
+    closure.
     """
-
-    def outputs(state: State) -> Array:
-        return jnp.concatenate([state.displacement, foundation_force(scene, state)])
-
-    def rates(t: Array, state: State) -> tuple[Array, Array, Array]:
-        def first(s: Array, y: State) -> Array:
-            return jax.jvp(outputs, (y,), (field(s, y),))[1]
-
-        second = jax.jvp(first, (t, state), (jnp.ones_like(t), field(t, state)))[1]
-        return outputs(state), first(t, state), second
-
-    x, v, a = jax.vmap(rates)(times, states)
-    half = times.shape[0] // 2
-    step = times[1] - times[0]
-    span = jax.vmap(lambda y, dy, ddy: _zero_to_peak(y, dy * step, ddy * step**2), in_axes=1)
-    early, late = span(x[:half], v[:half], a[:half]), span(x[half:], v[half:], a[half:])
-    whole = span(x, v, a)
-    nd = states.displacement.shape[1]
+    early, late, whole = _spans(scene, field, times, states)
+    nd, half = states.displacement.shape[1], times.shape[0] // 2
 
     phi, rate = states.angle[0], states.rate[0]
     turning = jax.vmap(lambda p, w: _mean_speed(times, p, w), in_axes=1)
@@ -215,33 +202,124 @@ def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, 
     )
 
 
-def _zero_to_peak(x: Array, v: Array, a: Array) -> Array:
-    """Half of peak to peak; x, v, a are samples and their first two derivatives, in units of the sampling step."""
-    low, high = _quintic(x, v, a)
+@eqx.filter_custom_jvp
+def _spans(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Array:
+    """Half of peak to peak of displacements and foundation forces, over the first half of the samples, the second and all of
+    them, (3, outputs).
+
+    Derivatives, of any order, cost next to nothing: the equations are evaluated once more at the few samples beside the
+    extrema, and are differentiated there alone.
+    """
+    (low, high), _, _ = _extrema(scene, field, times, states)
     return (high - low) / 2.0
 
 
-def _quintic(x: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Least and greatest value of the quintic Hermite interpolant through evenly spaced samples."""
-    x0, x1, v0, v1, a0, a1 = x[:-1], x[1:], v[:-1], v[1:], a[:-1], a[1:]
-    d, e, f = x1 - x0 - v0 - a0 / 2.0, v1 - v0 - a0, a1 - a0
-    c3, c4, c5 = 10.0 * d - 4.0 * e + f / 2.0, -15.0 * d + 7.0 * e - f, 6.0 * d - 3.0 * e + f / 2.0
+@_spans.def_jvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    _, samples, shares = jax.lax.stop_gradient(_extrema(*primals))
+    outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
 
-    def value(s: Array) -> Array:
-        return x0 + s * (v0 + s * (a0 / 2.0 + s * (c3 + s * (c4 + s * c5))))
+    def spans(scene: Scene, field: Any, times: Array, states: State) -> Array:
+        def extremum(output: Array, k: Array, share: Array) -> Array:
+            def sample(j: Array) -> list[Array]:
+                state = jax.tree.map(lambda leaf: leaf[j], states)
+                return [part[output] for part in _moving(scene, field, times[1] - times[0], times[j], state)]
 
-    def slope(s: Array) -> Array:
-        return v0 + s * (a0 + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))
+            return _extremum(sample(k), sample(k + 1), share)
 
-    turns = (v0 * v1) < 0.0
-    safe = jnp.where(turns, v1 - v0, 1.0)
-    s = jnp.clip(-v0 / safe, 0.0, 1.0)
+        low, high = jax.vmap(jax.vmap(jax.vmap(extremum)))(outputs, samples, shares)
+        return (high - low) / 2.0
+
+    return eqx.filter_jvp(spans, primals, tangents)
+
+
+def _extrema(scene: Scene, field: Any, times: Array, states: State) -> tuple[Array, Array, Array]:
+    """Least and greatest values of each output, and their places, see `_places`; (2, 3, outputs) each."""
+    step = times[1] - times[0]
+    samples = jax.vmap(lambda t, y: _moving(scene, field, step, t, y))(times, states)
+    return jax.vmap(_places, in_axes=1, out_axes=-1)(*samples)
+
+
+def _moving(scene: Scene, field: Any, step: Array, t: Array, state: State) -> tuple[Array, Array, Array]:
+    """Displacements and foundation forces with their first two derivatives, in units of the step."""
+
+    def outputs(state: State) -> Array:
+        return jnp.concatenate([state.displacement, foundation_force(scene, state)])
+
+    def first(s: Array, y: State) -> Array:
+        return jax.jvp(outputs, (y,), (field(s, y),))[1]
+
+    second = jax.jvp(first, (t, state), (jnp.ones_like(t), field(t, state)))[1]
+    return outputs(state), first(t, state) * step, second * step**2
+
+
+def _places(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+    """Where the quintics through evenly spaced samples are least and greatest, over their first half, their second and all.
+
+    x, v, a (n,) are samples and their first two derivatives, in units of the sampling step. **Returns** values there, the
+    sample before each place, and at which share of the step after it the place is; (2, 3) each.
+    """
+    begin, end = ([part[cut] for part in (x, v, a)] for cut in (slice(-1), slice(1, None)))
+    quintic = _quintic(begin, end)
+    slope = _derived(quintic)
+    bend = _derived(slope)
+    turns = begin[1] * end[1] < 0.0
+    share = jnp.clip(-begin[1] / jnp.where(turns, end[1] - begin[1], 1.0), 0.0, 1.0)
     for _ in range(4):
-        _, bend = jax.jvp(slope, (s,), (jnp.ones_like(s),))
-        s = jnp.clip(s - slope(s) / jnp.where(turns & (bend != 0.0), bend, 1.0), 0.0, 1.0)
-    # The value at an extremum does not depend on where it is, to first order: its place carries no derivative.
-    inner = jnp.where(turns, value(jax.lax.stop_gradient(s)), x0)
-    return jnp.minimum(jnp.min(inner), jnp.min(x)), jnp.maximum(jnp.max(inner), jnp.max(x))
+        curved = _at(bend, share)
+        share = jnp.clip(share - _at(slope, share) / jnp.where(turns & (curved != 0.0), curved, 1.0), 0.0, 1.0)
+    inner = jnp.where(turns, _at(quintic, share), x[:-1])
+    n, half = len(x), len(x) // 2
+
+    def greatest(sign: float, first: int, stop: int) -> tuple[Array, Array, Array]:
+        inside = sign * inner > sign * x[:-1]
+        reached = jnp.where(inside, sign * inner, sign * x[:-1])[first : stop - 1]
+        top, last = jnp.max(reached), sign * x[stop - 1]
+        k = first + jnp.min(jnp.where(reached == top, jnp.arange(stop - 1 - first), stop - 2 - first))
+        place = jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
+        place = jnp.where(jnp.isnan(top), jnp.nan, place)  # what is made of it later is not a number either
+        return jnp.maximum(top, last), jnp.where(last > top, stop - 2, k), place
+
+    found = []
+    for sign in (-1.0, 1.0):
+        parts = [greatest(sign, *stretch) for stretch in ((0, half), (half, n), (half - 1, half + 1))]
+        value, k, place = (jnp.stack(column) for column in zip(*parts, strict=True))
+        best = jnp.argmax(value)
+        found.append([jnp.concatenate([row[:2], row[best][None]]) for row in (sign * value, k, place)])
+    values, k, places = (jnp.stack(pair) for pair in zip(*found, strict=True))
+    return values, k, places
+
+
+def _extremum(begin: Sequence[Array], end: Sequence[Array], share: Array) -> Array:
+    """The quintic's value at an extremum, which stays one: where it is inside the step it moves with what it is made of."""
+    quintic = _quintic(begin, end)
+    slope = _derived(quintic)
+    curved = _at(_derived(slope), share)
+    inside = (share > 0.0) & (share < 1.0) & (curved != 0.0)
+    move = jnp.where(inside, _at(slope, share), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
+    return _at(quintic, share - move + jax.lax.stop_gradient(move))
+
+
+def _quintic(begin: Sequence[Array], end: Sequence[Array]) -> list[Array]:
+    """Coefficients, of the lowest power first, of the Hermite interpolant through values and two derivatives at 0 and 1."""
+    (x0, v0, a0), (x1, v1, a1) = begin, end
+    d, e, f = x1 - x0 - v0 - a0 / 2.0, v1 - v0 - a0, a1 - a0
+    return [
+        x0,
+        v0,
+        a0 / 2.0,
+        10.0 * d - 4.0 * e + f / 2.0,
+        -15.0 * d + 7.0 * e - f,
+        6.0 * d - 3.0 * e + f / 2.0,
+    ]
+
+
+def _derived(polynomial: list[Array]) -> list[Array]:
+    return [float(k) * c for k, c in enumerate(polynomial)][1:]
+
+
+def _at(polynomial: list[Array], s: Array) -> Array:
+    return functools.reduce(lambda value, c: value * s + c, reversed(polynomial))
 
 
 def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:
@@ -271,4 +349,5 @@ def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Arr
         values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
     )
     step = stretch.time[1] - stretch.time[0]
-    return _zero_to_peak(x, v * step, a * step**2)
+    (low, high), _, _ = _places(x, v * step, a * step**2)
+    return (high - low)[2] / 2.0

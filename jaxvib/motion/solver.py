@@ -147,7 +147,8 @@ class WrittenOut(Prince8):
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
         end = y if self.wrap is None else self.wrap(y)
-        return end, error, dict(y0=y0, stages=heard(jnp.stack([packed(k) for k in stages]))), stages[-1], diffrax.RESULTS.successful
+        inside = dict(y0=y0, stages=heard(jnp.stack([packed(k) for k in stages])))
+        return end, error, inside, stages[-1], diffrax.RESULTS.successful
 
 
 def _weighted(weights: Any, values: Any) -> Array:
