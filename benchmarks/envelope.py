@@ -19,7 +19,7 @@ import diffrax
 import equinox as eqx
 import jax
 import numpy as np
-from common import best, first, published, say
+from common import best_in_turn, first, published, say
 
 import jaxvib as jv
 from jaxvib.motion.solver import WrittenOut
@@ -98,11 +98,7 @@ def compare(name: str, scene: jv.Scene, until: float, rounds: int) -> None:
         note = f"tolerance {tolerance_:.1e}, {int(run.steps + run.rejected)} steps"
         add(title, lambda s, asked=asked: full(s, *asked, save="window"), off, note)
 
-    seconds = [np.inf] * len(timed)
-    for _ in range(rounds):  # in turn: a slow moment of the machine is then nobody's
-        seconds = [
-            min(s, best(call, 20 if k == 0 else 1)) for k, (s, (_, call, *_)) in enumerate(zip(seconds, timed, strict=True))
-        ]
+    seconds = best_in_turn([call for _, call, *_ in timed], rounds)
     for each, (title, _, compiling, off, note) in zip(seconds, timed, strict=True):
         say(group, title, each, seconds[0], off, compiling, note)
 

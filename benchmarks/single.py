@@ -7,6 +7,8 @@ tolerance is made smaller until it is reached, then the fastest of several runs 
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import native
 import numpy as np
-from common import TOLERANCES, as_first_written, best, first, flat, published, reach, say, thrown, told
+from common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
 
 import jaxvib as jv
 from jaxvib.motion.engine import Motion, Tolerance
@@ -69,21 +71,24 @@ def single(quick: bool = False, error: float = 1e-6) -> None:
     exact = loop(y0, speed, par, end, int(40 * end))
     steps = [float(int(end * r)) for r in np.arange(3.0, 24.0, 0.5)]
     chosen, found, _ = reach(lambda n: loop(y0, speed, par, end, int(n)), steps, exact, error)
-    base = best(lambda: loop(y0, speed, par, end, int(chosen)), 15)
-    say(group, "native loop (numba), Dopri8, equal steps", base, base, found, native_compile, f"{chosen:g} steps")
+    rows = [("native loop (numba), Dopri8, equal steps", found, native_compile, f"{chosen:g} steps")]
+    calls: list[Callable[[], Any]] = [lambda n=int(chosen): loop(y0, speed, par, end, n)]
     for kind, settings in (("adaptive", TOLERANCES), ("equal steps", steps)):
         run = integrator(scene, start, kind)
         chosen, found, compiling = reach(lambda x, run=run: np.asarray(run(scene, end, x)), settings, exact, error)
-        seconds = best(lambda run=run, c=chosen: run(scene, end, c), 15)
-        say(group, f"jaxvib, {kind}", seconds, base, found, compiling, told(chosen, found, error))
+        rows.append((f"jaxvib, {kind}", found, compiling, told(chosen, found, error)))
+        calls.append(lambda run=run, c=chosen: run(scene, end, c))
 
     def whole(tolerance: float) -> np.ndarray:
         run = jv.simulate(scene, end, start=start, save="window", tolerance=tolerance, estimate=False)
         return flat(jax.tree.map(lambda leaf: leaf[-1], run.window.state))
 
     chosen, found, compiling = reach(whole, TOLERANCES, exact, error)
-    seconds = best(lambda: whole(chosen))
-    say(group, "jaxvib.simulate, measured over its window", seconds, base, found, compiling, told(chosen, found, error))
+    rows.append(("jaxvib.simulate, measured over its window", found, compiling, told(chosen, found, error)))
+    seconds = best_in_turn([*calls, lambda c=chosen: whole(c)])
+    base = seconds[0]
+    for each, (name, found, compiling, note) in zip(seconds, rows, strict=True):
+        say(group, name, each, base, found, compiling, note)
     others(scene, start, end, exact, error, base)
     for name, seconds, found, compiling in as_first_written("single", end=end, error=error, exact=exact.tolist()):
         say(group, name, seconds, base, found, compiling)
@@ -94,7 +99,7 @@ def others(scene: jv.Scene, start: jv.State, end: float, exact: np.ndarray, erro
     numbers, speed, y0 = native.numbers(scene), float(scene.drive.speed), flat(start)
     par = np.asarray([speed, *numbers])
 
-    def add(name: str, run: Callable[[float], np.ndarray], settings: list[float] = TOLERANCES[2:]) -> None:
+    def add(name: str, run: Callable[[float], np.ndarray], settings: list[float] = TOLERANCES[4:]) -> None:
         try:
             chosen, found, compiling = reach(run, settings, exact, error)
         except ImportError as missing:
@@ -130,7 +135,8 @@ def others(scene: jv.Scene, start: jv.State, end: float, exact: np.ndarray, erro
             from jitcode import jitcode, y
 
             made["ode"] = jitcode(native.symbolic(y, symengine, speed, numbers), n=6)
-            made["ode"].compile_C(extra_compile_args=["-O3", "-march=native", "-ffast-math"])
+            with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it reads a pyproject.toml beside it
+                made["ode"].compile_C(extra_compile_args=["-O3", "-march=native", "-ffast-math"])
         ode = made["ode"]
         ode.set_integrator("dop853", rtol=tolerance, atol=tolerance, nsteps=10**8)
         ode.set_initial_value(y0, 0.0)

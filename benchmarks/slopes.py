@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import best, first, published, say, thrown
+from common import best, best_in_turn, first, published, say, thrown
 
 import jaxvib as jv
 
@@ -47,10 +47,7 @@ def gradient(quick: bool = False) -> None:
         ]
         compiling = [first(lambda call=call: call(values)) for _, call in ways]
         found = [np.asarray(call(values)) for _, call in ways]
-        seconds = [np.inf] * len(ways)
-        for _ in range(3 if quick else 20):  # in turn: a slow moment of the machine is then nobody's
-            for k, (_, call) in enumerate(ways):
-                seconds[k] = min(seconds[k], best(lambda call=call: call(values), 3))
+        seconds = best_in_turn([lambda call=call: call(values) for _, call in ways], 3 if quick else 20)
         for k, (name, _) in enumerate(ways):
             off = float(np.max(np.abs(found[k] - found[1])) / np.max(np.abs(found[1]))) if k > 1 else None
             say(group, name, seconds[k], seconds[0], off, compiling[k], "" if off is None else "error: to forward mode")
