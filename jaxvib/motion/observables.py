@@ -275,10 +275,11 @@ def _places(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
         inside = sign * inner > sign * x[:-1]
         reached = jnp.where(inside, sign * inner, sign * x[:-1])[first : stop - 1]
         top, last = jnp.max(reached), sign * x[stop - 1]
+        value = jnp.maximum(top, last)
         k = first + jnp.min(jnp.where(reached == top, jnp.arange(stop - 1 - first), stop - 2 - first))
         place = jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
-        place = jnp.where(jnp.isnan(top), jnp.nan, place)  # what is made of it later is not a number either
-        return jnp.maximum(top, last), jnp.where(last > top, stop - 2, k), place
+        place = jnp.where(jnp.isnan(value), jnp.nan, place)  # what is made of it later is not a number either
+        return value, jnp.where(last > top, stop - 2, k), place
 
     found = []
     for sign in (-1.0, 1.0):

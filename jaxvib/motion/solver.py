@@ -15,8 +15,9 @@ from jax import Array
 __all__ = ["ERROR", "NODES", "ROWS", "Between", "Prince8", "WrittenOut", "heard", "mixed", "packed", "unpacked"]
 
 _TABLEAU = diffrax.Dopri8.tableau
-_POLYNOMIALS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
-_LATE = int(np.flatnonzero(np.any(_POLYNOMIALS, axis=1))[1])
+_COEFFICIENTS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
+_LATE = int(np.flatnonzero(np.any(_COEFFICIENTS, axis=1))[1])
+_POLYNOMIALS = np.concatenate([_COEFFICIENTS[:1], _COEFFICIENTS[_LATE:]])
 
 NODES = np.asarray(_TABLEAU.c)
 """At which share of the step each stage but the first is."""
@@ -75,9 +76,8 @@ class Between(diffrax.AbstractLocalInterpolation):
             return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
         span = self.t1 - self.t0
         share = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
-        polynomials = np.concatenate([_POLYNOMIALS[:1], _POLYNOMIALS[_LATE:]])
-        weights = jnp.zeros(len(polynomials), share.dtype)
-        for column in polynomials.T:
+        weights = jnp.zeros(len(_POLYNOMIALS), share.dtype)
+        for column in _POLYNOMIALS.T:
             weights = weights * share + jnp.asarray(column, share.dtype)
         return self.moved(share * span * weights)
 
