@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
+from jaxvib.programs import kept
 from jaxvib.steady.jam import Folds, Jam, branch_points, fold_points
 from jaxvib.steady.picture import picture
 
@@ -110,7 +110,7 @@ def branches(
     return _branches(scene, top, points, per_side)
 
 
-@eqx.filter_jit
+@kept
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     crowded, resonances = fold_points(jax.lax.stop_gradient(scene), per_side)
     # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
