@@ -21,8 +21,8 @@ from jax.flatten_util import ravel_pytree
 
 import jaxvib as jv
 from jaxvib.steady.collocation import harmonics_of, periodic_motion
+from jaxvib.steady.folds import jam_rotor_speed
 from jaxvib.steady.grid import grid_of
-from jaxvib.steady.jam import jam_rotor_speed
 from jaxvib.steady.stability import floquet, steps_for
 
 GROUP = "exact orbits, each"

@@ -17,7 +17,8 @@ from jaxvib.machine.supports import CubicSupport, Stop
 from jaxvib.motion.averaged import Amplitudes, Averaged, averaged_field
 from jaxvib.motion.dynamics import Dynamics, State, vector_field
 from jaxvib.motion.ensemble import Ensemble, ensemble
-from jaxvib.motion.envelope import Envelope, Envelopes, EnvelopeStatus, envelope
+from jaxvib.motion.envelope import envelope
+from jaxvib.motion.envelopes import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
 from jaxvib.motion.regime import PhasePattern, Regime, RegimeName, phase_pattern, regime
 from jaxvib.motion.run import Run, RunStatus
@@ -37,7 +38,8 @@ from jaxvib.steady.balance import (
 from jaxvib.steady.branches import Branches, branches
 from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.diagram import ExactBranches, SpecialPoint
-from jaxvib.steady.jam import Folds, Jam, JamModes, JamStatus, jam_modes, jam_rotor_speed
+from jaxvib.steady.folds import Folds, jam_rotor_speed
+from jaxvib.steady.jam import Jam, JamModes, JamStatus, jam_modes
 from jaxvib.steady.jam_orbit import jam_orbit
 from jaxvib.steady.orbit import Orbit, OrbitStatus
 from jaxvib.steady.phase_search import PhaseBranch, PhaseJams, phase_branch, phase_jams

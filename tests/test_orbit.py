@@ -17,8 +17,8 @@ from scipy.optimize import fsolve
 
 import jaxvib as jv
 from jaxvib.steady.collocation import along, periodic_motion
+from jaxvib.steady.folds import jam_rotor_speed
 from jaxvib.steady.grid import grid_of
-from jaxvib.steady.jam import jam_rotor_speed
 
 
 class Shaker(jv.Machine):

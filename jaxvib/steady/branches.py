@@ -14,7 +14,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
 from jaxvib.programs import kept
-from jaxvib.steady.jam import Folds, Jam, branch_points, fold_points
+from jaxvib.steady.folds import Folds, fold_points
+from jaxvib.steady.jam import Jam, branch_points
 from jaxvib.steady.picture import picture
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number
 from jaxvib.steady.bodies import has_half_turn
-from jaxvib.steady.jam import fold_points
+from jaxvib.steady.folds import fold_points
 from jaxvib.steady.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.steady.picture import picture
 from jaxvib.steady.stability import Floquet, steps_for

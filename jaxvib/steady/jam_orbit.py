@@ -13,8 +13,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, number, traced
 from jaxvib.steady.bodies import has_half_turn
 from jaxvib.steady.collocation import Given, along, periodic_motion
+from jaxvib.steady.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.grid import grid_of
-from jaxvib.steady.jam import fold_points, jam_modes, piece_modes, without_ripples
+from jaxvib.steady.jam import jam_modes
 from jaxvib.steady.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
 from jaxvib.steady.response import jammed_loads
 from jaxvib.steady.stability import steps_for

@@ -11,8 +11,8 @@ from jax import Array
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.bodies import bodies, circle, each_load, has_half_turn, load_torque, rotor_torque, torque_of_each
 from jaxvib.steady.collocation import Given, Harmonics, Motion, along, harmonics_of, periodic_motion
+from jaxvib.steady.folds import jam_rotor_speed
 from jaxvib.steady.grid import Grid, grid_of
-from jaxvib.steady.jam import jam_rotor_speed
 from jaxvib.steady.response import jammed_loads
 from jaxvib.steady.roots import bracketed_root
 from jaxvib.steady.stability import Floquet, floquet
