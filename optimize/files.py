@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxvib.errors import InputError
 from jaxvib.machine.files import called, closest, load_scene, read_toml
-from jaxvib.machine.units import count
+from jaxvib.machine.units import count, number
 from optimize.quantities import (
     Quantity,
     amplitude,
@@ -41,7 +41,7 @@ class Design:
 
     space: DesignSpace
     objective: Quantity
-    search: dict[str, int] = field(default_factory=dict)
+    search: dict[str, Any] = field(default_factory=dict)
 
 
 def load_design(path: str | Path) -> Design:
@@ -49,9 +49,21 @@ def load_design(path: str | Path) -> Design:
 
     `scene` names the scene file, relative to the design file; `[free]` gives bounds for each number that may change;
     every `[[hold]]` a quantity and, unless it shall stay as it is, its value; `[objective]` the quantity to make small, or
-    large with `maximize = true`; `[search]` the number of starts, the seed and the iterations.
+    large with `maximize = true`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`.
 
-    **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field named.
+    **Arguments**: `path` of a TOML file.
+
+    **Returns** `Design`. **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field
+    named.
+
+    >>> import pathlib, tempfile
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> from optimize.files import TEMPLATE, load_design
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> for name, text in (("machine.toml", TEMPLATES["two_mass"]), ("design.toml", TEMPLATE)):
+    ...     _ = (folder / name).write_text(text)
+    >>> load_design(folder / "design.toml").objective.name
+    'force_per_amplitude'
     """
     tables = read_toml(path)
     for name in tables:
@@ -77,10 +89,15 @@ def load_design(path: str | Path) -> Design:
     if more.get("maximize", False):
         objective = negative(objective)
     search = dict(tables.get("search", {}))
-    allowed = ["starts", "seed", "iterations", "polishing"]
+    allowed = ["starts", "seed", "iterations", "rate", "polishing"]
     for name, value in search.items():
         if name not in allowed:
             raise InputError(f"search.{name}", f"is no field here; {closest(name, allowed)}")
+        if name == "rate":
+            search[name] = float(number(value, "", "search.rate", low=0.0, open_low=True))
+            if not search[name] < 1.0:
+                raise InputError("search.rate", f"is {search[name]:g}; it must be less than 1")
+            continue
         count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
     return Design(space, objective, search)
 
@@ -118,11 +135,14 @@ quantity = "support_frequency_squared"   # the sum of k/M over the supports: how
 [objective]
 quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
 mode = 3
-of = [1, 2]                       # amplitude of platform 1 relative to platform 2; a number: that platform's own
+of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); a number: that platform's own
 # maximize = true
 
 [search]
 starts = 256
 seed = 0
+# iterations = 100                # of the descent
+# rate = 0.05                     # its first step, in parts of a free number's range
+# polishing = 12                  # steps of Newton's method at the end
 """
 """A commented design file."""

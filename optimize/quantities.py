@@ -92,6 +92,11 @@ def _amplitude(scene: Scene, jam: Jam, of: Pair) -> Array:
 def amplitude(*, mode: int, of: Pair = None) -> Quantity:
     """Amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
 
+    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
+    raises `InputError` where the quantity is computed.
+
     >>> from optimize import amplitude
     >>> amplitude(mode=3, of=1).unit
     'm'
@@ -104,6 +109,11 @@ def amplitude(*, mode: int, of: Pair = None) -> Quantity:
 def foundation_force(*, mode: int) -> Quantity:
     """Force of all supports on the bed in a jam mode, N zero to peak.
 
+    **Arguments**: `mode` number of the jam mode.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
+    `InputError` where the quantity is computed.
+
     >>> from optimize import foundation_force
     >>> foundation_force(mode=3).unit
     'N'
@@ -113,6 +123,11 @@ def foundation_force(*, mode: int) -> Quantity:
 
 def force_per_amplitude(*, mode: int, of: Pair = None) -> Quantity:
     """Foundation force per amplitude in a jam mode, N/m; whose amplitude as `amplitude`.
+
+    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
+    raises `InputError` where the quantity is computed.
 
     >>> from optimize import force_per_amplitude
     >>> force_per_amplitude(mode=3).unit
@@ -129,6 +144,11 @@ def force_per_amplitude(*, mode: int, of: Pair = None) -> Quantity:
 def jam_frequency(*, mode: int) -> Quantity:
     """Speed Omega at which the loads jam in a mode, rad/s.
 
+    **Arguments**: `mode` number of the jam mode.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
+    `InputError` where the quantity is computed.
+
     >>> from optimize import jam_frequency
     >>> jam_frequency(mode=3).unit
     'rad/s'
@@ -139,12 +159,16 @@ def jam_frequency(*, mode: int) -> Quantity:
 def support_frequency_squared() -> Quantity:
     """sum_i k_i/M_i over the platforms, loads included in M, (rad/s)^2: the stiffness budget n_1^2 + n_2^2 of the papers.
 
+    **Returns** `Quantity`. A machine without platforms raises `InputError` where the quantity is computed.
+
     >>> import jaxvib as jv
     >>> from optimize import support_frequency_squared
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
     >>> round(float(support_frequency_squared()(form.scene())), 6)
     0.222222
+
+    Source: the antiphase paper, section 5.1.
     """
 
     def budget(scene: Scene, _: JamModes) -> Array:
@@ -158,7 +182,7 @@ def support_frequency_squared() -> Quantity:
 def total(field: str) -> Quantity:
     """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
 
-    **Raises** `InputError` for a name that no scene has.
+    **Returns** `Quantity`. **Raises** `InputError` for a name that no scene has.
 
     >>> from optimize import total
     >>> total("machine.stiffness").unit
@@ -179,6 +203,8 @@ def total(field: str) -> Quantity:
 
 def negative(quantity: Quantity) -> Quantity:
     """The quantity with its sign turned: a search that makes it small makes the quantity itself large.
+
+    **Returns** `Quantity`.
 
     >>> from optimize import amplitude, negative
     >>> negative(amplitude(mode=3, of=1)).name

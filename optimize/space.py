@@ -33,7 +33,7 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
 
     **Arguments**: `quantity` such as `jam_frequency(mode=3)`; `value` in its unit, or text.
 
-    **Raises** `InputError` for a wrong unit, or a value of 0 (what is held is compared relative to it).
+    **Returns** `Held`. **Raises** `InputError` for a wrong unit, or a value of 0 (what is held is compared relative to it).
 
     >>> from optimize import hold, jam_frequency
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import count
 from jaxvib.motion.observables import relative_amplitude
@@ -38,8 +39,9 @@ _SAME = 1e-3
 class Outcome:
     """A machine in numbers, in one jam mode.
 
-    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m
-    and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not exist.
+    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m,
+    of platform 1 (y1) first, and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not
+    exist.
     """
 
     parameters: dict[str, float | list[float]]
@@ -115,7 +117,8 @@ class Synthesis:
         """Every quantity after the search against before. **Returns** a matplotlib figure."""
         from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
 
-        return before_after(_flat(self.before), _flat(self.after), title=f"search for {wanted(self.objective)}")
+        names = amplitude_names(self.scene)
+        return before_after(_flat(self.before, names), _flat(self.after, names), title=f"search for {wanted(self.objective)}")
 
     def plot_convergence(self) -> Figure:
         """The objective of every start over the iterations. **Returns** a matplotlib figure."""
@@ -133,7 +136,15 @@ def _show(value: float | list[float]) -> str:
     return ", ".join(f"{v:.5g}" for v in value) if isinstance(value, list) else f"{value:.5g}"
 
 
-def _flat(outcome: Outcome) -> dict[str, float]:
+def amplitude_names(scene: Scene) -> list[str]:
+    """What the amplitude of each coordinate is called: that of platform 1 is the coordinate y1's."""
+    names = scene.machine.structure().coordinates
+    if not isinstance(scene.machine, Platforms):
+        return [f"amplitude of {name}" for name in names]
+    return [f"amplitude of platform {k + 1} ({name})" for k, name in enumerate(names)]
+
+
+def _flat(outcome: Outcome, names: list[str]) -> dict[str, float]:
     flat: dict[str, float] = {}
     for name, value in outcome.parameters.items():
         if isinstance(value, list):
@@ -141,7 +152,7 @@ def _flat(outcome: Outcome) -> dict[str, float]:
         else:
             flat[name] = value
     flat["jam frequency, rad/s"] = outcome.omega
-    flat.update({f"amplitude of platform {k + 1}, m": a for k, a in enumerate(outcome.amplitude)})
+    flat.update({f"{name}, m": a for name, a in zip(names, outcome.amplitude, strict=True)})
     flat["foundation force, N"] = outcome.foundation_force
     flat["force per amplitude, N/m"] = outcome.force_per_amplitude
     return flat
@@ -222,7 +233,10 @@ def synthesize(
     values = np.where(ends.good, ends.history[-1], np.inf)
     done = ends.good & (ends.left < _CONVERGED)
     if not np.any(np.isfinite(values)):
-        raise ComputationError("diverged", f"no search from {starts} starts ended at a possible design; give a smaller rate")
+        raise ComputationError(
+            "diverged",
+            f"no search from {starts} starts ended at a possible design; give a smaller rate (search.rate of a design file)",
+        )
     best = int(np.argmin(values))
     scene = space.at(jnp.asarray(ends.z[best]))
     tell("checking by time integration", 0.9)

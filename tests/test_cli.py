@@ -78,6 +78,68 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     assert code == 2 and "--speed is -5 rad/s; it must be at least 0" in err
 
 
+def test_exact_modes_json_has_the_promised_keys(typed):
+    code, out, err = typed("modes", "machine.toml", "--exact", "--json")
+    document = json.loads(out)
+    assert code == 0 and err == ""
+    assert set(document) == {"rotor_speed", "resonances", "modes", "special", "missing"}
+    assert set(document["special"][0]) == {"omega", "rotor_speed", "kind"}
+    assert {"fold"} <= {point["kind"] for point in document["special"]}
+
+
+def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
+    plain = scene("two_mass", speed=150.0)
+    shaken = jv.Scene(plain.machine, plain.loads, plain.drive, (jv.StaticImbalance("5 g m"),))
+    jv.save_scene(shaken, tmp_path / "shaken.toml")
+    said = "amplitudes and forces are the loads' alone: the static imbalance shakes at the rotor's own speed"
+    assert said in typed("modes", "shaken.toml")[1]
+    assert said not in typed("modes", "machine.toml")[1]
+    assert said in typed("modes", "shaken.toml", "--phases")[1]
+    code, _, err = typed("modes", "shaken.toml", "--exact")
+    assert code == 2 and "effects.static_imbalance shakes the machine at the rotor's own speed" in err
+
+
+def test_a_machine_without_springs_ends_in_a_sentence(typed, tmp_path):
+    loads_ = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04)
+    free = {
+        "platform": jv.one_mass(mass=50.0, stiffness=0.0, damping=30.0),
+        "plane": jv.planar_rotor(mass=37.0, stiffness=0.0, damping=843.0),
+        "hinge": jv.rotor(
+            mass=37.0,
+            transverse_inertia=0.479,
+            polar_inertia=0.093,
+            stiffness=(6e5, 0.0),
+            damping=400.0,
+            position=(0.165, -0.155),
+        ),
+    }
+    for name, machine in free.items():
+        jv.save_scene(jv.Scene(machine, loads_, jv.ConstantSpeed(100.0)), tmp_path / f"{name}.toml")
+    code, out, err = typed("criterion", "platform.toml", "--check", "--out", "o")
+    assert (code, out) == (2, "") and "machine.stiffness lets the machine drift" in err and err.count("\n") == 1
+    assert typed("criterion", "platform.toml", "--out", "o")[0] == 0
+    for name in ("plane", "hinge"):
+        for more in ((), ("--out", "o"), ("--loads", "none")):
+            code, out, err = typed("whirl", f"{name}.toml", *more)
+            assert (code, out) == (2, "") and "machine.stiffness leaves a motion of the rotor without a spring" in err
+
+
+@pytest.mark.parametrize("given", ["5", '"5 N/m"', "[1.0, 2.0]", '["1 N/m", "soft", 3.0]', "{ a = 1 }", "true"])
+def test_terms_that_are_no_three_numbers_end_in_a_sentence(typed, tmp_path, given):
+    text = TEMPLATES["rotor"].replace("# stiffness_terms = [1.159e6, 0.0, 2.98e4]", f"stiffness_terms = {given}")
+    assert given in text
+    (tmp_path / "rotor.toml").write_text(text)
+    code, out, err = typed("whirl", "rotor.toml")
+    assert (code, out) == (2, "") and "machine.stiffness_terms" in err and err.count("\n") == 1
+
+
+def test_whirl_draws_the_campbell_diagram(typed, tmp_path):
+    (tmp_path / "rotor.toml").write_text(TEMPLATES["rotor"])
+    code, out, _ = typed("whirl", "rotor.toml", "--out", "o", "--json")
+    assert code == 0 and len(json.loads(out)["critical"]) == 4
+    assert (tmp_path / "o" / "campbell.png").stat().st_size > 10_000
+
+
 def test_modes_speed_option_replaces_the_scene_s(typed):
     _, out, _ = typed("modes", "machine.toml", "--json", "--speed", "600 rpm")
     np.testing.assert_allclose(json.loads(out)["rotor_speed"], 20 * np.pi, rtol=1e-15)
@@ -89,6 +151,7 @@ def test_simulate_json_and_files(typed, tmp_path):
     assert code == 0 and document["status"] == "done" and document["time"] == 4.0
     assert abs(document["omega"] - float(jv.jam_modes(scene(speed=150.0)).select(3).omega)) < 0.5
     assert float(jv.Run.load(tmp_path / "o" / "run.npz").omega) == document["omega"]
+    assert document["coordinates"] == ["y1", "y2"] and document["units"] == ["m", "m"]
     assert (tmp_path / "o" / "history.png").stat().st_size > 10_000
 
 

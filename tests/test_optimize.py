@@ -1,5 +1,7 @@
 """The design layer: what may change, what is held, what is found."""
 
+import inspect
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -230,6 +232,12 @@ def test_design_file_is_read(tmp_path):
     assert [h.quantity.name for h in design.space.held] == ["jam_frequency", "support_frequency_squared"]
     np.testing.assert_allclose(design.space.held[0].value, 570 * np.pi / 30)
     assert design.search == {"starts": 256, "seed": 0}
+    every = TEMPLATE.replace("# iterations", "iterations").replace("# rate", "rate").replace("# polishing", "polishing")
+    (tmp_path / "design.toml").write_text(every)
+    search = load_design(tmp_path / "design.toml").search
+    assert search == {"starts": 256, "seed": 0, "iterations": 100, "rate": 0.05, "polishing": 12}
+    defaults = {name: each.default for name, each in inspect.signature(synthesize).parameters.items()}
+    assert all(defaults[name] == value for name, value in search.items())
 
 
 @pytest.mark.parametrize(
@@ -245,6 +253,9 @@ def test_design_file_is_read(tmp_path):
         (("mode = 3", 'mode = "three"'), "mode is 'three'"),
         (("starts = 256", "start = 256"), "did you mean 'starts'"),
         (("starts = 256", "starts = 0.5"), "must be a whole number"),
+        (("# rate = 0.05", "rate = 2.0"), "search.rate is 2; it must be less than 1"),
+        (("# rate = 0.05", "rate = 0"), "search.rate is 0; it must be greater than 0"),
+        (("# rate = 0.05", 'rate = "fast"'), "search.rate is 'fast'"),
         (("[free]", "[free"), "is no TOML file"),
     ],
 )

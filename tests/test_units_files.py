@@ -242,6 +242,16 @@ def test_scene_file_of_a_rotor_with_every_effect(drive, stations, tmp_path):
     same(jv.load_scene(jv.save_scene(plane, tmp_path / "scene.toml")), plane)
 
 
+def test_terms_may_come_as_an_array():
+    machine_ = jv.rotor(**ROTOR, stiffness_terms=jnp.asarray([1e6, 1e4, 3e4]))
+    np.testing.assert_array_equal(machine_.stiffness_terms, [1e6, 1e4, 3e4])
+
+
+def test_coordinates_have_units():
+    assert jv.rotor(**ROTOR).structure().units == ("m", "m", "rad", "rad")
+    assert two().structure().units == two().carrier().units == ("m", "m")
+
+
 def rotor_scene(machine_=None, drive=None, effects=(), count=4):
     machine_ = jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]) if machine_ is None else machine_
     loads_ = jv.pendulums(count=count, mass=0.05, radius=0.08, drag=0.1)
@@ -270,6 +280,17 @@ WRONG_ROTORS = {
     "slip": (lambda: motor(slip=1.2), r"drive\.breakdown_slip is 1\.2; it must be below 1"),
     "no inertia": (lambda: motor(inertia=0.0), r"drive\.inertia is 0 kg m\^2; it must be greater than 0"),
     "terms": (lambda: jv.rotor(**ROTOR, stiffness_terms=(1.0, 2.0)), r"machine\.stiffness_terms has 2 values; 3 are needed"),
+    "one term": (
+        lambda: jv.rotor(**ROTOR, stiffness_terms=5),
+        r"machine\.stiffness_terms is 5; it must be a list of three numbers, in N/m, N, N m",
+    ),
+    "terms in words": (lambda: jv.rotor(**ROTOR, damping_terms="5 N s/m"), r"damping_terms is '5 N s/m'; it must be a list"),
+    "terms in a table": (lambda: jv.rotor(**ROTOR, damping_terms={"a": 1}), r"damping_terms is {'a': 1}; it must be a list"),
+    "a term in words": (lambda: jv.rotor(**ROTOR, damping_terms=(8e2, "soft", 1.0)), r"damping_terms\[1\] is 'soft'"),
+    "an array of two terms": (
+        lambda: jv.rotor(**ROTOR, damping_terms=jnp.ones(2)),
+        r"damping_terms has 2 values; 3 are needed",
+    ),
     "term's unit": (lambda: jv.rotor(**ROTOR, stiffness_terms=("1 N/m", "2 m", 3.0)), r"stiffness_terms\[1\] is '2 m'"),
     "terms that no supports have": (
         lambda: jv.rotor(**ROTOR, stiffness_terms=(1e6, 2e5, 3e4)),

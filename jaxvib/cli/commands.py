@@ -81,6 +81,7 @@ def simulate(
     if picture is not None and data is not None:
         run.plot().savefig(picture)
         run.save(data)
+    structure = loaded.machine.structure()
     document = {
         "status": "done",
         "message": run.message,
@@ -88,6 +89,8 @@ def simulate(
         "rotor_speed": float(run.window.rotor_speed[-1]),
         "omega": float(run.omega),
         "load_speed": run.load_speed.tolist(),
+        "coordinates": list(structure.coordinates),
+        "units": list(structure.units),
         "amplitude": run.amplitude.tolist(),
         "foundation_force": float(run.foundation_force),
         "drift": float(run.drift),
@@ -182,7 +185,7 @@ def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool
 
 
 def _outcomes(best: Synthesis) -> str:
-    from optimize.synthesize import wanted
+    from optimize.synthesize import amplitude_names, wanted
 
     columns: list[tuple[str, Outcome]] = [("before", best.before), ("after", best.after)]
     if best.verified is not None:
@@ -199,8 +202,8 @@ def _outcomes(best: Synthesis) -> str:
         else:
             row(name, lambda o, name=name: o.parameters[name])
     row("jam frequency, rad/s", lambda o: o.omega)
-    for k in range(len(best.after.amplitude)):
-        row(f"amplitude of platform {k + 1}, mm", lambda o, k=k: 1e3 * o.amplitude[k])
+    for k, name in enumerate(amplitude_names(best.scene)):
+        row(f"{name}, mm", lambda o, k=k: 1e3 * o.amplitude[k])
     row("foundation force, N", lambda o: o.foundation_force)
     row("force per amplitude, N/m", lambda o: o.force_per_amplitude)
     counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"

@@ -28,7 +28,8 @@ def criterion(scene: Path, check: bool, output: Output) -> None:
     top = 1.5 * max([*document["resonances"], *document["damped_resonances"], float(loaded.drive.speed)])
     exact = None
     if check:
-        exact = jv.balanced_intervals(loaded, 0.05 * min(w for w in document["resonances"] if w > 0.0), top)
+        lowest = min((w for w in document["resonances"] if w > 0.0), default=top)
+        exact = jv.balanced_intervals(loaded, 0.05 * lowest, top)
         document["exact_balancing"] = exact
         document["exact_up_to"] = top
     picture = output.file("criterion.png")

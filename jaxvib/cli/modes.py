@@ -20,13 +20,14 @@ _RPM = 30.0 / np.pi
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
 @click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
-@click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of the limit of light loads.")
-@click.option("--phases", is_flag=True, help="Jams of loads at unequal phases too; always so for a rotor.")
+@click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
+@click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
 @shared
 def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, output: Output) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
-    Of a rotor: every jam of light loads at any phases; --out draws them over the loads' drag."""
+    Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
+    with platforms and with a rotor that does not tilt, where no load has a station of its own and nothing is out of balance."""
     loaded = jv.load_scene(scene)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
@@ -83,9 +84,15 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
-        return "\n".join(lines)
+        return "\n".join([*lines, *_left_out(loaded)])
 
     output.done(document, text, "modes")
+
+
+def _left_out(scene: jv.Scene) -> list[str]:
+    """What a table of light loads' jams does not hold, in a line; none where nothing is out of balance."""
+    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if effect.throws)
+    return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 
 
 def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
@@ -130,7 +137,7 @@ def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
             return f"no jam at {speed:.5g} rad/s"
         kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({jam.pattern_label})" for jam in jams if jam.stable)
         said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
-        return table(title, head, rows) + "\n" + said
+        return "\n".join([table(title, head, rows), said, *_left_out(scene)])
 
     output.done(document, text, "modes")
 
@@ -162,7 +169,7 @@ def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
             }
             for k, jam in known.items()
         ],
-        "folds": [{"omega": p.omega, "rotor_speed": p.rotor_speed, "kind": p.kind} for p in diagram.special],
+        "special": [{"omega": p.omega, "rotor_speed": p.rotor_speed, "kind": p.kind} for p in diagram.special],
         "missing": [{"mode": k, "status": jam.message} for k, jam in jams.items() if k not in known],
     }
 

@@ -38,7 +38,7 @@ def whirl(scene: Path, speed: str | None, loads: Any, output: Output) -> None:
     ]
     picture = output.file("campbell.png")
     if picture is not None:
-        top = 1.3 * max(rotor_speed, *(each["speed"] for each in critical))
+        top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
         jv.whirl(loaded, np.linspace(0.0, top, 161), loads=loads).plot().savefig(picture)
     document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}
 

@@ -22,15 +22,30 @@ def time_histories(
     rotor_speed: np.ndarray,
     *,
     names: Sequence[str],
+    units: Sequence[str] | None = None,
 ) -> Figure:
-    """Three panels over time (s): displacements (nt, nd) mm, speeds of the loads (nt, count) and of the
-    rotor (nt,) rad/s, force on the bed (nt, nb) N."""
-    figure, (top, middle, bottom) = panels(3, size=(8.0, 2.4), share_x=True)
+    """Panels over time (s): displacements (nt, nd) mm, tilts mrad where there are any, speeds of the loads (nt, count) and of
+    the rotor (nt,) rad/s, force on the bed (nt, nb) N.
+
+    `displacement` is in m, and in rad where `units` (nd,) say "rad"; if None, all is in m.
+
+    >>> import numpy as np
+    >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
+    >>> figure = time_histories(t, q, one, one, t, names=("y", "theta"), units=("m", "rad"))
+    >>> [axes.get_ylabel() for axes in figure.axes][:2]
+    ['displacement, mm', 'tilt, mrad']
+    """
+    units = ["m"] * len(names) if units is None else units
+    kinds = [(unit, label) for unit, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if unit in units]
+    figure, (*upper, middle, bottom) = panels(len(kinds) + 2, size=(8.0, 2.4), share_x=True)
     widest_first = np.argsort(-np.ptp(displacement, axis=0))  # so that none hides another
-    for depth, k in enumerate(widest_first):
-        top.plot(time, 1e3 * displacement[:, k], color=COLORS[k % len(COLORS)], label=names[k], lw=0.7, zorder=2 + 0.1 * depth)
-    top.set_ylabel("displacement, mm")
-    top.legend(ncols=min(len(names), 6), loc="upper right")
+    for axis, (unit, label) in zip(upper, kinds, strict=True):
+        own = [k for k in widest_first if units[k] == unit]
+        for depth, k in enumerate(own):
+            line = {"color": COLORS[k % len(COLORS)], "lw": 0.7, "zorder": 2 + 0.1 * depth}
+            axis.plot(time, 1e3 * displacement[:, k], label=names[k], **line)
+        axis.set_ylabel(label)
+        axis.legend(ncols=min(len(own), 6), loc="upper right")
     for k in range(rate.shape[1]):
         middle.plot(time, rate[:, k], color=COLORS[k % len(COLORS)], lw=0.9)
     middle.plot(time, rotor_speed, color="black", ls="--", lw=1.0, label="rotor")
@@ -53,11 +68,13 @@ def branch_diagram(
     resonances: np.ndarray,
     marks: Sequence[tuple[str, np.ndarray, np.ndarray]] = (),
     names: Sequence[str],
+    units: Sequence[str] | None = None,
     at: float | None = None,
     unit: str = "rad/s",
 ) -> Figure:
     """Three panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N.
 
+    `amplitude` is in m, and in rad where `units` (nd,) say "rad", which is drawn in mrad; if None, all is in m.
     Stable parts are solid, unstable ones dashed. `resonances` are drawn as level lines, `marks` as points (label, rotor
     speed, load speed), `at` as an upright line; speeds are given in rad/s and drawn in `unit` ("rad/s" or "rpm").
     """
@@ -66,7 +83,9 @@ def branch_diagram(
     n = scale * rotor_speed
     view = scale * rotor_speed[np.isfinite(rotor_speed)]
     series: list[tuple[Axes, np.ndarray, str, str]] = [(axes[0], scale * omega, COLORS[0], "loads")]
-    series += [(axes[1], 1e3 * amplitude[:, k], COLORS[k % len(COLORS)], name) for k, name in enumerate(names)]
+    tilts = [units is not None and units[k] == "rad" for k in range(len(names))]
+    labels = [f"{name}, mrad" if tilts[k] else name for k, name in enumerate(names)]
+    series += [(axes[1], 1e3 * amplitude[:, k], COLORS[k % len(COLORS)], name) for k, name in enumerate(labels)]
     series += [(axes[2], force, COLORS[0], "force")]
     for axis, values, color, label in series:
         solid_and_dashed(axis, n, values, stable, color, label)

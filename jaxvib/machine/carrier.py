@@ -28,7 +28,7 @@ class Carrier(eqx.Module):
     - `port` B (np, nd): the port's displacement is B q
     - `axes`: which direction of a load's plane (0 across, 1 up) each row of B moves in
     - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): ties to the bed, N/m and N s/m
-    - `coordinates`: a name for each coordinate
+    - `coordinates`: a name for each coordinate; `units`: the unit of each, "rad" of tilts, "m" of all others
     - `tilt` T (np, nd), 1/m times the unit of a displacement: how the structure's axis turns with q; None where it cannot.
       A point at the distance s along the axis from the port moves by (B + s T) q
     - `stations` s_j (count,) m: where along the axis, counted from the port, each load runs; None where all run at the port
@@ -50,6 +50,16 @@ class Carrier(eqx.Module):
     tilt: Array | None = None
     stations: Array | None = None
     seat: Array | None = None
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each coordinate: "rad" of the tilts "theta" and "psi", "m" of all others.
+
+        >>> import jaxvib as jv
+        >>> jv.planar_rotor(mass=37.0, stiffness="1160 N/mm", damping=840.0).structure().units
+        ('m', 'm')
+        """
+        return tuple("rad" if name in ("theta", "psi") else "m" for name in self.coordinates)
 
     def port_at(self, distance: Array | float) -> Array:
         """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""

@@ -111,6 +111,8 @@ class Gravity(Effect):
 
     **Arguments**: `g` m/s^2.
 
+    **Raises** `InputError` for a wrong unit or a negative value.
+
     >>> import jaxvib as jv
     >>> float(jv.Gravity().g)
     9.81
@@ -134,6 +136,8 @@ class StaticImbalance(Effect):
     The force on the carrier, where the rotor sits, is - M e d^2/dt^2 of that direction.
 
     **Arguments**: `moment` M e, kg m, not negative; `angle` rad, of the heavy side when the rotor's angle is 0.
+
+    **Raises** `InputError` for a wrong unit or a negative moment.
 
     >>> import jaxvib as jv
     >>> float(jv.StaticImbalance("9.25 g m").moment)
@@ -164,6 +168,8 @@ class MomentImbalance(Effect):
     It turns the carrier about its tilts with the moment - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
 
     **Arguments**: `moment` (A - C) delta, kg m^2, of either sign; `angle` rad (- gamma in the paper).
+
+    **Raises** `InputError` for a wrong unit, and, by the scene, for a machine that cannot tilt.
 
     >>> import jaxvib as jv
     >>> float(jv.MomentImbalance(4e-4).moment)

@@ -86,13 +86,35 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 def load_scene(path: str | Path) -> Scene:
     """Reads a scene file, see `scene_from_toml`.
 
-    **Raises** `InputError` for a file that cannot be read, and for everything that is wrong in it, field named.
+    **Arguments**: `path` of a TOML file.
+
+    **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for everything that is wrong in it, field
+    named.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "machine.toml"
+    >>> _ = path.write_text(TEMPLATES["two_mass"])
+    >>> jv.load_scene(path).machine.kind
+    'two_mass'
     """
     return scene_from_tables(read_toml(path))
 
 
 def save_scene(scene: Scene, path: str | Path) -> Path:
-    """Writes a scene file that `load_scene` reads back bit for bit. **Returns** its path."""
+    """Writes a scene file that `load_scene` reads back bit for bit.
+
+    **Arguments**: `scene`; `path` of the file, which is overwritten.
+
+    **Returns** its path. **Raises** `OSError` where it cannot be written.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> path = jv.save_scene(scene, pathlib.Path(tempfile.mkdtemp()) / "machine.toml")
+    >>> bool(jv.load_scene(path).drive.speed == scene.drive.speed)
+    True
+    """
     path = Path(path)
     path.write_text(scene_to_toml(scene), encoding="utf-8")
     return path
@@ -104,7 +126,8 @@ def scene_from_toml(text: str) -> Scene:
     Tables `[machine]`, `[loads]`, `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit;
     `[effects]` names only what the scene calls for, `gravity = true` or a table of the effect's arguments.
 
-    **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not allowed.
+    **Returns** `Scene`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not
+    allowed.
 
     >>> import jaxvib as jv
     >>> scene = jv.scene_from_toml('''
@@ -188,7 +211,16 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
 
 
 def scene_to_toml(scene: Scene) -> str:
-    """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit."""
+    """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit.
+
+    **Returns** text.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    >>> jv.scene_to_toml(scene).splitlines()[:3]
+    ['[machine]', 'kind = "one_mass"', 'mass = 50.0']
+    """
     import tomli_w  # only where a file is written
 
     tables: dict[str, Any] = {}

@@ -155,16 +155,18 @@ def balls(
     **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
     all, or N of them; `own_radius` r m of a ball, for balls in one track, which cannot all be at one point: where jams and
     the criterion take them as collected, they lie side by side and carry the unbalance m R sin(N arcsin(r/R)) / (r/R) in
-    place of N m R. A run in time does not see it: there nothing keeps loads from passing each other.
+    place of N m R. In time only the effect `LoadContact` sees it: without that nothing keeps loads from passing each other.
 
-    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, values not positive, balls that have
-    no room side by side.
+    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, a mass or radius that is not
+    positive, a negative drag (0 is allowed), balls that have no room side by side.
 
     >>> import jaxvib as jv
     >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5).unbalance().round(6))
     0.288
     >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5, own_radius="20 mm").unbalance().round(6))
     0.277333
+
+    Source: the antiphase paper, equations (1), (2), (6).
     """
     return _circular("ball", count, mass, radius, drag, None, own_radius)
 
@@ -177,11 +179,17 @@ def rollers(
     drag: Number | Sequence[Number],
     own_radius: Number | None = None,
 ) -> CircularLoads:
-    """Cylindrical rollers that roll in an annular track, kappa = 3/2. Arguments as `balls`.
+    """Cylindrical rollers that roll in an annular track, kappa = 3/2.
+
+    **Arguments**: as `balls`.
+
+    **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
 
     >>> import jaxvib as jv
     >>> float(jv.rollers(count=2, mass=1.0, radius=0.1, drag=1.0).inertia_factor())
     1.5
+
+    Source: as `balls`.
     """
     return _circular("roller", count, mass, radius, drag, None, own_radius)
 
@@ -204,5 +212,7 @@ def pendulums(
     >>> import jaxvib as jv
     >>> float(jv.pendulums(count=1, mass=2.0, radius=0.1, drag=1.0, inertia=0.01).inertia_factor())
     1.5
+
+    Source: as `balls`; on a rotor Artyunin 2013, equation (1).
     """
     return _circular("pendulum", count, mass, radius, drag, inertia)

@@ -210,6 +210,8 @@ def network(
     ...                    link_stiffness=[2e4] * 3, link_damping=[4.0] * 3, exciter=4)
     >>> chain.carrier().mass.shape
     (4, 4)
+
+    Source: Filimonikhin et al. 2022, equations (1)-(39) for one to three platforms, for any number of them.
     """
     masses = numbers(mass, "kg", "machine.mass", None, low=0.0, open_low=True)
     n = 1 if masses.ndim == 0 else masses.shape[0]

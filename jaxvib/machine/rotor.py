@@ -102,8 +102,8 @@ def rotor(
 
     **Arguments**: `mass` kg, `transverse_inertia` A and `polar_inertia` C kg m^2 without loads; `stiffness` N/m, `damping`
     N s/m and `position` m (along the axis from the mass centre, one side negative) of the two supports; `stations` m of the
-    loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3) where they are
-    not what the supports make, see `Rotor`.
+    loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3), lists of three,
+    where they are not what the supports make, see `Rotor`.
 
     **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports that are both at
     one place, and for terms that no supports can have (negative ones, or c2^2 > c1 c3).
@@ -113,12 +113,18 @@ def rotor(
     ...                    damping=(420.0, 420.0), position=(0.165, -0.155), stations=(0.28, 0.25, -0.25, -0.28))
     >>> machine.carrier().coordinates
     ('y', 'z', 'theta', 'psi')
+
+    Source: Artyunin 2013, equation (1).
     """
 
     def terms(values: Sequence[Number] | None, units: tuple[str, str, str], field: str) -> Array | None:
         if values is None:
             return None
-        numbers([0.0] * len(values) if isinstance(values, (list, tuple)) else values, "", f"machine.{field}", 3)
+        if not isinstance(values, (list, tuple)) and np.ndim(values) != 1:
+            problem = f"is {values!r}; it must be a list of three numbers, in {', '.join(units)}"
+            raise InputError(f"machine.{field}", problem)
+        if len(values) != 3:
+            raise InputError(f"machine.{field}", f"has {len(values)} values; 3 are needed")
         given = [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
         if not any(map(traced, given)):
             one, two, three = map(float, given)
@@ -186,6 +192,8 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
     >>> import jaxvib as jv
     >>> jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0).carrier().port.shape
     (2, 2)
+
+    Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.
     """
     return PlanarRotor(
         mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),

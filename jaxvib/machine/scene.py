@@ -18,10 +18,12 @@ class Scene(eqx.Module):
 
     `jax.grad`, `jax.vmap` and `jax.jit` go through every number in it; `equinox.tree_at` replaces one.
 
-    **Arguments**: `machine` from `one_mass`, `two_mass`, `three_mass`, `network`; `loads` from `balls`, `rollers`,
-    `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, only those the scene calls for.
+    **Arguments**: `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor`, `rotor`; `loads` from
+    `balls`, `rollers`, `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, only those the scene calls
+    for, once each; `CubicSupport` and `Stop` as often as the machine has such supports.
 
-    **Raises** `InputError` where a part is not of its kind, or an effect is named twice.
+    **Raises** `InputError` where a part is not of its kind, an effect is named twice that may be named once, a machine's
+    stations are not as many as the loads, or an effect does not go with this machine or these loads.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -43,9 +43,10 @@ class SpecialPoint(NamedTuple):
 class ExactBranches(eqx.Module):
     """The branch n(Omega) of exact jams, ascending in Omega, a leading axis over its P points.
 
-    **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m and `foundation_force` (P,) N,
-    zero to peak; `power` (P,) W; `stable`, `multiplier` (P,) and `multipliers` (P, ...) as in `Orbit`; `residual`, `error`
-    (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in Omega; `scene`.
+    **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m, of tilts rad, and
+    `foundation_force` (P,) N, zero to peak, as in `Orbit`; `power` (P,) W; `stable`, `multiplier` (P,) and `multipliers` (P,
+    ...) as in `Orbit`; `residual`, `error` (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in
+    Omega; `scene`.
     """
 
     status: OrbitStatus

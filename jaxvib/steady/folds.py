@@ -42,8 +42,11 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
     with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
     `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
-    Dry friction helps the drag with mu2 (d/2) N sign(n - w) a load; n is then the root of that balance between w and the above,
-    N = m R w^2 (the loads' weight left out: it adds nothing on the average of a turn unless it exceeds that).
+    Dry friction helps the drag with mu2 (d/2) N sign(n - w) a load; n is then the root of that balance between w and the
+    above, N = m R w^2 (the loads' weight left out: it adds nothing on the average of a turn unless it exceeds that). An
+    imbalance of the rotor shakes at n and not at w, and adds nothing here.
+
+    **Returns** n, a scalar. **Raises** `InputError` as `jam_modes` does for scenes it cannot judge.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

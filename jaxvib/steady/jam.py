@@ -31,9 +31,10 @@ class JamStatus(eqx.Enumeration):
 class Jam(eqx.Module):
     """One jam mode of a scene.
 
-    **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable`
-    by the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, at load angle Omega t; `amplitude` (nd,) m and
-    `foundation_force` N, zero to peak.
+    **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
+    the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude`
+    (nd,) m, of tilts rad, and `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed
+    squares of their peaks (sqrt 2 times the force of a circular whirl).
     """
 
     mode: Array
@@ -114,10 +115,15 @@ def jam_modes(scene: Scene) -> JamModes:
     damped so much that modes 1 and 2 have vanished. Rising pieces (odd modes) are stable by slope, falling ones are not.
     Where the branch has more peaks than resonances, the lowest ripples, each over a narrow range of rotor speeds, are left out.
 
+    A rotor out of balance (`StaticImbalance`, `MomentImbalance`) leaves a jam where it is: it shakes at the rotor's speed,
+    loads at theirs, so that no mean torque comes of it at this order. Its vibration and force come on top: the amplitudes and
+    the foundation force are the loads' alone. Where both count, ask `simulate`.
+
     **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit
     function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
 
-    **Raises** `InputError` for loads without drag, or a machine whose coordinates couple through the rotor's speed.
+    **Raises** `InputError` for loads without drag or at stations of their own, a machine whose coordinates couple through the
+    rotor's speed, a motor in place of a given speed, and effects that this theory leaves out (`CubicSupport`, `Stop`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

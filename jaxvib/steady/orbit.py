@@ -41,13 +41,15 @@ class Orbit(eqx.Module):
     - `status` an `OrbitStatus`; `residual` of the torque balance, relative; `error` estimate of the relative error of the
       speeds (and, rad, of psi) that the number of harmonics leaves
     - `omega`, `rotor_speed` rad/s; `slope` dn/dOmega along the branch
-    - `amplitude` (nd,) m and `foundation_force` N: zero to peak, (max - min)/2 over the period
+    - `amplitude` (nd,) m, of tilts rad, and `foundation_force` N: zero to peak, (max - min)/2 over the period; of two
+      directions of the force the root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
     - `power` W: mean power that the loads take from the rotor, by drag and dry friction
     - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
       Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
       the multiplier that is 1, as computed
-    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, `force_harmonics` (nb, K) N: the c_k; loads that share
-      every number have one lag (G = 1), else each has its own (G = count)
+    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, of tilts rad, `force_harmonics` (nb, K) N: the c_k; loads
+      that share every number have one lag (G = 1), else each has its own (G = count)
+    - `units` (nd,): of the amplitudes, "m" or "rad"
     - `lag_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
     """
 
@@ -70,6 +72,7 @@ class Orbit(eqx.Module):
     offsets: Array
     lag_orders: tuple[int, ...] = eqx.field(static=True)
     orders: tuple[int, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def message(self) -> str:
@@ -84,7 +87,8 @@ class Orbit(eqx.Module):
     def at(self, theta: Array) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
         """The motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',) rad/s.
 
-        These are what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of the motion.
+        Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
+        the motion.
         """
         k, j = np.asarray(self.orders), np.asarray(self.lag_orders)
         wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
@@ -99,11 +103,14 @@ class Orbit(eqx.Module):
 
     def summary(self) -> str:
         """A few lines a person can read; amplitudes zero to peak."""
-        amplitude = ", ".join(f"{float(a):.6g}" for a in self.amplitude)
+        kinds = {unit: [k for k, each in enumerate(self.units) if each == unit] for unit in dict.fromkeys(self.units)}
+        amplitude = "; ".join(
+            f"{', '.join(f'{float(self.amplitude[k]):.6g}' for k in places)} {unit}" for unit, places in kinds.items()
+        )
         return (
             f"loads {float(self.omega):.9g} rad/s, rotor {float(self.rotor_speed):.9g} rad/s, "
             f"{'stable' if self.stable else 'unstable'} (largest multiplier {float(self.multiplier):.6g})\n"
-            f"amplitude {amplitude} m, foundation force {float(self.foundation_force):.6g} N, "
+            f"amplitude {amplitude}, foundation force {float(self.foundation_force):.6g} N, "
             f"power {float(self.power):.6g} W\n"
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )
@@ -193,6 +200,7 @@ def orbits(
         force_harmonics=or_nan(harmonics.force),
         lag_orders=tuple(map(int, grid.lag_orders)),
         orders=tuple(map(int, grid.orders)),
+        units=scene.machine.structure().units,
         offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
     )
     return orbit, growth

@@ -109,6 +109,10 @@ def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
     load speed to the next, the speed is solved for as well (`phase_jam`). What differs by a common turn, or by which of
     several equal loads stands where, is one jam. Loads that turn with the rotor and balance it are left out.
 
+    A rotor out of balance (`StaticImbalance`, `MomentImbalance`) leaves a jam where it is: it shakes at the rotor's speed,
+    loads at theirs, so that no mean torque comes of it at this order. Its vibration and force come on top: the amplitudes and
+    the foundation force are the loads' alone. Where both count, ask `simulate`.
+
     **Arguments**: `starts`: random sets of phases at each load speed; `seed` which. Stable jams are found with a few; unstable
     ones close to where patterns part from each other take many.
 

@@ -37,9 +37,10 @@ class PhaseJam(eqx.Module):
 
     **Attributes**: `status` a `PhaseStatus`; `omega`, `rotor_speed` rad/s; `phase` (count,) rad, of the first load 0;
     `pattern` a `PhasePattern`; `growth` 1/s, of the fastest growing small disturbance, and `stable` where it is negative;
-    `displacement` (nd,) complex amplitudes at Omega t; `amplitude` (nd,) and `foundation_force` N, zero to peak; `torque`
-    (count,) N m, the mean torque of the vibration on each load; `residual` of the balance, relative to the drag's torque.
-    NaN where there is no jam.
+    `displacement` (nd,) complex amplitudes at Omega t, m, of tilts rad; `amplitude` (nd,) m, of tilts rad, and
+    `foundation_force` N, zero to peak (of two directions the root of the summed squares of their peaks: sqrt 2 times the force
+    of a circular whirl); `torque` (count,) N m, the mean torque of the vibration on each load; `residual` of the balance,
+    relative to the drag's torque. NaN where there is no jam.
     """
 
     status: PhaseStatus
@@ -118,6 +119,9 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 
     L_j (np, nd) is how load j's point moves with the carrier's coordinates: its port, at its station; n the rotor's speed.
 
+    **Returns** an array (count,). **Raises** `InputError` for loads that are not on a circle, drives without a given speed, and
+    effects that this theory leaves out.
+
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
@@ -145,7 +149,10 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     taken. On supports that are alike both ways nothing is averaged away.
 
     **Returns** `PhaseJam`; `vmap` over starts and scenes goes through it, derivatives of all but stability are those of the
-    implicit function theorem. **Raises** `InputError` for loads without drag.
+    implicit function theorem. An imbalance of the rotor is left out of amplitudes and forces, see `phase_jams`.
+
+    **Raises** `InputError` for loads without drag, phases of another number than the loads, drives without a given speed, and
+    effects that this theory leaves out.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

@@ -54,6 +54,7 @@ def picture(
         resonances=np.asarray(natural_frequencies(branch.scene)),
         marks=[(kind.replace("_", " "), points[:, 1], points[:, 0]) for kind, points in shown.items()],
         names=branch.scene.machine.structure().coordinates,
+        units=branch.scene.machine.structure().units,
         at=at,
         unit=unit,
     )

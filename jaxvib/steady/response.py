@@ -212,6 +212,15 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     the angle of the loads being w t. It is the limit of light loads (eps -> 0) of a jam. The rotor's `speed` n, rad/s, is asked
     for where the carrier has a gyroscopic matrix G.
 
+    **Returns** (nd,) complex. **Raises** `InputError` for a carrier with a gyroscopic matrix where no speed is given, loads at
+    stations of their own, a motor in place of a given speed, and effects that this theory leaves out.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> print(abs(jv.steady_displacement(scene, 100.0)[0]))      # 0.1 100^2 / (50 100^2 - 4e4)
+    0.002173913...
+
     Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
     """
     carrier = scene.machine.carrier()

@@ -82,6 +82,10 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 
     The loads' masses move with the port; G, where there is one, takes the rotor's speed w.
 
+    **Arguments**: `scene`; `omega`.
+
+    **Returns** (np, np) complex. It raises nothing of its own: at a resonance that nothing damps its numbers are not finite.
+
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))

@@ -14,7 +14,7 @@ from jaxvib.draw.whirl import campbell_diagram
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, numbers
+from jaxvib.machine.units import Number, numbers, traced
 from jaxvib.steady.response import hermitian_modes, loaded_mass, relative_to
 
 if TYPE_CHECKING:
@@ -70,7 +70,8 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
 
     **Returns** `Whirl`. Gradients go through speeds and decays where no two are equal.
 
-    **Raises** `InputError` for a machine that does not move in two directions, and for values that are not allowed.
+    **Raises** `InputError` for a machine that does not move in two directions or has a motion that no spring holds, and for
+    values that are not allowed.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
@@ -153,7 +154,16 @@ def _two_directions(scene: Scene) -> Carrier:
             "machine.kind",
             f"is {scene.machine.kind!r}, which moves up and down only; whirl needs a rotor such as rotor(...)",
         )
+    if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):
+        raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
     return carrier
+
+
+def _held(stiffness: np.ndarray) -> bool:
+    """Whether springs hold every motion, as far as rounding can tell."""
+    size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
+    rounding = 100.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps
+    return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))
 
 
 def _mass(scene: Scene, loads: Weights) -> Array:
