@@ -50,6 +50,15 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
     assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
 
 
+def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
+    """Nor is it asked how long a run would need to forget its start: less than no time."""
+    scene = jv.Scene(light().machine, light().loads, jv.ConstantSpeed("40 rad/s"))
+    cost = jv.accuracy(scene, "gradient", mode=2, repeats=1)
+    assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
+    (reason,) = cost.left_out
+    assert reason.startswith("full: jam mode 2 is unstable (largest Floquet multiplier 1.597")
+
+
 @pytest.mark.slow
 def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
     """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
@@ -77,6 +86,13 @@ def test_a_run_up_is_measured_at_its_end():
         jv.accuracy(scene, mode=1)
 
 
+def test_a_final_state_is_told_apart_but_for_whole_turns_in_single_precision():
+    cost = jv.accuracy(light(), "final_state", until=20.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
+    error = {row.dtype: row.error for row in cost.rows}
+    assert error.keys() == {"float64", "float32"} and 0.0 < error["float64"] < 1e-3 and error["float32"] < 0.1
+    assert cost.reference_error < 1e-8 and len(cost.reference) == 4
+
+
 def row(error, seconds):
     return CostRow("full", "", "float64", "", error, seconds, 0.0)
 
@@ -97,6 +113,8 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
         (dict(solvers=["Euler"]), r"solvers are \['Euler'\]; name some of default, Tsit5, Dopri8"),
         (dict(solvers=[]), r"solvers are \[\]; name some of default"),
         (dict(until=-1.0), "until is -1"),
+        (dict(tolerances=()), r"tolerances are \(\); name one at least, such as 1e-6"),
+        (dict(repeats=0), "repeats is 0; it must be a whole number, at least 1"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(asked, message):

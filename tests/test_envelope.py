@@ -393,3 +393,19 @@ def test_a_run_that_does_not_finish_says_so():
     with pytest.raises(jv.ComputationError, match=r"in the steps it was allowed \(5 steps\)") as error:
         jv.envelope(small(), 60.0, max_steps=5)
     assert error.value.status == "max_steps_reached"
+
+
+def test_a_stiff_method_of_diffrax_gives_the_same_run(caught):
+    other = jv.envelope(small(), 60.0, start="spin_up", solver=diffrax.Kvaerno5())
+    np.testing.assert_allclose(other.omega, caught.omega, rtol=1e-4)
+    np.testing.assert_allclose(other.amplitude, caught.amplitude, rtol=1e-3)
+
+
+def test_a_lane_that_is_not_finite_ends_at_once():
+    def one(scale):
+        there = eqx.tree_at(lambda s: s.machine.stiffness, small(), small().machine.stiffness * scale)
+        run = jv.envelope(there, 60.0, start="spin_up", save="window")
+        return run.status == jv.EnvelopeStatus.not_finite, run.steps
+
+    bad, steps = jax.jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan]))
+    assert bad.tolist() == [False, True] and int(jnp.max(steps)) < 1000

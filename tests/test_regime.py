@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import published
 
 import jaxvib as jv
 from jaxvib.study.published_rotor import published_rotor, rotor_regimes
@@ -22,7 +23,9 @@ def made(phase, speed, *, wobble=0.0, slow=0.0, effects=()):
     angle = angle + slow * TIME[:, None] ** 2
     rate = speed[None] + (100.0 * wobble * jnp.cos(100.0 * TIME) + 2.0 * slow * TIME)[:, None]
     still = jnp.zeros((801, 4))
-    return s, jv.Trajectory(TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), jnp.full(801, 460.0))
+    return s, jv.Trajectory(
+        TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), 460.0 * TIME, jnp.full(801, 460.0)
+    )
 
 
 CASES = {
@@ -60,6 +63,24 @@ def test_loads_at_one_station_cannot_balance_what_tilts_their_rotor(effects, lab
     s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0, effects=effects)
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.05))
     assert jv.regime(jv.Scene(machine, s.loads, s.drive, effects), motion).label == label
+
+
+@pytest.mark.parametrize(
+    ("speed", "damping", "mode", "near"),
+    [
+        (3.0, 0.01, 5, "beyond resonance 2 at 1 rad/s"),
+        (3.0, 0.01, 3, "by resonance 2 at 1 rad/s"),
+        (0.5, 0.05, 3, "beyond resonance 1 at 0.3"),
+    ],
+)
+def test_a_run_that_starts_in_a_mode_and_stays_has_that_mode(speed, damping, mode, near):
+    """Close to the rotor's speed it is the mode that rises there, not the unstable one that falls from the resonance below."""
+    s = published(speed=speed, damping=damping, eps=0.01).scene()
+    run = jv.simulate(s, 300.0, start="jam", mode=mode, save="window", tolerance=1e-6, estimate=False)
+    np.testing.assert_allclose(run.omega, jv.jam_modes(s).select(mode).omega, rtol=0.03)
+    np.testing.assert_allclose(run.regime.load_speed, run.load_speed, rtol=1e-12)
+    assert run.regime.label == "jammed" and int(run.regime.mode) == mode
+    assert near in run.regime.summary() and f"(mode {mode})" in run.regime.summary()
 
 
 def test_ripple_is_half_of_peak_to_peak():
@@ -184,6 +205,7 @@ def test_run_ups_name_each_lane():
     found = jv.run_ups(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], tolerance=1e-5)
     assert found.kind.shape == (2, 2) and np.all(found.finished)
     assert np.all(found.fraction("jammed") + found.fraction("unbalanced") + found.fraction("balanced") <= 1.0)
+    assert not np.any(found.fraction("failed"))
     lone = eqx.tree_at(lambda s: s.loads.drag, s, jnp.asarray(5.0))
     start = eqx.tree_at(lambda y: y.angle, jv.initial_state(lone), (jnp.array([1.0, 2.0]),))
     run = jv.simulate(lone, 5.0, start=start, save="window", tolerance=1e-5)
@@ -198,6 +220,23 @@ def test_run_ups_name_each_lane():
         jv.run_ups(s, 5.0, angles=[[0.0, 0.1, 0.2]])
     with pytest.raises(jv.InputError, match="goes without angles"):
         jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
+
+
+def test_run_ups_that_fail_are_no_motion():
+    """In single precision, whose tolerance nobody has named; one drag is none at all."""
+    with jax.enable_x64(False):
+        s = jv.Scene(
+            jv.one_mass(mass=20.0, stiffness=4e4, damping=60.0),
+            jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5),
+            jv.SpinUp(60.0, duration=0.5),
+        )
+        found = jv.run_ups(s, 2.0, drag=[5.0, 1e12], max_steps=2**14)
+    assert found.finished.tolist() == [[True], [False]]
+    assert found.fraction("failed").tolist() == [0.0, 1.0] and found.kind[1, 0] == "failed"
+    assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: 100 % failed"
+    assert len(found.plot().axes) == 2
+    with pytest.raises(jv.InputError, match=r"kind is 'lost'; allowed: swinging, .*unsettled, failed"):
+        found.fraction("lost")
 
 
 def test_regime_under_jit_and_vmap():

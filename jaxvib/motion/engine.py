@@ -85,14 +85,12 @@ class Motion(eqx.Module):
         y = tuple(numbers_of(state)) if self.few else state
         return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
-    def states(self, held: Any) -> tuple[State, State]:
-        """States along a leading axis, from what the integrator held then; and the same, angles counted from the first."""
+    def states(self, held: Any) -> State:
+        """States along a leading axis, from what the integrator held then; wrapped angles count from the first one's turn."""
         if not self.wrapped:
-            state = self._state(held)
-            return state, state
+            return self._state(held)
         y, turns = held
-        since = jax.tree.map(lambda n: n - n[:1], turns)
-        return self._state(self._turned(y, turns, 1.0)), self._state(self._turned(y, since, 1.0))
+        return self._state(self._turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
     def _wrap(self, held: Any) -> Any:
         """Takes whole turns out of the angles and counts them."""
@@ -162,6 +160,7 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
 
     a PI controller for a method of order 8, its powers made of square roots. A step with e > 1 is taken again.
     An angle grows without end; an error relative to it would let a long run lose its phase: `relative` is 0 there.
+    A step whose error is not a number is taken again too, a fifth as long; where no shorter one moves time on, the run ends.
 
     **Attributes**: `tolerance` scalar; `unit`, `relative` trees like the integrator's state.
     """
@@ -206,7 +205,7 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
         e = ratios[0]
         for other in ratios[1:]:
             e = jnp.maximum(e, other)
-        e = jax.lax.stop_gradient(jnp.clip(e, 1e-8, 1e8))
+        e = jax.lax.stop_gradient(jnp.clip(jnp.where(jnp.isnan(e), jnp.inf, e), 1e-8, 1e8))
         root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
         keep = e <= 1.0
         cube = root * root * root
@@ -215,4 +214,10 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
         start = jnp.where(keep, t1, t0)
         end = start + factor * (t1 - t0)
         before = jnp.where(keep, root, controller_state)
-        return keep, start, end, False, before, diffrax.RESULTS.successful
+        return keep, start, end, False, before, moved_on(keep, start, t1, end)
+
+
+def moved_on(keep: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
+    """Whether the run can go on: a step from `start` to `before` that was refused is followed by a shorter one to `end`."""
+    shorter = (end > start) & (end < before)
+    return diffrax.RESULTS.where(keep | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -18,9 +19,10 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
+from jaxvib.motion.distance import distance, scales
 from jaxvib.motion.dynamics import State, vector_field
 from jaxvib.motion.engine import Motion
-from jaxvib.motion.integrate import fastest_and_slowest, is_finite
+from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wraps
 from jaxvib.motion.start import initial_state
 
 __all__ = ["Ensemble", "ensemble"]
@@ -35,14 +37,16 @@ _LANES = 64
 class Ensemble(eqx.Module):
     """Where many runs ended.
 
-    **Attributes** (B runs): `state` a `State` whose arrays have a leading axis over the runs, at the end; `omega` (B, count)
-    rad/s, the mean speed of each load over the last quarter of the run; `error` (B,) estimated, as that of a `Run` but for the
-    end state alone, NaN where no estimate was asked for; `finite` (B,) whether the motion stayed so; `steps` each run took;
-    `seconds` all of it took, compiling included where the program was new, NaN under a JAX transformation.
+    **Attributes** (B runs): `state` a `State` whose arrays have a leading axis over the runs, at the end, in single precision
+    with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
+    `error` (B,) estimated, as that of a `Run` but for the end state alone, each run's displacements relative to its own
+    largest: NaN where no estimate was asked for or the motion did not stay finite, infinite where 4 steps or fewer leave no
+    larger ones to compare with; `finite` (B,) whether the motion stayed so; `steps` each run took; `seconds` all of it took,
+    compiling included where a program was new, NaN under a JAX transformation.
     """
 
     state: State
-    omega: Array
+    load_speed: Array
     error: Array
     finite: Array
     steps: Array
@@ -63,15 +67,19 @@ def ensemble(
     Runs advance together, `lanes` at a time, every number of the state a contiguous array over them, and chunks are spread over
     all devices that JAX has: graphics processors, or as many cores as `prepare_cpu(devices=None)` made devices of.
     Equal steps keep runs together that would wait for each other otherwise; near the boundary between two outcomes they also
-    keep the choice of steps from deciding. Other values of the same shape need no new program.
+    keep the choice of steps from deciding. Other values of the same shape need no new program where `make` is the same function
+    and the same numbers are shared by all runs; a function written in the call is another one each time. In single precision
+    angles are kept within a turn while time is integrated, so that long runs keep their phase.
 
     **Arguments**
 
-    - `make`: gives a run's `Scene`, which starts at rest, or its scene and `State`, from one entry of `values`
+    - `make`: gives a run's `Scene`, which starts at rest, or its scene and `State`, from one entry of `values`; it is compiled
+      as by `jax.jit`, so what it refers to besides must stay what it was at the first call
     - `values`: an array with a leading axis over the runs, or a tree of them
     - `until`: end time, s or text, of all runs
-    - `steps`: how many each run takes; 4 for each radian of what moves fastest unless said otherwise
-    - `estimate`: whether to estimate errors by a second run with half as many steps
+    - `steps`: how many each run takes, rounded up to a multiple of 4; 4 for each radian of what moves fastest unless said
+      otherwise
+    - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
     - `lanes`: how many runs advance together
 
     **Returns** `Ensemble`. Derivatives go through it in forward mode.
@@ -87,54 +95,65 @@ def ensemble(
     >>> many.state.displacement.shape, bool(many.finite.all()), bool(many.error.max() < 1e-6)
     ((5, 1), True, True)
     """
+    begun = time.perf_counter()
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
     if len(sizes) != 1 or sizes & {(), (0,)}:
         raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
     ((runs,),) = sizes
     end = number(until, "s", "until", low=0.0, open_low=True)
     lanes = min(count(lanes, "lanes"), runs)
-
-    def whole(value: Any) -> tuple[Scene, State]:
-        made = make(value)
-        alone = isinstance(made, Scene)
-        scene, state = (made, initial_state(made)) if alone else made if isinstance(made, tuple) else (made, None)
-        if not isinstance(scene, Scene) or not isinstance(state, State):
-            raise InputError("make", f"gives {made!r}; it must give a Scene, or a Scene and a State")
-        return scene, state
-
-    made = eqx.filter_jit(eqx.filter_vmap(whole))(values)
+    made = _made(make, values)
     known = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.
     shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]
+    shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
     leaves, rest = jax.tree.flatten(made)
     parts = [leaf[0] if same else leaf for leaf, same in zip(leaves, shared, strict=True)]
     if steps is None:
         if not known:
             raise InputError("steps", "is missing; under a JAX transformation say how many steps each run takes")
-        fastest = float(jnp.max(jax.jit(jax.vmap(lambda s: fastest_and_slowest(s)[0]))(made[0])))
-        steps = max(16, math.ceil(4.0 * float(end) * fastest))
-    count(steps, "steps")
-    chosen = (tuple(shared), rest, lanes, runs)
-    begun = time.perf_counter()
-    states, finite = _all(parts, end, jnp.asarray(steps, end.dtype), *chosen)
-    last = jax.tree.map(lambda leaf: leaf[:, -1], states)
-    error = jnp.full((runs,), jnp.nan, end.dtype)
-    if estimate:
-        coarse, _ = _all(parts, end, jnp.ceil(jnp.asarray(steps, end.dtype) / 2.0), *chosen)
-        # What a method of order 3 would leave of the difference; this one is of order 8.
-        error = _apart(made[0], last, jax.tree.map(lambda leaf: leaf[:, -1], coarse)) / 8.0
-    omega = (states.angle[0][:, -1] - states.angle[0][:, -2]) / (end / _PARTS)
-    if known:
-        jax.block_until_ready((last, error))
-    seconds = jnp.asarray(time.perf_counter() - begun if known else jnp.nan, end.dtype)
-    return Ensemble(last, omega, error, finite, jnp.asarray(steps), seconds)
+        steps = max(16, math.ceil(4.0 * float(end) * float(np.max(np.asarray(_fastest(made[0]))))))
+    each = -(-count(steps, "steps") // _PARTS)
+    coarse = -(-each // 2)
+    # A run of one step in each part has no coarser one beside it.
+    compared = estimate and coarse < each
+    counts = np.asarray([each, coarse] if compared else [each], end.dtype)
+    last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs)
+    # What a method of order 3 would leave of the difference; this one is of order 8.
+    error = apart * (coarse / each) ** 3 if compared else jnp.asarray(np.full(runs, np.inf if estimate else np.nan, end.dtype))
+    found = Ensemble(last, load_speed, error, finite, taken[0], jnp.asarray(jnp.nan, end.dtype))
+    if not known:
+        return found
+    jax.block_until_ready(found)
+    return dataclasses.replace(found, seconds=jnp.asarray(time.perf_counter() - begun, end.dtype))
+
+
+@eqx.filter_jit
+def _made(make: Callable[..., Any], values: Any) -> tuple[Scene, State]:
+    """The scenes and the states they start from, all with a leading axis over the runs."""
+
+    def one(value: Any) -> tuple[Scene, State]:
+        given = make(value)
+        if isinstance(given, Scene):
+            return given, initial_state(given)
+        scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
+        if not isinstance(scene, Scene) or not isinstance(state, State):
+            raise InputError("make", f"gives {given!r}; it must give a Scene, or a Scene and a State")
+        return scene, state
+
+    return eqx.filter_vmap(one)(values)
+
+
+@eqx.filter_jit
+def _fastest(scenes: Scene) -> Array:
+    return jax.vmap(lambda scene: fastest_and_slowest(scene)[0])(scenes)
 
 
 @eqx.filter_jit
 def _all(
-    parts: list[Array], end: Array, steps: Array, shared: tuple[bool, ...], rest: Any, lanes: int, runs: int
-) -> tuple[State, Array]:
-    """All runs in chunks over all devices: states at the ends of the run's parts (runs, parts, ...), and whether finite."""
+    parts: list[Array], end: Array, counts: Any, shared: tuple[bool, ...], rest: Any, lanes: int, runs: int
+) -> tuple[State, Array, Array, Array, Array]:
+    """All runs in chunks over all devices, (runs, ...); see `_run`."""
     devices = jax.devices()
     chunks = -(-runs // (lanes * len(devices)))
     padded = chunks * lanes * len(devices)
@@ -147,36 +166,40 @@ def _all(
     own = [chunked(leaf) for leaf, same in zip(parts, shared, strict=True) if not same]
     common = [leaf for leaf, same in zip(parts, shared, strict=True) if same]
 
-    def one(own: list[Array], common: list[Array], end: Array, steps: Array) -> tuple[State, Array]:
+    def one(own: list[Array], common: list[Array], end: Array, counts: Array) -> Any:
         mine, ours = iter(own), iter(common)
         scene, state = jax.tree.unflatten(rest, [next(ours) if same else next(mine) for same in shared])
-        return _run(scene, state, end, steps)
+        return _run(scene, state, end, counts)
 
-    def on_device(own: list[Array], common: list[Array], end: Array, steps: Array) -> tuple[State, Array]:
+    def on_device(own: list[Array], common: list[Array], end: Array, counts: Array) -> Any:
         chunk = jax.vmap(one, in_axes=(0, None, None, None))
-        return jax.lax.map(lambda mine: chunk(mine, common, end, steps), own)
+        return jax.lax.map(lambda mine: chunk(mine, common, end, counts), own)
 
     if len(devices) > 1:
         split, whole = PartitionSpec("runs"), PartitionSpec()
         mesh = Mesh(np.asarray(devices), ("runs",))
         specs = (split, whole, whole, whole)
         on_device = jax.shard_map(on_device, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
-    states, finite = on_device(own, common, end, steps)
-    return jax.tree.map(lambda leaf: leaf.reshape(padded, *leaf.shape[2:])[:runs], (states, finite))
+    found = on_device(own, common, end, jnp.asarray(counts))
+    return jax.tree.map(lambda leaf: leaf.reshape(padded, *leaf.shape[2:])[:runs], found)
 
 
-def _run(scene: Scene, state: State, end: Array, steps: Array) -> tuple[State, Array]:
-    """One run of equal steps in a few parts, which share a program; states at their ends."""
-    motion = Motion(vector_field(scene), state, wrapped=False)
-    each = end / _PARTS
-    step = each / jnp.ceil(steps / _PARTS)
+def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, Array, Array, Array, Array]:
+    """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
 
-    def part(held: Any, begin: Array) -> tuple[Any, Any]:
+    **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
+    there, whether it stayed finite, the steps it took.
+    """
+    single, together = wraps(scene, state.displacement.dtype)
+    motion = Motion(vector_field(scene), state, wrapped=single, together=together)
+    length = end / _PARTS
+
+    def part(held: Any, begin: Array, step: Array) -> tuple[Any, Any]:
         solution = diffrax.diffeqsolve(
             motion.term,
             motion.method(lanes=True),
             t0=begin,
-            t1=begin + each,
+            t1=begin + length,
             dt0=step,
             y0=held,
             args=motion.args,
@@ -187,23 +210,19 @@ def _run(scene: Scene, state: State, end: Array, steps: Array) -> tuple[State, A
             throw=False,
         )
         held = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
-        return held, held
+        return held, (held, solution.stats["num_steps"])
 
-    _, helds = jax.lax.scan(part, motion.held(state), each * jnp.arange(_PARTS))
-    states, _ = motion.states(helds)
-    return states, is_finite(states)
+    def whole(steps: Array) -> tuple[Any, Array]:
+        times = length * jnp.arange(_PARTS)
+        _, (helds, taken) = jax.lax.scan(lambda held, begin: part(held, begin, length / steps), motion.held(state), times)
+        return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
-
-def _apart(scenes: Scene, a: State, b: State) -> Array:
-    """How far the ends of runs are apart, (B,): as a `Run`'s `error`, displacements relative to the largest of all."""
-    speed = scenes.drive.speed
-
-    def largest(x: Array, y: Array) -> Array:
-        return jnp.max(jnp.abs(x - y), axis=-1)
-
-    parts = [largest(x, y) / jnp.max(jnp.abs(x)) for x, y in ((a.displacement, b.displacement), (a.velocity, b.velocity))]
-    parts += [largest(x, y) for x, y in zip(a.angle, b.angle, strict=True)]
-    parts += [largest(x, y) / speed for x, y in zip(a.rate, b.rate, strict=True)]
-    if a.rotor is not None and b.rotor is not None:
-        parts += [jnp.abs(a.rotor[0] - b.rotor[0]), jnp.abs(a.rotor[1] - b.rotor[1]) / speed]
-    return jnp.max(jnp.stack(parts), axis=0)
+    helds, taken = jax.lax.map(whole, counts)
+    # Wrapped angles are counted from the first of the states that are asked for together.
+    ends = motion.states(jax.tree.map(lambda leaf: leaf[:, -1], helds))
+    angle = motion.states(jax.tree.map(lambda leaf: leaf[0], helds)).angle[0]
+    last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
+    finite, apart = is_finite(last), distance(last, other, scales(last, natural_units(scene)))
+    # A run whose coarser one did not stay finite has an error that nobody knows.
+    apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
+    return last, (angle[1] - angle[0]) / length, apart, finite, taken[0]

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jax import Array
 from jax.extend import core
 
@@ -19,12 +20,13 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
 from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.motion.dynamics import State
+from jaxvib.motion.engine import moved_on
 from jaxvib.motion.envelopes import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.observables import Measured
 from jaxvib.motion.replay import solve
 from jaxvib.motion.rosenbrock import Rodas4
 from jaxvib.motion.scalars import MOST_NUMBERS, numbers_of, program_on_numbers
-from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
+from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
 from jaxvib.steady.response import magnitude, natural_frequencies
 
 __all__ = ["envelope"]
@@ -36,14 +38,26 @@ _LONGEST = 256
 """Turns of the rotor that the window is long at most, as in `simulate`."""
 
 
-class _Tolerance(diffrax.AbstractStepSizeController):
+class _Tolerance(diffrax.AbstractAdaptiveStepSizeController):
     """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
 
     inner: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
 
+    @property
+    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return getattr(self.inner, "rtol", 0.0)  # a controller without one has no implicit method to serve
+
+    @property
+    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return getattr(self.inner, "atol", 0.0)
+
+    @property
+    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
+        return getattr(self.inner, "norm", optimistix.rms_norm)
+
     def wrap(self, direction: Any) -> _Tolerance:
-        return _Tolerance(self.inner.wrap(direction), self.blocks)
+        return _Tolerance(inner=self.inner.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
         return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -56,7 +70,13 @@ class _Tolerance(diffrax.AbstractStepSizeController):
             # An angle grows without end; its error is never relative.
             return jnp.concatenate([*(jnp.broadcast_to(jnp.max(x), x.shape) for x in parts[:-1]), jnp.zeros_like(parts[-1])])
 
-        return self.inner.adapt_step_size(t0, t1, sizes(y0), sizes(y1_candidate), args, y_error, error_order, controller_state)
+        # An error that is not a number would make the next step's length one that is not.
+        error = None if y_error is None else jnp.where(jnp.isnan(y_error), jnp.inf, y_error)
+        keep, start, end, jumped, state, result = self.inner.adapt_step_size(
+            t0, t1, sizes(y0), sizes(y1_candidate), args, error, error_order, controller_state
+        )
+        moved = moved_on(keep, start, t1, end)
+        return keep, start, end, jumped, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, moved, result)
 
 
 class _Units(eqx.Module):
@@ -130,6 +150,7 @@ def envelope(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    require_numbers(scene)
     averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
@@ -147,7 +168,7 @@ def envelope(
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
         known = start in ("rest", "spin_up") and mode is None
-        state = None if known else initial_state(scene, start, mode=mode)
+        state = None if known else initial_state(scene, start, mode=mode, throw=throw)
     run = _run(
         scene,
         end,
@@ -201,7 +222,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
+        controller=_Tolerance(inner=controller, blocks=(2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),  # pyright: ignore[reportCallIssue]
         adjoint=adjoint,
         max_steps=max_steps,
     )
@@ -213,17 +234,21 @@ def _run(
     kept = envelopes(solution.ts[0], solution.ys[0])
     finite = _finite(kept)
     turning = _turning(scene, field, begin, kept)
-    finished = solution.result == diffrax.RESULTS.successful
+    result = solution.result
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.dt_min_reached, EnvelopeStatus.not_finite, EnvelopeStatus.no_step)
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.max_steps_reached, EnvelopeStatus.max_steps_reached, failed)
     status = EnvelopeStatus.where(turning, EnvelopeStatus.done, EnvelopeStatus.not_turning)
     status = EnvelopeStatus.where(finite, status, EnvelopeStatus.not_finite)
-    status = EnvelopeStatus.where(finished, status, EnvelopeStatus.max_steps_reached)
+    status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
     status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
-    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), _measure(kept))
+    whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
+    seen = (_measure(kept), jnp.max(kept.ripple, axis=0), whole, kept)
+    measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     return Envelope(
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
-        ripple=jnp.max(kept.ripple, axis=0),
+        ripple=ripple,
         status=status,
-        trajectory=envelopes(solution.ts[1], solution.ys[1]) if samples else None,
+        trajectory=whole,
         window=kept,
         steps=solution.stats["num_steps"],
         rejected=solution.stats["num_rejected_steps"],
@@ -317,10 +342,11 @@ def _finite(tree: Any) -> Array:
 def _raise_if_failed(run: Envelope, max_steps: int) -> None:
     if bool(run.status == EnvelopeStatus.done):
         return
-    names = ("max_steps_reached", "not_finite", "no_start", "not_turning")
+    names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_turning")
     name = next(name for name in names if bool(run.status == getattr(EnvelopeStatus, name)))
     hint = {
         "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
+        "no_step": "; give a smaller tolerance, or leave the solver out",
         "not_turning": "; integrate the full equations with simulate",
     }
     raise ComputationError(name, run.message + hint.get(name, ""))

@@ -24,6 +24,7 @@ class EnvelopeStatus(eqx.Enumeration):
     done = "the averaged run reached its end"
     max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
+    no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the state to start from does not exist or is not finite"
     not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
 
@@ -73,8 +74,6 @@ class Envelope(Measured):
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
-        names = self.scene.machine.structure().coordinates
-        amplitude = ", ".join(f"{n} {float(a):.4g} m" for n, a in zip(names, self.amplitude, strict=True))
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled"
         return "\n".join(
@@ -83,7 +82,7 @@ class Envelope(Measured):
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
-                f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
+                f"  {self.extent(self.scene)}",
                 f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
             ]
         )
@@ -96,4 +95,5 @@ class Envelope(Measured):
         return time_histories(
             *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
             names=self.scene.machine.structure().coordinates,
+            units=self.scene.machine.structure().units,
         )

@@ -124,6 +124,9 @@ def integrate(
     if isinstance(controller, StepControl):
         if controller.steps is not None:
             first = end / controller.steps
+        if controller.tolerance is not None:
+            # As the error of a step of order 8 asks; two runs, one to a larger tolerance, then make other steps from the first.
+            first = 0.4 * controller.tolerance ** (1.0 / 9.0) / fastest
         controller = _controller(scene, motion, state, controller)
     solution = solve(
         motion.term,
@@ -139,20 +142,17 @@ def integrate(
         progress=ProgressBar() if progress else None,
     )
     assert solution.ts is not None and solution.ys is not None
-    times, (states, since) = solution.ts[0], motion.states(solution.ys[0])
-    measured = measure(scene, motion.rates, times, since)
-    finished = solution.result == diffrax.RESULTS.successful
-    status = RunStatus.where(
-        finished, RunStatus.where(is_finite(states), RunStatus.done, RunStatus.not_finite), RunStatus.max_steps_reached
-    )
-    status = RunStatus.where(exists, status, RunStatus.no_start)
-    measured = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), measured)
+    times, states = solution.ts[0], motion.states(solution.ys[0])
+    window = trajectory(scene, times, states)
+    whole = trajectory(scene, solution.ts[1], motion.states(solution.ys[1])) if samples else None
+    seen = (measure(scene, motion.rates, times, states), window, whole)
+    measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     steps = solution.stats["num_steps"]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
-        status=status,
-        trajectory=trajectory(scene, solution.ts[1], motion.states(solution.ys[1])[0]) if samples else None,
-        window=trajectory(scene, times, states),
+        status=RunStatus.where(exists, _status(solution.result, is_finite(states)), RunStatus.no_start),
+        trajectory=whole,
+        window=window,
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
         error=unknown,
         steps=steps,
@@ -161,6 +161,14 @@ def integrate(
         seconds=unknown,
         scene=scene,
     )
+
+
+def _status(result: diffrax.RESULTS, finite: Array) -> RunStatus:
+    ended = RunStatus.where(finite, RunStatus.done, RunStatus.not_finite)
+    # A step that is refused until it is none has numbers in it that are not finite.
+    failed = RunStatus.where(result == diffrax.RESULTS.dt_min_reached, RunStatus.not_finite, RunStatus.no_step)
+    failed = RunStatus.where(result == diffrax.RESULTS.max_steps_reached, RunStatus.max_steps_reached, failed)
+    return RunStatus.where(result == diffrax.RESULTS.successful, ended, failed)
 
 
 def _stages(solver: diffrax.AbstractSolver) -> int:

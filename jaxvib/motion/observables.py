@@ -24,12 +24,14 @@ class Trajectory(eqx.Module):
     """States at some times.
 
     **Attributes** (nt times): `time` (nt,) s; `state` a `State` whose arrays have a leading axis over the times;
-    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_speed` (nt,) rad/s.
+    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_angle` (nt,) rad, within
+    whole turns, and `rotor_speed` (nt,) rad/s.
     """
 
     time: Array
     state: State
     foundation_force: Array
+    rotor_angle: Array
     rotor_speed: Array
 
 
@@ -37,9 +39,9 @@ class Measured(eqx.Module):
     """A motion in numbers, over the last turns of a run.
 
     **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
-    `amplitude` (nd,) m and `foundation_force` N, zero to peak, that is half of peak to peak; `drift` the largest change of an
-    amplitude from the first to the second half of those turns, relative to the largest amplitude, or of `omega` where that is
-    more; `settled` whether it is below 1e-3.
+    `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
+    directions the root of the sum of both squares; `drift` the largest change of an amplitude from the first to the second half
+    of those turns, relative to the largest amplitude, or of `omega` where that is more; `settled` whether it is below 1e-3.
     """
 
     omega: Array
@@ -52,6 +54,13 @@ class Measured(eqx.Module):
     def settled(self) -> Array:
         """Whether the motion repeats itself, as far as amplitudes and speed tell."""
         return self.drift < 1e-3
+
+    def extent(self, scene: Scene) -> str:
+        """Amplitudes and foundation force of the `scene` they belong to, a line for a person to read."""
+        structure = scene.machine.structure()
+        named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
+        amplitude = ", ".join(f"{name} {float(a):.4g} {unit}" for name, a, unit in named)
+        return f"amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N"
 
 
 def foundation_force(scene: Scene, state: State) -> Array:
@@ -171,8 +180,9 @@ def _throw_rate(scene: Scene, turn: Array) -> Array:
 def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
     """States at times, with the forces and rotor speeds that belong to them."""
     force = jax.vmap(lambda s: foundation_force(scene, s))(states)
+    angle = jax.vmap(lambda t, s: rotor_angle(scene.drive, t, s))(times, states)
     speed = jax.vmap(lambda t, s: rotor_speed(scene.drive, t, s))(times, states)
-    return Trajectory(times, states, force, speed)
+    return Trajectory(times, states, force, angle, speed)
 
 
 def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Measured:
@@ -223,7 +233,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
         def extremum(output: Array, k: Array, share: Array) -> Array:
             def sample(j: Array) -> list[Array]:
                 state = jax.tree.map(lambda leaf: leaf[j], states)
-                return [part[output] for part in _moving(scene, field, times[1] - times[0], times[j], state)]
+                return [part[output] for part in _moving(scene, field, _step(times), times[j], state)]
 
             return _extremum(sample(k), sample(k + 1), share)
 
@@ -235,7 +245,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 def _extrema(scene: Scene, field: Any, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Least and greatest values of each output, and their places, see `_places`; (2, 3, outputs) each."""
-    step = times[1] - times[0]
+    step = _step(times)
     samples = jax.vmap(lambda t, y: _moving(scene, field, step, t, y))(times, states)
     return jax.vmap(_places, in_axes=1, out_axes=-1)(*samples)
 
@@ -338,6 +348,11 @@ def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:
     return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (t[-1] - start), total / (t[-1] - t[0]))
 
 
+def _step(times: Array) -> Array:
+    """Between even samples: of all of them, for late in a long run two neighbours are rounded each."""
+    return (times[-1] - times[0]) / (times.shape[0] - 1)
+
+
 def _away_from_zero(x: Array) -> Array:
     tiny = jnp.sqrt(jnp.finfo(x.dtype).tiny)
     return jnp.where(jnp.abs(x) < tiny, tiny, x)
@@ -349,6 +364,6 @@ def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Arr
     x, v, a = (
         values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
     )
-    step = stretch.time[1] - stretch.time[0]
+    step = _step(stretch.time)
     (low, high), _, _ = _places(x, v * step, a * step**2)
     return (high - low)[2] / 2.0

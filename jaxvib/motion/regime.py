@@ -9,8 +9,7 @@ from jax import Array
 
 from jaxvib.machine.drive import Motor
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import rotor_angle
-from jaxvib.motion.observables import Trajectory
+from jaxvib.motion.observables import Trajectory, _mean_speed
 from jaxvib.steady.response import natural_frequencies
 from jaxvib.steady.whirl import whirl
 
@@ -56,11 +55,14 @@ class Regime(eqx.Module):
     **Attributes**
 
     - `name`: a `RegimeName`; `pattern`: a `PhasePattern` of the loads
-    - `load_speed` (count,) mean speeds and `rotor_speed`, rad/s; `ripple` half of peak to peak of the loads' speed, the largest
+    - `load_speed` (count,) mean speeds over whole turns and `rotor_speed`, rad/s; `ripple` half of peak to peak of the loads'
+      speed, the largest
     - `phase` (count,) rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
     - `unbalance`: what loads and rotor together leave out of balance in the rotor's frame, relative to the loads' own together
     - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed` rad/s
-    - `mode`: the jam mode that rises to it (2 resonance - 1) or falls from it (2 resonance), 0 where the loads are not jammed
+    - `mode`: the jam mode, 0 where the loads are not jammed: 2 k falls from the k-th natural frequency, the last one below the
+      loads' mean speed, 2 k + 1 rises from there to the next one, or to the rotor's speed where that is less; it is the one
+      whose end the loads are nearer to, so that beyond the last of nd frequencies close to the rotor it is 2 nd + 1
     - `caught`: whether the rotor itself is held at a resonance, below the speed that its motor would give it without a load
     - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's
     """
@@ -95,7 +97,9 @@ class Regime(eqx.Module):
         speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
         evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
         if bool(self.name == RegimeName.jammed):
-            near = f"by resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
+            # A mode that rises to the rotor's speed has its resonance behind it.
+            where = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
+            near = f"{where} resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
             evidence += [near, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
             evidence.append(f"{100.0 * float(self.unbalance):.2g} % of the loads' unbalance is left, {pattern}")
@@ -145,16 +149,15 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     times, state = stretch.time, stretch.state
     phi, rate = state.angle[0], state.rate[0]
     half = times.shape[0] // 2
-    turn = jax.vmap(lambda t, s: rotor_angle(scene.drive, t, s))(times, state)
+    turn = stretch.rotor_angle
 
-    def mean_speed(part: slice, angle: Array) -> Array:
-        t = times[part]
-        return (angle[part][-1] - angle[part][0]) / (t[-1] - t[0])
+    def mean_speed(part: slice) -> Array:
+        return jax.vmap(lambda p, w: _mean_speed(times[part], p, w), in_axes=1)(phi[part], rate[part])
 
     early, late, whole = slice(0, half), slice(half, None), slice(None)
-    speed, rotor = mean_speed(whole, phi), mean_speed(whole, turn)
+    speed, rotor = mean_speed(whole), _mean_speed(times, turn, stretch.rotor_speed)
     reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
-    change = jnp.max(jnp.abs(mean_speed(late, phi) - mean_speed(early, phi))) / reference
+    change = jnp.max(jnp.abs(mean_speed(late) - mean_speed(early))) / reference
     steady = change < _SAME_SPEED
     swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
     with_rotor = jnp.abs(speed - rotor) < _SAME_SPEED * reference
@@ -176,7 +179,6 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     natural = _resonances(scene, rotor)
     mean = jnp.mean(speed)
     nearest = jnp.argmin(jnp.abs(natural - mean))
-    mode = jnp.where(mean < natural[nearest], 2 * nearest + 1, 2 * nearest + 2)
     turning = jnp.all(with_rotor)
     return Regime(
         name=name,
@@ -188,10 +190,18 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
         unbalance=unbalance,
         resonance=nearest + 1,
         resonance_speed=natural[nearest],
-        mode=jnp.where(name == RegimeName.jammed, mode, 0),
+        mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
         caught=_caught(scene, natural, rotor),
         change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
     )
+
+
+def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
+    """The jam mode of loads at a mean speed between natural frequencies, ascending, infinite where there is none."""
+    ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
+    below = jnp.sum(natural <= mean)
+    rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
+    return jnp.where(rises | (below == 0), 2 * below + 1, 2 * below)
 
 
 def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:

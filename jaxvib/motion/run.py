@@ -36,6 +36,7 @@ class RunStatus(eqx.Enumeration):
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
+    no_step = "a step of the method could not be computed: its implicit equations were not solved"
     not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
     no_start = "the state to start from does not exist or is not finite"
 
@@ -45,9 +46,9 @@ class Run(Measured):
 
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
-    were `rejected`; `evaluations` of the vector field (0 where the method does not say); `seconds` it took, compiling
-    included where the program was new, NaN under a JAX transformation; `error` estimated, NaN where none was asked for; `scene`
-    that ran.
+    were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran. What
+    it cost, the runs with larger steps that were made for its error included: `evaluations` of the vector field (0 where the
+    method does not say) and `seconds`, compiling included where the program was new, NaN under a JAX transformation.
 
     The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles
     in rad, speeds of loads relative to the rotor's. It is what is left of the difference to a run with larger steps, of which
@@ -72,19 +73,17 @@ class Run(Measured):
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
-        names = self.scene.machine.structure().coordinates
-        units = ["rad" if n in ("theta", "psi") else "m" for n in names]
-        amplitude = ", ".join(f"{n} {float(a):.4g} {u}" for n, a, u in zip(names, self.amplitude, units, strict=True))
+        error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled"
         return "\n".join(
             [
                 f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
-                f"  estimated error {float(self.error):.1e}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
+                f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
-                f"  amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N",
+                f"  {self.extent(self.scene)}",
                 f"  {self.regime.summary()}",
             ]
         )
@@ -112,6 +111,7 @@ class Run(Measured):
             np.asarray(kept.foundation_force),
             np.asarray(kept.rotor_speed),
             names=self.scene.machine.structure().coordinates,
+            units=self.scene.machine.structure().units,
         )
 
     def to_xarray(self) -> xarray.Dataset:
@@ -121,7 +121,7 @@ class Run(Measured):
         except ImportError as error:
             raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
         kept = self._kept()
-        names = list(self.scene.machine.structure().coordinates)
+        structure = self.scene.machine.structure()
         loads = range(1, self.scene.loads.count + 1)
 
         def column(value: Array, dimension: str, unit: str) -> tuple[tuple[str, str], np.ndarray, dict[str, str]]:
@@ -129,8 +129,10 @@ class Run(Measured):
 
         return xr.Dataset(
             {
-                "displacement": column(kept.state.displacement, "coordinate", "m"),
-                "velocity": column(kept.state.velocity, "coordinate", "m/s"),
+                "displacement": column(kept.state.displacement, "coordinate", " or ".join(dict.fromkeys(structure.units))),
+                "velocity": column(
+                    kept.state.velocity, "coordinate", " or ".join(f"{u}/s" for u in dict.fromkeys(structure.units))
+                ),
                 "angle": column(kept.state.angle[0], "load", "rad"),
                 "rate": column(kept.state.rate[0], "load", "rad/s"),
                 "foundation_force": column(kept.foundation_force, "direction", "N"),
@@ -138,7 +140,8 @@ class Run(Measured):
             },
             coords={
                 "time": ("time", np.asarray(kept.time), {"units": "s"}),
-                "coordinate": names,
+                "coordinate": list(structure.coordinates),
+                "unit": ("coordinate", list(structure.units)),
                 "load": list(loads),
                 "direction": list(range(1, kept.foundation_force.shape[1] + 1)),
             },
@@ -177,7 +180,7 @@ class Run(Measured):
                 leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
                 zero = jnp.zeros(())
                 rotor = (zero, zero) if isinstance(scene.drive, Motor) else None
-                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,), rotor), zero, zero)
+                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,), rotor), zero, zero, zero)
                 kept = motion if kept_all else None
                 shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, zero, zero, zero, scene)
                 dynamic, static = eqx.partition(shape, eqx.is_array)

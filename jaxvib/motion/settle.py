@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import jax
 import jax.numpy as jnp
 
 from jaxvib.errors import ComputationError, InputError
@@ -12,11 +11,11 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import count
 from jaxvib.motion.dynamics import State
-from jaxvib.motion.run import Run
-from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import Start, initial_state
+from jaxvib.motion.integrate import fastest_and_slowest, wraps
+from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.simulate import last_state, simulate, whole_turns
+from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.steady.jam import jam_modes
-from jaxvib.steady.response import natural_frequencies
 
 __all__ = ["settle"]
 
@@ -27,23 +26,28 @@ _APART = 0.05
 def settle(
     scene: Scene,
     *,
-    start: Start | State = "jam",
+    start: Start | State | None = None,
     mode: int | None = None,
-    drift: float = 1e-6,
+    drift: float | None = None,
     periods: int = 100,
     stretches: int = 200,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
     throw: bool = True,
 ) -> Run:
     """Simulates a stretch after a stretch until amplitudes and speed no longer change.
 
-    **Arguments**: `start`, `mode`, `tolerance` as `simulate`; `drift` the change that counts as none, see `Measured`;
-    `periods` of the lowest natural frequency a stretch is long; at most so many `stretches`; `throw` raise if the motion has
-    not settled by then, otherwise the last run says so by its `drift`.
+    **Arguments**
+
+    - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
+    - `drift`: the change that counts as none, see `Measured`; 1e-6 unless said otherwise, in single precision 1e-3
+    - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
+    - `tolerance`: error a step may make, as `simulate`; 1e-9 unless said otherwise, in single precision 1e-5
+    - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
+      where it failed
 
     In a jam the loads start up to 0.05 rad apart: a motion that only loads glued together would keep does not pass for settled.
 
-    **Returns** the `Run` of the last stretch, without a trajectory.
+    **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
     **Raises** `ComputationError` (status "not_settled", or "left_mode" where the loads went to another
     mode than they began in), `InputError` for a drive whose speed changes; as `simulate` besides.
@@ -58,18 +62,22 @@ def settle(
     if not isinstance(scene.drive, ConstantSpeed):
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed only")
     count(periods, "periods")
-    frequencies = natural_frequencies(scene)
-    slowest = float(jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
-    state = start if isinstance(start, State) else initial_state(scene, start, mode=mode, angles=_parted(scene, start))
-    stretch = 2.0 * math.pi * periods / slowest
+    double = scene.drive.speed.dtype.itemsize >= 8
+    drift = (1e-6 if double else 1e-3) if drift is None else drift
+    tolerance = (1e-9 if double else 1e-5) if tolerance is None else tolerance
+    start = ("rest" if mode is None else "jam") if start is None else start
+    if isinstance(start, State):
+        state = whole_state(scene, start, mode)
+    else:
+        state = initial_state(scene, start, mode=mode, angles=_parted(scene, start), throw=throw)
+    _, slowest = fastest_and_slowest(scene)
+    # An imbalance goes on from where it was: the rotor is there after whole turns.
+    stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
     run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
     for _ in range(count(stretches, "stretches") - 1):
-        if float(run.drift) < drift:
+        if float(run.drift) < drift or not bool(run.status == RunStatus.done):
             break
-        state = jax.tree.map(lambda leaf: leaf[-1], run.window.state)
-        # Only where the loads are within a turn matters; kept small, an angle keeps its digits.
-        turns = jnp.floor(state.angle[0] / (2.0 * jnp.pi))
-        state = State(state.displacement, state.velocity, (state.angle[0] - 2.0 * jnp.pi * turns,), state.rate)
+        state = last_state(scene, run)
         run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
     if throw and not float(run.drift) < drift:
         raise ComputationError(
@@ -86,7 +94,9 @@ def _parted(scene: Scene, start: Start) -> list[float] | None:
     n = scene.loads.count
     if start != "jam" or n == 1:
         return None
-    return [_APART * (2.0 * k / (n - 1) - 1.0) for k in range(n)]
+    _, touching = wraps(scene, float)
+    beside = scene.loads.offsets() if touching else jnp.zeros(n)  # pyright: ignore[reportAttributeAccessIssue]
+    return [float(beside[k]) + _APART * (2.0 * k / (n - 1) - 1.0) for k in range(n)]
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

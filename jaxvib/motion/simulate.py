@@ -19,11 +19,12 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, traced
+from jaxvib.motion.distance import distance, scales, turned
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
 from jaxvib.motion.looped import Looped
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
+from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
 
 __all__ = ["enough_steps", "simulate"]
 
@@ -75,10 +76,11 @@ def simulate(
       displacements, that times the rotor's speed for velocities, 1 rad for angles, whose error is never relative (1e-8 unless
       said otherwise, in single precision 1e-5)
     - `accuracy`: in place of a tolerance, the `error` the result may have; runs are repeated with smaller tolerances until
-      their estimated error is below it, 6 of them at most, or the run says `not_accurate`
+      their estimated error is below it, 6 of them at most, or the run fails as `not_accurate`
     - `steps`: in place of a tolerance, so many equal steps
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
-      unless said otherwise it is where numbers are known, and not under a JAX transformation
+      unless said otherwise it is where numbers are known and tolerance or steps say how steps are chosen, and not under a JAX
+      transformation
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
       reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
       `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `Looped`.
@@ -89,8 +91,9 @@ def simulate(
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
 
     **Returns** `Run`, which carries its estimated `error` and its cost. Gradients, forward and reverse, go through all of it;
-    `jit` and `vmap` too. In single precision angles are kept within a turn while time is integrated, and runs of more than
-    20,000 turns under a constant speed that keep a window only are cut into stretches, so that they do not lose phase.
+    `jit` and `vmap` too. In single precision angles are kept within a turn while time is integrated, those of the window are
+    counted from a turn at its beginning, and runs of more than 20,000 turns under a constant speed that keep a window only are
+    cut into stretches, so that they do not lose phase.
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 
@@ -109,11 +112,13 @@ def simulate(
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
+    require_numbers(scene)
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
-    control = _control(end, tolerance, accuracy, steps, controller)
+    control = _control(end, tolerance, accuracy, steps, controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
-    state = whole_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    given = isinstance(start, State)
+    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, throw=throw)
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
@@ -128,7 +133,7 @@ def simulate(
         allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
         stretches = _stretches(scene, end, state, save)
         if stretches > 1:
-            return _in_stretches(scene, end / stretches, stretches, state, solver, chosen, adjoint, turns, allowed)
+            return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, turns, allowed)
         begun = time.perf_counter()
         found = integrate(scene, end, state, solver, chosen, adjoint, kept, turns, allowed, progress)
         if traced(found.steps):
@@ -143,26 +148,31 @@ def simulate(
     elif controller is not None or not (known if estimate is None else estimate):
         found = run(control)
     else:
-        coarse = run(_coarser(control))
-        found = run(control)
-        found = _with(found, error=_difference(scene, found, coarse) * _shrink(control, _coarser(control)))
+        coarse, found = run(_coarser(control)), run(control)
+        found = _compared(scene, found, coarse, control, _coarser(control), [coarse])
     if throw and not traced(found.steps):
         _raise_if_failed(found, max_steps, accuracy)
     return found
 
 
-def _control(end: Array, tolerance: Any, accuracy: Any, steps: Any, controller: Any) -> StepControl:
+def _control(end: Array, tolerance: Any, accuracy: Any, steps: Any, controller: Any, estimate: bool | None) -> StepControl:
     """What was asked for, checked: at most one of the ways to choose steps, and none the dtype cannot deliver."""
     given = {"tolerance": tolerance, "accuracy": accuracy, "steps": steps, "controller": controller}
     named = [name for name, value in given.items() if value is not None]
     if len(named) > 1:
         raise InputError(named[1], f"is given together with {named[0]}; give one of them")
+    if estimate and controller is not None:
+        raise InputError("estimate", "is True together with a controller, whose steps nobody can make larger; give a tolerance")
+    if estimate is False and accuracy is not None:
+        raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a tolerance")
     precision = float(jnp.finfo(end.dtype).eps)
     for name, value, low in (("tolerance", tolerance, 10.0 * precision), ("accuracy", accuracy, 1e3 * precision)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value < 1.0):
+        plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if value is not None and not (plain and low <= value < 1.0):
             raise InputError(
                 name,
                 f"is {value!r}; in {end.dtype} it must be at least {low:.1g} and less than 1"
+                + ("" if plain else ", a number of Python's own such as 1e-6")
                 + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
             )
     if steps is not None:
@@ -178,7 +188,7 @@ def _coarser(control: StepControl) -> StepControl:
     if control.steps is not None:
         return StepControl(steps=jnp.ceil(control.steps / 2.0))
     assert control.tolerance is not None
-    return StepControl(tolerance=jnp.minimum(_COARSER * control.tolerance, 0.1))
+    return StepControl(tolerance=jnp.minimum(_COARSER * control.tolerance, jnp.sqrt(control.tolerance)))
 
 
 def _shrink(fine: StepControl, coarse: StepControl) -> Array:
@@ -190,38 +200,30 @@ def _shrink(fine: StepControl, coarse: StepControl) -> Array:
     return (fine.tolerance / coarse.tolerance) ** 0.6
 
 
-def _difference(scene: Scene, fine: Run, coarse: Run) -> Array:
-    """How far two runs are apart over the window at their end: displacements and velocities relative to the largest, angles in
-    rad, speeds relative to the rotor's."""
-    xp = jnp if traced(fine.steps) else np
-    a, b = fine.window.state, coarse.window.state
-    unit, speed = natural_units(scene), xp.asarray(scene.drive.speed)
-
-    def apart(x: Any, y: Any, scale: Any) -> Any:
-        with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
-            return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / scale
-
-    parts = [
-        apart(a.displacement, b.displacement, xp.maximum(xp.max(xp.abs(xp.asarray(a.displacement))), unit.displacement)),
-        apart(a.velocity, b.velocity, xp.maximum(xp.max(xp.abs(xp.asarray(a.velocity))), unit.velocity)),
-        *(apart(x, y, 1.0) for x, y in zip(a.angle, b.angle, strict=True)),
-        *(apart(x, y, speed) for x, y in zip(a.rate, b.rate, strict=True)),
-    ]
-    if a.rotor is not None and b.rotor is not None:
-        parts += [apart(a.rotor[0], b.rotor[0], 1.0), apart(a.rotor[1], b.rotor[1], speed)]
-    return jnp.asarray(xp.max(xp.stack(parts)), fine.error.dtype)
+def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: list[Run]) -> Run:
+    """The finer run with its estimated error, and what it and the runs `before` it cost."""
+    # A run that is compared with itself, or with one that failed, has an error that nobody knows.
+    known = coarse.status == RunStatus.done
+    if control.steps is not None:
+        known = known & (control.steps != coarser.steps)
+    ours, theirs = fine.window.state, coarse.window.state
+    theirs = turned(theirs, ours) if wraps(scene, fine.error.dtype)[0] else theirs
+    error = distance(ours, theirs, scales(ours, natural_units(scene))) * _shrink(control, coarser)
+    error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
+    evaluations = sum((run.evaluations for run in before), fine.evaluations)
+    return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
 
 
 def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
     """Runs with ever smaller tolerances until the estimated error is small enough."""
     floor = 10.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     before, coarse = run(_coarser(control)), _coarser(control)
-    found = before
+    found, tried = before, [before]
     for _ in range(_ATTEMPTS - 1):
-        found = run(control)
+        latest = run(control)
+        found = _compared(scene, latest, before, control, coarse, tried)
         if not bool(found.status == RunStatus.done):
             return found
-        found = _with(found, error=_difference(scene, found, before) * _shrink(control, coarse))
         tolerance = float(cast(Array, control.tolerance))
         if float(found.error) <= accuracy:
             return found
@@ -229,26 +231,28 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
-        before, coarse = found, control
+        before, coarse = latest, control
+        tried.append(latest)
         control = StepControl(tolerance=jnp.asarray(max(share * tolerance, floor), found.error.dtype))
     return eqx.tree_at(lambda r: r.status, found, RunStatus.not_accurate)
 
 
 def _with(run: Run, **values: Any) -> Run:
-    return dataclasses.replace(run, **{name: jnp.asarray(value, run.error.dtype) for name, value in values.items()})
+    return dataclasses.replace(run, **{name: jnp.asarray(value, getattr(run, name).dtype) for name, value in values.items()})
 
 
 def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
     """Into how many stretches a run is cut: more than one in single precision, where time would lose its digits."""
     if state.displacement.dtype.itemsize >= 8 or save != "window" or not isinstance(scene.drive, ConstantSpeed):
         return 1
-    turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
-    return 1 if traced(turns) else max(1, math.ceil(float(turns) / _STRETCH))
+    if any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state))):
+        return 1
+    return max(1, math.ceil(float(end * fastest_and_slowest(scene)[0]) / (2.0 * math.pi * _STRETCH)))
 
 
 def _in_stretches(
     scene: Scene,
-    length: Array,
+    end: Array,
     number: int,
     state: State,
     solver: Any,
@@ -257,19 +261,18 @@ def _in_stretches(
     turns: int,
     max_steps: int,
 ) -> Run:
-    """The run of the last of several stretches, each starting at time 0 with angles within a turn."""
+    """The run of the last of several stretches; each begins at time 0 after whole turns of the rotor, angles within one."""
     begun = time.perf_counter()
     if isinstance(controller, StepControl) and controller.steps is not None:
         controller = StepControl(steps=jnp.ceil(controller.steps / number))
-    _, together = wraps(scene, length.dtype)
+    length = whole_turns(scene, float(end) / number)
+    last = float(end) - (number - 1) * length
     taken, rejected, evaluations = 0, 0, 0
     found = None
-    for _ in range(number):
-        found = integrate(scene, length, state, solver, controller, adjoint, 0, turns, max_steps, False)
-        last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), found.window.state)
-        first = np.ravel(last.angle[0])[0]
-        inside = tuple(np.asarray(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi))) for x in last.angle)
-        state = jax.tree.map(jnp.asarray, eqx.tree_at(lambda y: y.angle, last, inside))
+    for k in range(number):
+        span = jnp.asarray(length if k < number - 1 else last, end.dtype)
+        found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, False)
+        state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
         evaluations += int(found.evaluations)
         if not bool(found.status == RunStatus.done):
@@ -279,6 +282,21 @@ def _in_stretches(
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
     return _with(found, seconds=time.perf_counter() - begun)
+
+
+def whole_turns(scene: Scene, stretch: float) -> float:
+    """The longest time within `stretch`, s, after which a rotor of constant speed is where it was; a turn at least."""
+    turn = 2.0 * math.pi / float(scene.drive.speed)
+    return max(math.floor(stretch / turn), 1) * turn
+
+
+def last_state(scene: Scene, run: Run) -> State:
+    """Where a run under a constant speed ended, as a state to go on from: angles within a turn keep their digits."""
+    last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), run.window.state)
+    _, together = wraps(scene, last.displacement.dtype)
+    first = np.ravel(last.angle[0])[0]
+    inside = tuple(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi)) for x in last.angle)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))
 
 
 def _enough_samples(scene: Scene, end: Array) -> int:
@@ -301,12 +319,15 @@ def enough_steps(scene: Scene, end: Array) -> int:
 def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
     if bool(run.status == RunStatus.done):
         return
-    names = ("max_steps_reached", "not_finite", "no_start", "not_accurate")
+    names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_accurate")
     name = next(name for name in names if bool(run.status == getattr(RunStatus, name)))
-    reached = np.asarray(run.window.time)
-    reached = reached[np.isfinite(reached)]
-    where = f" at t = {reached[-1]:.6g} s" if name == "not_finite" and reached.size else ""
-    hint = f"{run.message}{where}"
+    kept = run.window if run.trajectory is None else run.trajectory
+    times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
+    hint = run.message
+    if not bool(np.all(finite)) and bool(np.any(finite)):
+        hint += f", after t = {times[finite][-1]:.6g} s"
+    if name == "no_step":
+        hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
         hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
     if name == "not_accurate":

@@ -7,6 +7,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
@@ -17,13 +18,15 @@ from jaxvib.machine.units import Number, numbers, traced
 from jaxvib.motion.dynamics import State
 from jaxvib.steady.jam import jam_modes
 
-__all__ = ["Start", "brought_up", "initial_state", "whole_state"]
+__all__ = ["Start", "brought_up", "initial_state", "require_numbers", "whole_state"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
 
 
-def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Number | None = None) -> State:
+def initial_state(
+    scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Number | None = None, throw: bool = True
+) -> State:
     """A state to start from.
 
     **Arguments**
@@ -33,6 +36,7 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
     - `mode`: number of the jam mode, for "jam"
     - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam, where
       the platforms go with the mean angle; loads that touch each other lie side by side there)
+    - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
 
@@ -68,7 +72,7 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
         raise InputError(
             "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
         )
-    jam = jam_modes(scene).select(mode)
+    jam = jam_modes(scene).select(mode, throw=throw)
     angle = phases(0.0)
     displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
     return State(
@@ -77,6 +81,13 @@ def initial_state(scene: Scene, start: Start = "rest", *, mode: int | None = Non
         (angle,),
         (jnp.full((n,), jam.omega),),
     )
+
+
+def require_numbers(scene: Scene) -> None:
+    """**Raises** `InputError` for a scene that holds NaN: with it every step would be refused."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
+        if not traced(leaf) and np.any(np.isnan(leaf)):
+            raise InputError(f"scene{jax.tree_util.keystr(path)}", "is not a number (nan); give one, see how it was computed")
 
 
 def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:

@@ -107,7 +107,7 @@ def swing(
     viscous: Number,
     dry: Number | None = None,
     width: Number | None = None,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = 2**17,
@@ -125,7 +125,8 @@ def swing(
     - `viscous` mu1, N m s; `dry` mu2, no unit (about 0.0015 for ball bearings); left out, there is no dry friction
     - `width` rad/s of the passage through 0 of the sign of sliding; unless said otherwise a twentieth of the dead zone's
       angle times the natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less
-    - `tolerance` of a step, relative, and in rad; `solver`, `adjoint` diffrax's; `max_steps`
+    - `tolerance` of a step, relative, and in rad, 1e-9 unless said otherwise, in single precision 1e-5; `solver`, `adjoint`
+      diffrax's; `max_steps`
     - `throw`: raise where the steps do not suffice; otherwise, and under a JAX transformation, the status says so
 
     **Returns** `Swing`; gradients, forward (with `adjoint=diffrax.ForwardMode()`) and reverse, `jit` and `vmap` go through it.
@@ -158,7 +159,7 @@ def swing(
         number(viscous, "N m s", "viscous", low=0.0),
         friction,
         None if width is None else number(width, "rad/s", "width", low=0.0, open_low=True),
-        tolerance,
+        (1e-9 if times.dtype.itemsize >= 8 else 1e-5) if tolerance is None else tolerance,
         diffrax.Tsit5() if solver is None else solver,
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         count(max_steps, "max_steps"),

@@ -15,9 +15,11 @@ import numpy as np
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, number
+from jaxvib.machine.units import Number, count, number
+from jaxvib.motion.distance import distance, scales, turned
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.envelope import envelope
+from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
@@ -77,13 +79,18 @@ def accuracy(
     Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer
     is left out, and the result says why.
 
-    **Arguments**: `mode` a jam mode (the highest there is with a rising slope unless said otherwise); `until` s or text;
-    unless said otherwise 20 slow periods, and for a jam besides as long as its slowest Floquet multiplier needs to forget
-    the start to the tolerance of the run; `tolerances` of time integration; `solvers` its methods, names from `SOLVERS`;
-    `repeats` how often each is timed (less often where it takes seconds), the fastest counts.
+    **Arguments**
 
-    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, a scene in single precision, a gradient
-    of a scene without an exact jam; as `jam_modes`, `simulate` besides.
+    - `quantity`: one of `QUANTITIES`
+    - `mode`: a jam mode; unless said otherwise the second highest there is with a rising slope, for in the highest the loads
+      turn with the rotor but for a small slip; where there is one only, that one
+    - `until`: s or text; unless said otherwise 20 slow periods, and for a jam besides as long as its slowest Floquet multiplier
+      needs to forget the start to the tolerance of the run
+    - `tolerances` of time integration, one at least; `solvers`: its methods, names from `SOLVERS`
+    - `repeats`: how often each is timed (less often where it takes seconds), the fastest counts
+
+    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
+    gradient of a scene without an exact jam; as `jam_modes`, `simulate` besides.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -92,12 +99,17 @@ def accuracy(
     >>> cost = jv.accuracy(scene, "amplitude", mode=1, tolerances=(1e-6,), solvers=["default"], repeats=1)
     >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
     ('exact orbit', True)
+
+    Source: ours; the tiers have theirs, see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
     """
     if quantity not in QUANTITIES:
         raise InputError("quantity", f"is {quantity!r}; it must be one of {', '.join(QUANTITIES)}")
     unknown = [name for name in solvers if name not in SOLVERS]
     if unknown or not solvers:
         raise InputError("solvers", f"are {list(solvers)!r}; name some of {', '.join(SOLVERS)}")
+    if not tolerances:
+        raise InputError("tolerances", f"are {tuple(tolerances)!r}; name one at least, such as 1e-6")
+    count(repeats, "repeats")
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     if scene.drive.speed.dtype.itemsize < 8:
@@ -118,6 +130,10 @@ def accuracy(
     return _steady(ask, quantity, jam, end)
 
 
+_Way = tuple[str, str, str, Callable[..., Any]]
+"""Tier, method and setting in words, and the gradient at stiffnesses."""
+
+
 class _Ask(NamedTuple):
     scene: Scene
     tolerances: tuple[float, ...]
@@ -133,7 +149,7 @@ class _Jam(NamedTuple):
     coarse: Orbit
 
     def length(self, scene: Scene, tolerance: float) -> float:
-        """How long a run takes to forget its start to the tolerance, s, the measuring window after that."""
+        """How long a run takes to forget its start to the tolerance, s, the measuring window after that; of a stable jam."""
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
         window = _slow_period(scene) * _SLOW_PERIODS
         return min(window + np.log(1.0 / tolerance) / rate, _slow_period(scene) * _MOST_PERIODS)
@@ -282,37 +298,30 @@ def _final_state(ask: _Ask, end: float | None) -> Cost:
     end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
     best = functools.cache(lambda: simulate(ask.scene, end, save="window", tolerance=1e-13))
 
+    @functools.cache
+    def scale() -> State:
+        return scales(best().window.state, natural_units(ask.scene))
+
     def error(run: Run) -> float:
-        return _largest(_scaled(ask.scene, run) - _scaled(ask.scene, best()))
+        last, exact = _last(run), _last(best())
+        single = run.error.dtype.itemsize < 8  # of its angles whole turns are not known
+        value = float(distance(turned(last, exact) if single else last, exact, scale()))
+        return value if np.isfinite(value) else np.inf
 
     rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)
     reason = "leading order, exact orbit, envelope: they know no phase, which is a part of the final state"
-    return Cost("final_state", _scaled(ask.scene, best()).tolist(), float(best().error), rows, (reason,))
+    parts = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(best()), scale()))
+    return Cost("final_state", np.concatenate(parts).tolist(), float(best().error), rows, (reason,))
 
 
-def _scaled(scene: Scene, run: Run) -> np.ndarray:
-    """The final state in the units of a `Run`'s error: the largest displacement and velocity, 1 rad, the rotor's speed."""
-    state, last = run.window.state, jax.tree.map(lambda leaf: np.asarray(leaf[-1], float), run.window.state)
-    speed = float(scene.drive.speed)
-    parts = [last.displacement / np.max(np.abs(state.displacement)), last.velocity / np.max(np.abs(state.velocity))]
-    parts += [*last.angle, *(rate / speed for rate in last.rate)]
-    if last.rotor is not None:
-        parts += [last.rotor[0], last.rotor[1] / speed]
-    return np.concatenate([np.ravel(part) for part in parts])
-
-
-def _largest(difference: np.ndarray) -> float:
-    value = float(np.max(np.abs(difference)))
-    return value if np.isfinite(value) else np.inf
+def _last(run: Run) -> State:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[-1], float), run.window.state)
 
 
 def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
     mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
     stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
-    end = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
     few, more, most = (_whole(scene, points) for points in (16, 24, 32))
-    tolerance = f"{_GRADIENT_TOLERANCE:.0e}"
-    max_steps = min(enough_steps(scene, jnp.asarray(end)), _MOST_NOTED)
 
     def at(k: Any) -> Scene:
         return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
@@ -323,13 +332,8 @@ def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
     def leading(k: Any) -> Any:
         return jnp.max(jam_modes(at(k)).select(mode).amplitude)
 
-    def full(k: Any, adjoint: Any = None) -> Any:
-        asked = dict(start="jam", mode=mode, save="window", tolerance=_GRADIENT_TOLERANCE, max_steps=max_steps, throw=False)
-        return jnp.max(simulate(at(k), end, adjoint=adjoint, **asked).amplitude)  # pyright: ignore[reportArgumentType]
-
     fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
-    value = eqx.filter_jit(full)
-    ways: list[tuple[str, str, str, Callable[..., Any]]] = [
+    ways: list[_Way] = [
         ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
         ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
     ]
@@ -342,16 +346,31 @@ def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
         if not bool(jam.fine.stable):
             left_out = [_unstable("full", jam)]
         else:
-            ways += [
-                ("full", "forward", tolerance, jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
-                ("full", "reverse", tolerance, jax.jit(jax.grad(full))),
-                ("full", "finite differences", tolerance, lambda k: _differences(value, k)),
-            ]
+            ways += _by_runs(scene, at, jam, end)
     rows = [
         row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
         for tier, method, setting, f in ways
     ]
     return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
+
+
+def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: _Jam, end: float | None) -> list[_Way]:
+    """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
+    until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
+    max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
+
+    def full(k: Any, adjoint: Any = None) -> Any:
+        asked = dict(save="window", tolerance=_GRADIENT_TOLERANCE, max_steps=max_steps, throw=False)
+        run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
+        return jnp.max(run.amplitude)
+
+    value = eqx.filter_jit(full)
+    ways: list[tuple[str, Callable[..., Any]]] = [
+        ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
+        ("reverse", jax.jit(jax.grad(full))),
+        ("finite differences", lambda k: _differences(value, k)),
+    ]
+    return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
 
 
 def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:

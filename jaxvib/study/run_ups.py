@@ -17,6 +17,7 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.units import Number, count, number, numbers
 from jaxvib.motion.regime import REGIMES, Regime, RegimeName
+from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
 
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["RunUps", "run_ups"]
+
+_FAILED = "failed"
+"""The word for a run that did not reach its end: it has no kind of motion."""
+
+_TOLERANCE = 1e-7
+"""Error of a step in double precision: enough to name a motion."""
 
 _FEWEST = 2**20
 """Steps that a run may take at least, so that run-ups of any usual length share one program."""
@@ -33,8 +40,8 @@ class RunUps(NamedTuple):
     """What became of run-ups over nd drags and ns starts.
 
     **Attributes**: `drag` (nd,) b_W N s/m; `angle` (ns, count) rad, where the loads started; `regime` a `Regime` whose arrays
-    have the leading axes (nd, ns); `kind` (nd, ns) the regime's word; `omega` (nd, ns) mean speed of the loads, rad/s;
-    `finished` (nd, ns) whether the run reached its end.
+    have the leading axes (nd, ns); `kind` (nd, ns) the regime's word, or "failed" where the run did not reach its end; `omega`
+    (nd, ns) mean speed of the loads, rad/s, NaN where it failed; `finished` (nd, ns) whether it reached its end.
     """
 
     drag: np.ndarray
@@ -45,17 +52,20 @@ class RunUps(NamedTuple):
     finished: np.ndarray
 
     def fraction(self, kind: str) -> np.ndarray:
-        """Share of the starts (nd,) that came to a `kind` of motion."""
-        if kind not in REGIMES:
-            raise InputError("kind", f"is {kind!r}; allowed: {', '.join(REGIMES)}")
+        """Share of the starts (nd,) that came to a `kind` of motion, or whose runs "failed".
+
+        **Raises** `InputError` for another word.
+        """
+        if kind not in (*REGIMES, _FAILED):
+            raise InputError("kind", f"is {kind!r}; allowed: {', '.join((*REGIMES, _FAILED))}")
         return np.mean(self.kind == kind, axis=1)
 
     def summary(self) -> str:
-        """A line for each drag: shares of the kinds of motion that its starts came to, and where they jammed."""
+        """A line for each drag: shares of the kinds of motion that its starts came to, where they jammed, and what failed."""
         lines = [f"of {len(self.angle)} starts at each drag"]
         for k, drag in enumerate(self.drag):
             said = []
-            for kind in (kind for kind in REGIMES if np.any(self.kind[k] == kind)):
+            for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
                 speeds = self.omega[k][self.kind[k] == kind]
                 at = f" at {_span(speeds)} rad/s" if kind == "jammed" else ""
                 said.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
@@ -63,9 +73,10 @@ class RunUps(NamedTuple):
         return "\n".join(lines)
 
     def plot(self) -> Figure:
-        """Shares of the kinds of motion, and the speeds of the loads, over drag."""
-        shares = {kind: self.fraction(kind) for kind in REGIMES if np.any(self.kind == kind)}
-        return regime_chart(self.drag, shares, self.omega, float(np.max(self.regime.rotor_speed)))
+        """Shares of the kinds of motion, and the speeds of the loads, over drag. **Returns** a matplotlib figure."""
+        shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
+        rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
+        return regime_chart(self.drag, shares, self.omega, float(rotor))
 
 
 def _span(values: np.ndarray) -> str:
@@ -82,7 +93,7 @@ def run_ups(
     starts: int | None = None,
     seed: int = 0,
     angles: Sequence[Sequence[float]] | None = None,
-    tolerance: float = 1e-7,
+    tolerance: float | None = None,
     batch: int = 16,
     max_steps: int | None = None,
 ) -> RunUps:
@@ -94,10 +105,14 @@ def run_ups(
     - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
     - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
       rad. Without either all loads start together at the bottom
-    - `tolerance`: error of a step, as `simulate`; `batch`: so many runs go side by side
+    - `tolerance`: error of a step, as `simulate`; 1e-7 unless said otherwise, in single precision what `simulate` takes
+    - `batch`: so many runs go side by side
+    - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
 
     **Returns** `RunUps`, whose `fraction` says how many of the starts came to a kind of motion. From few starts a share is
-    known to 1 / sqrt(starts) only. **Raises** `InputError` for values that are not allowed.
+    known to 1 / sqrt(starts) only. A run that fails raises nothing: it is counted as "failed".
+
+    **Raises** `InputError` for values that are not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -138,11 +153,13 @@ def run_ups(
     shape = (len(drags), len(sets))
     size = min(batch, shape[0] * shape[1])
     end = number(until, "s", "until", low=0.0, open_low=True)
+    if tolerance is None and end.dtype.itemsize >= 8:
+        tolerance = _TOLERANCE
     if max_steps is None:
         max_steps = max(_FEWEST, enough_steps(scene, end))
     named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
     code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
-    kind = np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)]
+    kind = np.where(np.asarray(finished), np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)], _FAILED)
 
     def folded(leaf: Array) -> Array:
         return leaf.reshape(shape + leaf.shape[1:])
@@ -159,13 +176,14 @@ def run_ups(
 
 @eqx.filter_jit
 def _all(
-    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, tolerance: float, max_steps: int
+    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, tolerance: float | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
     def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
         drag, angle = lane
         this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
         start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
         run = simulate(this, until, start=start, save="window", tolerance=tolerance, max_steps=max_steps, throw=False)
-        return run.regime, run.omega, jnp.isfinite(run.omega)
+        finished = run.status == RunStatus.done
+        return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
 
     return jax.lax.map(one, lanes, batch_size=batch)

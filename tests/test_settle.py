@@ -1,0 +1,91 @@
+"""Runs until nothing changes: where they end, and how they go on from stretch to stretch."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.motion.simulate import last_state, whole_turns
+
+
+def test_settle_names_a_motion_that_left_its_mode():
+    s = scene("two_mass", speed=150.0)
+    with pytest.raises(jv.ComputationError) as caught:
+        jv.settle(s, mode=4)
+    assert caught.value.status == "left_mode"
+
+
+def test_settle_does_not_pass_a_jam_that_only_glued_loads_keep():
+    """By slope mode 5 is stable; two balls in it part, and balance the rotor."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    s = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=5.0), jv.ConstantSpeed(100.0))
+    assert bool(jv.jam_modes(s).select(3).stable)
+    with pytest.raises(jv.ComputationError) as caught:
+        jv.settle(s, mode=3)
+    assert caught.value.status in ("left_mode", "not_settled")
+
+
+def test_a_stretch_goes_on_where_the_last_one_ended():
+    """Under an imbalance too: the rotor is where it was after whole turns, and every load where it is within a turn."""
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    loads = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=1.94)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance("8 g m"),))
+    start = jv.initial_state(s, angles=[0.3, 2.0])
+    stretch = whole_turns(s, 0.2)
+    assert stretch <= 0.2 and abs(np.sin(460.0 * stretch)) < 1e-12
+    given = dict(save="window", tolerance=1e-11, estimate=False)
+    once = jv.simulate(s, 2.0 * stretch, start=start, **given).window.state
+    first = last_state(s, jv.simulate(s, stretch, start=start, **given))
+    assert float(jnp.max(jnp.abs(first.angle[0]))) <= np.pi
+    twice = jv.simulate(s, stretch, start=first, **given).window.state
+    np.testing.assert_allclose(twice.displacement[-1], once.displacement[-1], rtol=1e-6)
+    np.testing.assert_allclose(np.sin(twice.angle[0][-1]), np.sin(once.angle[0][-1]), atol=1e-6)
+
+
+def test_balls_that_touch_settle_side_by_side():
+    """They start beside each other, however large they are, and go on in their order: nothing presses them apart."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, own_radius=0.03)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), effects=(jv.LoadContact(1e5, 200.0),))
+    run = jv.settle(s, mode=1, drift=1e-3, periods=20, stretches=8)
+    angle = np.asarray(run.window.state.angle[0])
+    ahead, beside = angle[:, 1] - angle[:, 0], 2.0 * np.arcsin(0.03 / 0.1)
+    assert np.all(np.abs(ahead - beside) < 0.1), (ahead.min(), ahead.max(), beside)
+
+
+def test_settle_starts_from_rest_where_no_mode_is_named():
+    s = scene("one_mass", "rollers", speed=20.0)
+    run = jv.settle(s)
+    assert float(run.drift) < 1e-6 and np.isnan(run.error) and "error not estimated" in run.summary()
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), s)
+        run = jv.settle(single)
+        assert run.omega.dtype == jnp.float32 and float(run.drift) < 1e-3
+
+
+def test_settle_stops_where_a_stretch_fails():
+    soft = scene("one_mass", "rollers", speed=60.0, effects=(jv.CubicSupport(-4e9),))
+    start = jv.State(jnp.asarray([0.01]), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
+    run = jv.settle(soft, start=start, periods=1, throw=False)
+    assert not bool(run.status == jv.RunStatus.done) and not bool(run.status == jv.RunStatus.no_start)
+
+
+def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
+    """A long run in stretches ends where a run in double precision does, with the rotor's imbalance where it was."""
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    loads = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=1.94)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance("4 g m"),))
+    start = eqx.tree_at(lambda y: y.rate, jv.initial_state(s, angles=[1.5, -2.0]), (jnp.full(2, 460.0),))
+    exact = jv.simulate(s, 3.0, start=start, save="window", estimate=False)
+    monkeypatch.setattr("jaxvib.motion.simulate._STRETCH", 60.0)
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (s, start))
+        run = jv.simulate(single[0], 3.0, start=single[1], save="window", estimate=False)
+        phase, unbalance = run.regime.phase, run.regime.unbalance
+    np.testing.assert_allclose(run.window.time[-1], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * exact.regime.phase), atol=1e-2)
+    np.testing.assert_allclose(unbalance, exact.regime.unbalance, atol=1e-2)
+    assert not np.allclose(np.exp(1j * phase), 1.0, atol=0.3)
