@@ -3,8 +3,11 @@
     python benchmarks/rotor.py
 
 The native loop (numba) has the paper's equations written by hand, the pendulums eliminated one by one, 4 equations left; its
-method is Dormand and Prince's pair of order 8(7) with the same step control. The error of a run is that of the pendulums'
-angles at its end against the native loop at a tolerance of 1e-13. Compile time is told apart; of 5 runs the fastest counts.
+method is Dormand and Prince's pair of order 8(7). Its step control is a PI controller too, in the same units, but one of its
+own: the norm is the root of the mean square (that of `simulate` is the largest part), the powers of the errors of this step and
+the one before are 0.6/8 and 0.2/8 (3/32 and 1/16), and a step grows 10 times at most (5 times). So one tolerance is not one
+error, and times are compared at equal errors. The error of a run is that of the pendulums' angles at its end against the native
+loop at a tolerance of 1e-13. Compile time is told apart; of 5 runs the fastest counts.
 """
 
 from __future__ import annotations

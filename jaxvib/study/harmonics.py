@@ -58,6 +58,8 @@ def harmonic_convergence(
     >>> found = harmonic_convergence(form.scene(), [0.97], points=(4, 8))
     >>> [bool(error < most) for error, most in zip(found.error[:, 0], (1e-4, 1e-10))]
     [True, True]
+
+    Source: ours, on `jam_orbit`.
     """
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {points!r}; give numbers of points in ascending order")

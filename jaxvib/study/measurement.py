@@ -16,6 +16,10 @@ from jaxvib.study.record import Record, read_record
 __all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
 
 
+_FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
+"""What a record's fields are called in a file, where `from` is no word of Python's, and here."""
+
+
 class Measurement(NamedTuple):
     """What `identify` is called with: `pendulum`, `record`, `dry`, `instrument`."""
 
@@ -28,7 +32,17 @@ class Measurement(NamedTuple):
 def measurement_from_tables(tables: Mapping[str, Any], folder: Path) -> Measurement:
     """A measurement from the tables [record], [pendulum], [identify] of a file in `folder`, see `TEMPLATE`.
 
-    **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not allowed.
+    **Arguments**: `tables` as TOML reads them; `folder` in which the record's file is looked for.
+
+    **Returns** `Measurement`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are
+    not allowed.
+
+    >>> import pathlib
+    >>> rod = {"mass": 0.3, "length": "25 cm"}
+    >>> measurement_from_tables({"record": {"file": "swing.csv", "form": 1.0}, "pendulum": rod}, pathlib.Path())
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: record.form is no field here; did you mean 'from'? allowed: file, columns, angle_unit, from, until
     """
     names = ["record", "pendulum", "identify"]
     for name, table in tables.items():
@@ -38,8 +52,11 @@ def measurement_from_tables(tables: Mapping[str, Any], folder: Path) -> Measurem
             raise InputError(name, f"is {table!r}; it must be a table, write [{name}]")
     pendulum = called(BearingPendulum, tables.get("pendulum", {}), "pendulum")
     asked = called(_asked, tables.get("identify", {}), "identify")
-    part = {"from_" if name == "from" else name: value for name, value in tables.get("record", {}).items()}
-    record = called(_record, part, "record")(folder)
+    part = tables.get("record", {})
+    for name in part:
+        if name not in _FIELDS:
+            raise InputError(f"record.{name}", f"is no field here; {closest(name, list(_FIELDS))}")
+    record = called(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
     return Measurement(pendulum, record, *asked)
 
 

@@ -53,6 +53,8 @@ def stability_map(
     >>> chart = stability_map(machine, [0.01, 0.05], omega=(0.36, 0.5), points=60)
     >>> [[p.kind for p in points] for points in chart.special]
     [['fold'], ['fold', 'torus']]
+
+    Source: ours, on the diagrams of `exact_branches`.
     """
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
@@ -84,7 +86,16 @@ def onset(
     with one; `omega` the range of load speeds that it is looked for in, rad/s; `points` of each diagram; `accuracy` of x,
     relative.
 
-    **Returns** x. **Raises** `InputError` where the ends do not differ.
+    **Returns** x, too large by `accuracy` at most. **Raises** `InputError` where the ends do not differ.
+
+    >>> import jaxvib as jv
+    >>> def machine(eps):
+    ...     return jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                             rho=1.0, eps=eps, beta=1.0, speed=2.0).scene()
+    >>> round(onset(machine, "torus", (0.02, 0.05), omega=(0.36, 0.5), points=60, accuracy=0.5), 4)
+    0.0398
+
+    Source: ours, on the diagrams of `exact_branches`.
     """
 
     def there(x: float) -> bool:

@@ -67,6 +67,8 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
     >>> tiers = compare_tiers(form.scene(), (0.1, 1.0, 10.0), mode=3)
     >>> [f"{abs(a / b - 1):.0e}" for a, b in zip(tiers.leading.omega, tiers.exact.omega)]
     ['1e-06', '1e-05', '1e-04']
+
+    Source: the leading order is the antiphase paper's, see `jam_modes`; the comparison is ours.
     """
     loads = jammed_loads(scene)
     answers: list[tuple[Jam, Orbit]] = []
