@@ -50,6 +50,7 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
     assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
 
 
+@pytest.mark.slow
 def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
     """Nor is it asked how long a run would need to forget its start: less than no time."""
     scene = jv.Scene(light().machine, light().loads, jv.ConstantSpeed("40 rad/s"))

@@ -86,7 +86,7 @@ def initial_state(
 def require_numbers(scene: Scene) -> None:
     """**Raises** `InputError` for a scene that holds NaN: with it every step would be refused."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
-        if not traced(leaf) and np.any(np.isnan(leaf)):
+        if eqx.is_array(leaf) and not traced(leaf) and np.any(np.isnan(leaf)):
             raise InputError(f"scene{jax.tree_util.keystr(path)}", "is not a number (nan); give one, see how it was computed")
 
 
