@@ -150,7 +150,6 @@ def envelope(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
-    require_numbers(scene)
     averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
@@ -342,6 +341,7 @@ def _finite(tree: Any) -> Array:
 def _raise_if_failed(run: Envelope, max_steps: int) -> None:
     if bool(run.status == EnvelopeStatus.done):
         return
+    require_numbers(run.scene)
     names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_turning")
     name = next(name for name in names if bool(run.status == getattr(EnvelopeStatus, name)))
     hint = {

@@ -112,7 +112,6 @@ def simulate(
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
-    require_numbers(scene)
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
     control = _control(end, tolerance, accuracy, steps, controller, estimate)
@@ -302,7 +301,7 @@ def last_state(scene: Scene, run: Run) -> State:
 def _enough_samples(scene: Scene, end: Array) -> int:
     """So many that a picture shows the vibration and no beat of it with the samples; a power of 2: few compilations."""
     wanted = PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
-    return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(min(max(float(wanted), 2000.0), 2.0**18)))
+    return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(max(min(2.0**18, float(wanted)), 2000.0)))
 
 
 def enough_steps(scene: Scene, end: Array) -> int:
@@ -312,6 +311,7 @@ def enough_steps(scene: Scene, end: Array) -> int:
         return 2**20
     steps = 4096 + 500 * float(turns)
     if not steps <= _MOST_STEPS:
+        require_numbers(scene)
         raise InputError("until", f"is {float(end):g} s, {float(turns):.2g} turns of what moves fastest; run shorter stretches")
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
@@ -319,6 +319,7 @@ def enough_steps(scene: Scene, end: Array) -> int:
 def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
     if bool(run.status == RunStatus.done):
         return
+    require_numbers(run.scene)
     names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_accurate")
     name = next(name for name in names if bool(run.status == getattr(RunStatus, name)))
     kept = run.window if run.trajectory is None else run.trajectory
