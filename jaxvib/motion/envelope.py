@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax import Array
 from jax.extend import core
 
@@ -22,8 +21,9 @@ from jaxvib.motion.averaged import Amplitudes, Averaged, amplitudes_of, averaged
 from jaxvib.motion.dynamics import State
 from jaxvib.motion.engine import moved_on
 from jaxvib.motion.envelopes import Envelope, Envelopes, EnvelopeStatus
+from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.observables import Measured
-from jaxvib.motion.replay import solve
+from jaxvib.motion.replay import Around, solve
 from jaxvib.motion.rosenbrock import Rodas4
 from jaxvib.motion.scalars import MOST_NUMBERS, numbers_of, program_on_numbers
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
@@ -38,29 +38,17 @@ _LONGEST = 256
 """Turns of the rotor that the window is long at most, as in `simulate`."""
 
 
-class _Tolerance(diffrax.AbstractAdaptiveStepSizeController):
+class _Tolerance(Around):
     """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
 
-    inner: diffrax.AbstractStepSizeController
+    controller: Any
     blocks: tuple[int, ...] = eqx.field(static=True)
 
-    @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return getattr(self.inner, "rtol", 0.0)  # a controller without one has no implicit method to serve
-
-    @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return getattr(self.inner, "atol", 0.0)
-
-    @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
-        return getattr(self.inner, "norm", optimistix.rms_norm)
-
     def wrap(self, direction: Any) -> _Tolerance:
-        return _Tolerance(inner=self.inner.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
+        return _Tolerance(controller=self.controller.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
-        return self.inner.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
@@ -72,7 +60,7 @@ class _Tolerance(diffrax.AbstractAdaptiveStepSizeController):
 
         # An error that is not a number would make the next step's length one that is not.
         error = None if y_error is None else jnp.where(jnp.isnan(y_error), jnp.inf, y_error)
-        keep, start, end, jumped, state, result = self.inner.adapt_step_size(
+        keep, start, end, jumped, state, result = self.controller.adapt_step_size(
             t0, t1, sizes(y0), sizes(y1_candidate), args, error, error_order, controller_state
         )
         moved = moved_on(keep, start, t1, end)
@@ -198,7 +186,7 @@ def _run(
 ) -> Envelope:
     begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
-    exists = _finite(begin)
+    exists = is_finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
     field, nd = averaged_field(scene), begin.displacement.shape[0]
     frozen = jax.lax.stop_gradient(scene)
@@ -221,7 +209,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=_Tolerance(inner=controller, blocks=(2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),  # pyright: ignore[reportCallIssue]
+        controller=_Tolerance(controller=controller, blocks=(2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),  # pyright: ignore[reportCallIssue]
         adjoint=adjoint,
         max_steps=max_steps,
     )
@@ -231,7 +219,7 @@ def _run(
         return jax.vmap(lambda t, y: _at(scene, field, t, units.unpack(y, nd)))(times, flat)
 
     kept = envelopes(solution.ts[0], solution.ys[0])
-    finite = _finite(kept)
+    finite = is_finite(kept)
     turning = _turning(scene, field, begin, kept)
     result = solution.result
     failed = EnvelopeStatus.where(result == diffrax.RESULTS.dt_min_reached, EnvelopeStatus.not_finite, EnvelopeStatus.no_step)
@@ -332,10 +320,6 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
 def _units(scene: Scene) -> _Units:
     mass = jnp.mean(jnp.diagonal(scene.machine.carrier().mass))
     return _Units(averaged_loads(scene).unbalance() / mass, scene.drive.speed)
-
-
-def _finite(tree: Any) -> Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
 def _raise_if_failed(run: Envelope, max_steps: int) -> None:

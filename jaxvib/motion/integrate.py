@@ -177,6 +177,6 @@ def _stages(solver: diffrax.AbstractSolver) -> int:
     return 0 if tableau is None else tableau.num_stages - tableau.fsal
 
 
-def is_finite(state: State) -> Array:
-    """Whether every number of a state is."""
+def is_finite(state: Any) -> Array:
+    """Whether every number of a state is, or of another tree."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))

@@ -24,8 +24,8 @@ class Trajectory(eqx.Module):
     """States at some times.
 
     **Attributes** (nt times): `time` (nt,) s; `state` a `State` whose arrays have a leading axis over the times;
-    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_angle` (nt,) rad, within
-    whole turns, and `rotor_speed` (nt,) rad/s.
+    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_angle` (nt,) rad, but
+    for whole turns, and `rotor_speed` (nt,) rad/s.
     """
 
     time: Array

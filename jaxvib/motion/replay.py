@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix
 from jax import Array
 
-__all__ = ["solve"]
+__all__ = ["Around", "solve"]
 
 
 def solve(
@@ -122,23 +122,32 @@ def _along(controller: Any, times: Array) -> Any:
     return _Noted(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
 
 
-class _Noted(diffrax.AbstractAdaptiveStepSizeController):
-    """Takes the steps that end at `times`; tolerances, for implicit methods, are those of `controller`."""
+class Around(diffrax.AbstractAdaptiveStepSizeController):
+    """A controller around another one, whose tolerances it has for implicit methods."""
 
-    controller: Any
-    times: Array
+    controller: eqx.AbstractVar[Any]
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return getattr(self.controller, "rtol", 0.0)  # a controller without one has no implicit method to serve
+        """What an implicit method solves its equations to; a controller without one has no implicit method to serve."""
+        return getattr(self.controller, "rtol", 0.0)
 
     @property
     def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As `rtol`."""
         return getattr(self.controller, "atol", 0.0)
 
     @property
     def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
+        """As `rtol`."""
         return getattr(self.controller, "norm", optimistix.rms_norm)
+
+
+class _Noted(Around):
+    """Takes the steps that end at `times`."""
+
+    controller: Any
+    times: Array
 
     def wrap(self, direction: Any) -> _Noted:
         return self
