@@ -1,5 +1,6 @@
 """Float64, strict promotion of ranks: what a test relies on is said here, never by importing jaxvib."""
 
+import os
 import pathlib
 
 import equinox as eqx
@@ -7,14 +8,16 @@ import jax
 import matplotlib
 import pytest
 
-from jaxvib.backend import prepare_cpu
+from jaxvib.runtime.cpu import prepare_cpu
 
-# Each worker is a process of its own: what is set here is heard.
+# Each worker is a process of its own.
 prepare_cpu()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Workers share what they compile, and a second run of the tests finds it.
-jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(__file__).parent / ".pytest_cache" / "jax"))
+# Workers share what they compile, and so do clones: JAX's key of a program holds the program, the flags and the versions.
+if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "jaxvib" / "tests"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 matplotlib.use("Agg")
 

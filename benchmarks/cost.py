@@ -27,8 +27,8 @@ jax.config.update("jax_enable_x64", True)
 from common import machine_line, published  # noqa: E402
 
 from jaxvib.cli.cost import cost_document, cost_table  # noqa: E402
-from jaxvib.study.cost import WANTED  # noqa: E402
-from jaxvib.study.published_rotor import published_rotor  # noqa: E402
+from jaxvib.study.accuracy.cost import WANTED  # noqa: E402
+from jaxvib.study.maps.published_rotor import published_rotor  # noqa: E402
 
 COARSE = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 

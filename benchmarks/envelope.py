@@ -22,7 +22,7 @@ import numpy as np
 from common import best_in_turn, first, published, say
 
 import jaxvib as jv
-from jaxvib.motion.solver import WrittenOut
+from jaxvib.ode.dopri8 import WrittenOut
 
 BLOCKS, SAMPLES = 64, 2**17
 ALLOWED = 1e-2

@@ -20,10 +20,10 @@ from common import best, first, published, say
 from jax.flatten_util import ravel_pytree
 
 import jaxvib as jv
-from jaxvib.steady.collocation import harmonics_of, periodic_motion
-from jaxvib.steady.folds import jam_rotor_speed
-from jaxvib.steady.grid import grid_of
-from jaxvib.steady.stability import floquet, steps_for
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
+from jaxvib.steady.orbits.floquet import floquet, steps_for
 
 GROUP = "exact orbits, each"
 

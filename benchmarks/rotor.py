@@ -23,7 +23,7 @@ import numba
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.study.published_rotor import published_rotor
+from jaxvib.study.maps.published_rotor import published_rotor
 
 jv.prepare_cpu()
 jax.config.update("jax_enable_x64", True)

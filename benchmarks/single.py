@@ -20,7 +20,8 @@ import numpy as np
 from common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
 
 import jaxvib as jv
-from jaxvib.motion.engine import Motion, Tolerance
+from jaxvib.motion.system import Motion
+from jaxvib.ode.control import Tolerance
 
 
 def integrator(scene: jv.Scene, start: jv.State, controller: str = "equal steps") -> Callable[..., Any]:

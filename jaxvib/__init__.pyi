@@ -1,32 +1,35 @@
 """Differentiable simulation and design of vibration machines that work on the Sommerfeld effect."""
 
-from jaxvib.backend import prepare_cpu
+from jaxvib.equations.averaged import Amplitudes, Averaged, averaged_field
+from jaxvib.equations.dynamics import Dynamics, State, vector_field
+from jaxvib.equations.forces import energy, foundation_force, power
+from jaxvib.equations.linear import natural_frequencies, steady_displacement
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
-from jaxvib.machine.effects import Effect, Friction, Gravity, MomentImbalance, StaticImbalance, Throw
+from jaxvib.machine.effects.base import Effect, Friction, Gravity, MomentImbalance, StaticImbalance, Throw
+from jaxvib.machine.effects.contact import LoadContact
+from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
-from jaxvib.machine.friction import DryFriction
 from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
 from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.supports import CubicSupport, Stop
-from jaxvib.motion.averaged import Amplitudes, Averaged, averaged_field
-from jaxvib.motion.dynamics import Dynamics, State, vector_field
+from jaxvib.motion.analysis.measure import Measured, Trajectory
+from jaxvib.motion.analysis.regime import Regime, RegimeName, regime
 from jaxvib.motion.ensemble import Ensemble, ensemble
-from jaxvib.motion.envelope import envelope
-from jaxvib.motion.envelopes import Envelope, Envelopes, EnvelopeStatus
-from jaxvib.motion.observables import Measured, Trajectory, energy, foundation_force, power
-from jaxvib.motion.regime import PhasePattern, Regime, RegimeName, phase_pattern, regime
+from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
-from jaxvib.motion.swing import BearingPendulum, Swing, SwingStatus, swing
-from jaxvib.steady.balance import (
+from jaxvib.runtime.cpu import prepare_cpu
+from jaxvib.steady.balance.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
+from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.steady.balance.states import (
     BalancedStability,
     BalancedStates,
     BalanceStatus,
@@ -36,27 +39,26 @@ from jaxvib.steady.balance import (
     balanced_states,
 )
 from jaxvib.steady.branches import Branches, branches
-from jaxvib.steady.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
-from jaxvib.steady.diagram import ExactBranches, SpecialPoint
-from jaxvib.steady.folds import Folds, jam_rotor_speed
-from jaxvib.steady.jam import Jam, JamModes, JamStatus, jam_modes
-from jaxvib.steady.jam_orbit import jam_orbit
-from jaxvib.steady.orbit import Orbit, OrbitStatus
-from jaxvib.steady.phase_search import PhaseBranch, PhaseJams, phase_branch, phase_jams
-from jaxvib.steady.phases import PhaseJam, PhaseStatus, phase_jam, phase_torques
-from jaxvib.steady.response import natural_frequencies, steady_displacement
-from jaxvib.steady.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.steady.jams.folds import Folds, jam_rotor_speed
+from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
+from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
+from jaxvib.steady.jams.phase_search import PhaseBranch, PhaseJams, phase_branch, phase_jams
+from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus, phase_jam, phase_torques
+from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus
 from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
-from jaxvib.study.accuracy import accuracy
-from jaxvib.study.cost import Cost, CostRow, cost_figure
-from jaxvib.study.criterion_map import CriterionMap, criterion_map
-from jaxvib.study.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
-from jaxvib.study.harmonics import HarmonicConvergence, harmonic_convergence
-from jaxvib.study.identify import Identified, IdentifyStatus, identify
-from jaxvib.study.onset import StabilityMap, onset, stability_map
-from jaxvib.study.record import Record, read_record
-from jaxvib.study.run_ups import RunUps, run_ups
-from jaxvib.study.tiers import Tiers, compare_tiers
+from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
+from jaxvib.study.accuracy.harmonics import HarmonicConvergence, harmonic_convergence
+from jaxvib.study.accuracy.tiers import Tiers, compare_tiers
+from jaxvib.study.accuracy.work_precision import accuracy
+from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
+from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
+from jaxvib.study.bearing.record import Record, read_record
+from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
+from jaxvib.study.maps.criterion_map import CriterionMap, criterion_map
+from jaxvib.study.maps.run_ups import RunUps, run_ups
+from jaxvib.study.maps.stability_onset import StabilityMap, onset, stability_map
 
 __all__ = [
     "Amplitudes",

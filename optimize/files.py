@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxvib.errors import InputError
 from jaxvib.machine.files import called, closest, load_scene, read_toml
-from jaxvib.machine.units import count, number
+from jaxvib.units import count, number
 from optimize.quantities import (
     Quantity,
     amplitude,

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.linear import loaded_mass
 from jaxvib.errors import InputError
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import FIELD_UNITS
-from jaxvib.steady.jam import Jam, JamModes, jam_modes
-from jaxvib.steady.response import loaded_mass, magnitude
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
+from jaxvib.units import FIELD_UNITS
 
 __all__ = [
     "Quantity",

@@ -16,7 +16,7 @@ import numpy as np
 import optax
 from jax import Array
 
-from jaxvib.steady.jam import jam_modes
+from jaxvib.steady.jams.jam import jam_modes
 from optimize.quantities import Quantity
 from optimize.space import DesignSpace
 

@@ -14,8 +14,8 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import FIELD_UNITS, Number, number
-from jaxvib.steady.jam import JamModes
+from jaxvib.steady.jams.jam import JamModes
+from jaxvib.units import FIELD_UNITS, Number, number
 from optimize.quantities import Quantity
 
 __all__ = ["DesignSpace", "Held", "hold"]

@@ -14,11 +14,11 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import count
-from jaxvib.motion.observables import relative_amplitude
+from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
-from jaxvib.steady.jam import JamStatus, jam_modes
+from jaxvib.steady.jams.jam import JamStatus, jam_modes
+from jaxvib.units import count
 from optimize.quantities import Pair, Quantity, between, force_per_amplitude
 from optimize.search import Search, descend, draw_starts, polish
 from optimize.space import DesignSpace

@@ -27,7 +27,7 @@ def prepare() -> None:
     """Float64, and compiled programs kept on disk so that the second call of a command answers at once."""
     # Equinox turns runtime checks into host callbacks, which keep a program out of the cache; results carry a status instead.
     os.environ.setdefault("EQX_ON_ERROR", "nan")
-    from jaxvib.backend import prepare_cpu
+    from jaxvib.runtime.cpu import prepare_cpu
 
     prepare_cpu()
     import jax
@@ -38,6 +38,6 @@ def prepare() -> None:
         jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxvib"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
-    from jaxvib.programs import keep_programs
+    from jaxvib.runtime.programs import keep_programs
 
     keep_programs(Path(str(jax.config.values["jax_compilation_cache_dir"])) / "programs")

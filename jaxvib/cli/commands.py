@@ -12,7 +12,7 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
-from jaxvib.machine.units import number
+from jaxvib.units import number
 
 if TYPE_CHECKING:
     from optimize import Outcome, Synthesis
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of that KIND of machine, a design file, or a measurement file for `identify`."""
-    from jaxvib.study.measurement import TEMPLATE as MEASUREMENT
+    from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from optimize.files import TEMPLATE as DESIGN
 
     files = {"design": DESIGN, "measurement": MEASUREMENT}

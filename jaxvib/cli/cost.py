@@ -9,8 +9,8 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.study.accuracy import QUANTITIES, SOLVERS
-from jaxvib.study.cost import WANTED, Cost, CostRow
+from jaxvib.study.accuracy.cost import WANTED, Cost, CostRow
+from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 
 
 @app.command("cost")

@@ -11,7 +11,7 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.machine.files import read_toml
-from jaxvib.study.measurement import measurement_from_tables
+from jaxvib.study.bearing.measurement import measurement_from_tables
 
 _NAMED = (
     ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),

@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.machine.units import number
+from jaxvib.units import number
 
 _RPM = 30.0 / np.pi
 

@@ -14,8 +14,8 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, number, numbers
-from jaxvib.machine.units import count as whole
+from jaxvib.units import Number, number, numbers
+from jaxvib.units import count as whole
 
 __all__ = ["Dimensionless"]
 

@@ -13,15 +13,15 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
-from jaxvib.machine.effects import Gravity, MomentImbalance, StaticImbalance
-from jaxvib.machine.friction import DryFriction
+from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.effects.contact import LoadContact
+from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.supports import CubicSupport, Stop
 
 __all__ = [
     "TEMPLATES",

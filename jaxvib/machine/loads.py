@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.units import Number, count, number, numbers, traced
+from jaxvib.units import Number, count, number, numbers, traced
 
 __all__ = ["CircularLoads", "Loads", "balls", "pendulums", "rollers"]
 

@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.units import Number, count, numbers
+from jaxvib.units import Number, count, numbers
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 

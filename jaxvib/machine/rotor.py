@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.units import Number, number, numbers, traced
+from jaxvib.units import Number, number, numbers, traced
 
 __all__ = ["PlanarRotor", "Rotor", "planar_rotor", "rotor"]
 

@@ -7,7 +7,7 @@ import equinox as eqx
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects import Effect
+from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
 
 __all__ = ["Scene"]

@@ -16,14 +16,14 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, count, number, traced
-from jaxvib.motion.distance import distance, scales
-from jaxvib.motion.dynamics import State, vector_field
-from jaxvib.motion.engine import Motion
+from jaxvib.motion.analysis.distance import distance, scales
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wraps
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.system import Motion
+from jaxvib.units import Number, count, number, traced
 
 __all__ = ["Ensemble", "ensemble"]
 

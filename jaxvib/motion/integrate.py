@@ -10,17 +10,18 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.contact import LoadContact
+from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.drive import IdealDrive, Motor
+from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import State, vector_field
-from jaxvib.motion.engine import Motion, Tolerance
-from jaxvib.motion.observables import measure, trajectory
-from jaxvib.motion.progress import ProgressBar
-from jaxvib.motion.replay import solve
+from jaxvib.motion.analysis.measure import measure, trajectory
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.programs import kept
-from jaxvib.steady.response import natural_frequencies
+from jaxvib.motion.system import Motion
+from jaxvib.ode.control import Tolerance
+from jaxvib.ode.progress import ProgressBar
+from jaxvib.ode.replay import solve
+from jaxvib.runtime.programs import kept
 
 __all__ = ["PER_TURN", "WINDOW", "StepControl", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import Motor
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.dynamics import State
-from jaxvib.motion.observables import Measured, Trajectory
-from jaxvib.motion.regime import Regime, regime
+from jaxvib.motion.analysis.measure import Measured, Trajectory
+from jaxvib.motion.analysis.regime import Regime, regime
 
 if TYPE_CHECKING:
     import xarray

@@ -6,16 +6,16 @@ import math
 
 import jax.numpy as jnp
 
+from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import count
-from jaxvib.motion.dynamics import State
 from jaxvib.motion.integrate import fastest_and_slowest, wraps
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
-from jaxvib.steady.jam import jam_modes
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.units import count
 
 __all__ = ["settle"]
 

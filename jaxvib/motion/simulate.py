@@ -15,16 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, count, number, traced
-from jaxvib.motion.distance import distance, scales, turned
-from jaxvib.motion.dynamics import State
+from jaxvib.motion.analysis.distance import distance, scales, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
-from jaxvib.motion.looped import Looped
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
-from jaxvib.machine.contact import LoadContact
 from jaxvib.machine.drive import ConstantSpeed, Motor, SpinUp
+from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, numbers, traced
-from jaxvib.motion.dynamics import State
-from jaxvib.steady.jam import jam_modes
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.units import Number, numbers, traced
 
 __all__ = ["Start", "brought_up", "initial_state", "require_numbers", "whole_state"]
 

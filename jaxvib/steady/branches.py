@@ -12,16 +12,16 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, count, number
-from jaxvib.programs import kept
-from jaxvib.steady.folds import Folds, fold_points
-from jaxvib.steady.jam import Jam, branch_points
-from jaxvib.steady.picture import picture
+from jaxvib.runtime.programs import kept
+from jaxvib.steady.jams.folds import Folds, fold_points
+from jaxvib.steady.jams.jam import Jam, branch_points
+from jaxvib.steady.jams.picture import picture
+from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaxvib.steady.diagram import ExactBranches
+    from jaxvib.steady.orbits.diagram import ExactBranches
 
 __all__ = ["Branches", "branches"]
 
@@ -100,7 +100,7 @@ def branches(
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
     if exact:
-        from jaxvib.steady.diagram import exact_branches  # needs the time integrator: only who asks pays
+        from jaxvib.steady.orbits.diagram import exact_branches  # needs the time integrator: only who asks pays
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:

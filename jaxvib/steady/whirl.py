@@ -11,11 +11,12 @@ import numpy as np
 from jax import Array
 
 from jaxvib.draw.whirl import campbell_diagram
+from jaxvib.equations.linear import loaded_mass
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.units import Number, numbers, traced
-from jaxvib.steady.response import hermitian_modes, loaded_mass, relative_to
+from jaxvib.numerics.linalg import hermitian_modes, relative_to
+from jaxvib.units import Number, numbers, traced
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

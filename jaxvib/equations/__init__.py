@@ -1,0 +1,1 @@
+"""The one place where a scene becomes equations: full, averaged, linear, forces."""

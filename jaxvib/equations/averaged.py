@@ -1,0 +1,233 @@
+"""Averaged equations of motion: complex amplitudes of the carrier and load speeds in place of vibrations.
+
+**Exactly modulated carrier.** Let theta be the loads' mean angle and Omega = theta' their mean rate, phi_j = theta + psi_j,
+w_j = phi_j'. With q = Re(Y e^{i theta}), q' = Re(V e^{i theta}) and a load's position Re(R e e^{i phi}), e = (1, -i) for the
+directions (across, up), the carrier's equations M q'' + (C + n G) q' + K q = - sum_j m_j B^T p_j'' (M with the loads' masses)
+become, without any approximation,
+
+    Y' = V - i Omega Y
+    V' = A - i Omega V,     M A = - (C + n G) V - K Y + B^T e sum_j S_j e^{i psi_j} (w_j^2 - i w_j'),     S_j = m_j R_j
+
+A is the complex amplitude of the acceleration. No derivative of Y is dropped, so beats, the ringing after a resonance was
+passed, and carriers that are coupled by the rotor's speed are followed as they are.
+
+**Averaged loads.** The load's equation, with I_j = kappa_j m_j R_j^2 and D_j = b_Wj R_j^2, holds the product of two quantities
+that turn with theta. Its slow part is kept, the part at twice the speed is dropped:
+
+    I_j w_j' = D_j (n - w_j) - (S_j/2) Im(e^{-i psi_j} a_j),     psi_j' = w_j - Omega,     a_j = e^H B_j A
+
+Only a_j, the forward circular part of the acceleration where the load runs, drives it; the backward part averages to zero.
+Loads at one port feel one number a; where they run at stations s_j of their own, B_j = B + s_j T, it is a_j = a_1 + s_j a_2.
+As A contains w_j', the loads' own reaction, these numbers are implicit: with the levers g_j = 1 or (1, s_j),
+P = e^H B M^-1 B^T e of those one or two rows, h_j = S_j^2/(4 I_j) and f_j = D_j (n - w_j)/I_j
+
+    (1 - P sum_j h_j g_j g_j^T) a + P sum_j h_j e^{2 i psi_j} g_j g_j^T conj(a)
+        = - e^H B M^-1 ((C + n G) V + K Y) + P sum_j g_j S_j e^{i psi_j} (w_j^2 - i f_j)
+
+**What is lost.** The dropped torque shakes the loads' angles at twice their speed by
+r_j = S_j |e^T B_j A| / (2 I_j (2 w_j)^2) rad, and r_j is what the relative error is made of: it is of first order in
+eps = S/(M R), the loads' share of the mass, times the dynamic magnification. Where the carrier answers circularly to a circling
+force (two equal directions), e^T B A = 0 and the averaged equations are exact.
+
+The equilibria are the leading-order jams exactly: V = i Omega Y, A = -Omega^2 Y turn them into `steady_displacement` and
+`jam_rotor_speed`. Gravity and every other potential of the load's angle have mean torque 0.
+
+Source: the method of averaging, N. N. Bogoliubov, Yu. A. Mitropolsky, Asymptotic Methods in the Theory of Non-linear
+Oscillations, 1961; I. I. Blekhman, Synchronization in Science and Technology, 1988. The equations averaged are the antiphase
+paper's (1), (2) in general form.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.dynamics import State
+from jaxvib.equations.linear import _modes, loaded_mass, turning_loads
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import IdealDrive
+from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import magnitude, small_solve, written_inverse
+
+__all__ = ["Amplitudes", "Averaged", "amplitudes_of", "averaged_field", "averaged_loads"]
+
+_CIRCLE = (1.0, -1.0j)
+
+
+class Amplitudes(eqx.Module):
+    """A slowly changing motion; also the time derivative of one.
+
+        q = Re(displacement e^{i theta}),  q' = Re(velocity e^{i theta}),  phi_j = theta + phase_j,  theta' = mean of rate_j
+
+    **Attributes**: `displacement` Y (nd,) m and `velocity` V (nd,) m/s, complex; `rate` w_j (count,) rad/s; `phase` psi_j
+    (count,) rad.
+    """
+
+    displacement: Array
+    velocity: Array
+    rate: Array
+    phase: Array
+
+
+class Averaged(eqx.Module):
+    """The averaged equations of a scene, ready for time integration; a pure function of time (s) and `Amplitudes`.
+
+    - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), M with the loads' masses
+    - `port` (levers, np, nd): B and, where loads have stations, T; `push` M^-1 of their transposes, (levers, np, nd)
+    - `levers` g (levers, count): 1 and, where loads have stations, s_j m
+    - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s, all (count,)
+    """
+
+    stiffness: Array
+    damping: Array
+    gyroscopic: Array | None
+    push: Array
+    port: Array
+    levers: Array
+    unbalance: Array
+    inertia: Array
+    drag: Array
+    drive: IdealDrive
+    axes: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
+        """The time derivative of `state` at time `t`."""
+        n = self.drive.speed_at(t)
+        at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
+        free = self.drag * (n - state.rate) / self.inertia
+        unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
+        if self.gyroscopic is not None:
+            unforced = unforced - n * _times(self.gyroscopic, state.velocity)
+
+        circle, levers = self._circle(), self.levers
+        push = jnp.sum(self.push * circle, axis=1)
+        listen = jnp.sum(self.port * jnp.conj(circle), axis=1)
+        mobility = jnp.sum(listen[:, None, :] * push[None, :, :], axis=-1)
+
+        def pushes(rate: Array) -> Array:
+            return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
+
+        share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
+        alone = jnp.eye(levers.shape[0]) - _product(mobility, jnp.sum(share, axis=-1))
+        mirrored = _product(mobility, jnp.sum(share * (at**2)[None, None, :], axis=-1))
+        felt = _with_conjugate(alone, mirrored, _times(listen, unforced) + _times(mobility, pushes(free)))
+        felt = jnp.sum(levers * felt[:, None], axis=0)
+        rate = free - self.unbalance * (jnp.conj(at) * felt).imag / (2.0 * self.inertia)
+        acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
+        turn = 1j * jnp.mean(state.rate)
+        return Amplitudes(
+            displacement=state.velocity - turn * state.displacement,
+            velocity=acceleration - turn * state.velocity,
+            rate=rate,
+            phase=state.rate - turn.imag,
+        )
+
+    def ripple(self, state: Amplitudes) -> Array:
+        """By how much the dropped torque shakes each load's angle, (count,) rad: S |e^T B i Omega V| / (2 I (2 Omega)^2)."""
+        backward = _times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
+        backward = jnp.sum(self.levers * backward[:, None], axis=0)
+        size = magnitude(backward)
+        omega = jnp.abs(jnp.mean(state.rate))
+        turning = omega > 0.0
+        return jnp.where(turning, self.unbalance * size / (8.0 * self.inertia * jnp.where(turning, omega, 1.0)), 0.0)
+
+    def _circle(self) -> Array:
+        """e, a row for each direction of the port."""
+        return jnp.asarray([_CIRCLE[axis] for axis in self.axes])[None, :, None]
+
+
+def averaged_loads(scene: Scene) -> CircularLoads:
+    """The scene's loads, where the scene holds nothing that is not averaged here."""
+    loads = turning_loads(scene)
+    for effect in scene.effects:
+        if not isinstance(effect, Gravity):
+            raise InputError(f"effects.{effect.kind}", "is not averaged; leave it out here, or simulate")
+    return loads
+
+
+def averaged_field(scene: Scene) -> Averaged:
+    """The averaged equations of `scene`, see the module's page for what they are and what they leave out.
+
+    **Returns** `Averaged`; `jit`, `vmap` and `grad` go through it and through the scene. **Raises** `InputError` for loads
+    that do not move on a circle, motors that loads slow down, and effects other than gravity, whose mean torque is 0.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> jam = jv.jam_modes(scene).select(1)
+    >>> state = jv.Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
+    >>> bool(jnp.abs(jv.averaged_field(scene)(0.0, state).rate[0]) < 1e-10)     # a jam is an equilibrium
+    True
+    """
+    carrier, loads = scene.machine.carrier(), averaged_loads(scene)
+    assert isinstance(scene.drive, IdealDrive)
+    port, levers = carrier.port[None], jnp.ones((1, loads.count), dtype=carrier.port.dtype)
+    if carrier.stations is not None and carrier.tilt is not None:
+        port, levers = jnp.stack([carrier.port, carrier.tilt]), jnp.stack([levers[0], carrier.stations])
+    n = carrier.mass.shape[0]
+    parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
+    parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
+    solved = small_solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))
+    p = port.shape[0] * port.shape[1]
+
+    def each(value: Array) -> Array:
+        return jnp.broadcast_to(value, (loads.count,))
+
+    return Averaged(
+        stiffness=solved[:, :n],
+        damping=solved[:, n : 2 * n],
+        gyroscopic=None if carrier.gyroscopic is None else solved[:, 2 * n + p :],
+        push=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
+        port=port,
+        levers=levers,
+        unbalance=each(loads.mass * loads.radius),
+        inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
+        drag=each(loads.drag * loads.radius**2),
+        drive=scene.drive,
+        axes=carrier.axes,
+    )
+
+
+def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
+    """The slow motion that a state of the full equations belongs to: Re Y e^{i theta} = q, Re V e^{i theta} = q'.
+
+    What is not seen, the quarter of a period later, is that of a vibration at the loads' mean speed; where they turn at
+    less than half the lowest natural frequency, and so cannot have caused it, that of ringing at the natural frequencies.
+    A load's rate is taken for its mean.
+    """
+    (angle,), (rate,) = state.angle, state.rate
+    frequencies, shapes = _modes(scene)
+    omega, theta = jnp.mean(rate), jnp.mean(angle)
+    there = frequencies > 0.0
+    slow = jnp.abs(omega) < 0.5 * jnp.min(jnp.where(there, frequencies, jnp.inf))
+    own = jnp.where(there, 1.0 / jnp.where(there, frequencies, 1.0), 0.0)
+    to_modal = shapes.T @ loaded_mass(scene)
+    turning = jnp.where(slow, 1.0, omega)
+    late = jnp.where(slow, shapes @ (own * (to_modal @ state.velocity)), state.velocity / turning)
+    soon = jnp.where(slow, shapes @ (frequencies * (to_modal @ state.displacement)), turning * state.displacement)
+    back = jnp.exp(-1j * theta)
+    return Amplitudes(back * (state.displacement - 1j * late), back * (state.velocity + 1j * soon), rate, angle - theta)
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    return jnp.sum(matrix * vector[None, :], axis=-1)
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
+
+
+def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
+    """x of a x + b conj(x) = right: written out for one number, otherwise as real equations of twice the number."""
+    if right.shape[0] == 1:
+        a, b = a[0], b[0]
+        return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)
+    top = jnp.concatenate([a.real + b.real, b.imag - a.imag], axis=1)
+    bottom = jnp.concatenate([a.imag + b.imag, a.real - b.real], axis=1)
+    x = _times(written_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
+    n = right.shape[0]
+    return x[:n] + 1j * x[n:]

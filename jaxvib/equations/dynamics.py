@@ -1,0 +1,345 @@
+"""The one place where a scene becomes equations of motion."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.drive import Drive, IdealDrive, Motor
+from jaxvib.machine.effects.base import Effect, Friction, Gravity
+from jaxvib.machine.loads import Loads
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import small_inverse
+
+__all__ = ["Dynamics", "State", "rotor_angle", "rotor_speed", "vector_field"]
+
+
+class State(eqx.Module):
+    """Where everything is and how fast; also the time derivative of such a state.
+
+    **Attributes**: `displacement` q (nd,) m and `velocity` q' (nd,) m/s of the carrier's coordinates; `angle` and `rate`, a
+    tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s;
+    `rotor` the rotor's angle and speed, rad and rad/s, where a motor drives it, None under an ideal drive.
+    """
+
+    displacement: Array
+    velocity: Array
+    angle: tuple[Array, ...]
+    rate: tuple[Array, ...]
+    rotor: tuple[Array, Array] | None = None
+
+
+class _Support(eqx.Module):
+    """An effect that supports the carrier, the displacements it is at (k, nd), and what a force there accelerates (nd, k)."""
+
+    effect: Effect
+    rows: Array
+    push: Array
+
+
+class _Eliminated(NamedTuple):
+    """The loads without their own accelerations u'' = free - answers . a, a the acceleration of what carries each of them.
+
+    They push the port with -(weight a + reaction), and take the torque `drag` + `pull` . a (each (count,)) off the rotor.
+    """
+
+    free: tuple[Array, ...]
+    answers: dict[int, tuple[Array, ...]]
+    weight: list[list[Array]]
+    reaction: list[Array]
+    drag: Array
+    pull: dict[int, Array] | None
+
+
+class Dynamics(eqx.Module):
+    """A scene made ready for time integration: all that does not change with time is computed once, here.
+
+    The carrier is solved for its accelerations, q'' = flow - with M's inverse already applied. P is the port B; where loads
+    run at stations of their own, or the rotor is out of balance elsewhere, the tilt T is below it:
+
+    - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
+    - `push` M^-1 P^T (nd, nP): acceleration per force at the port; `mobility` P M^-1 P^T (nP, nP); `port` P (nP, nd)
+    - `stations` of the loads and `seat` of the rotor, see `Carrier`; `supports` that are not linear
+    """
+
+    stiffness: Array
+    damping: Array
+    gyroscopic: Array | None
+    push: Array
+    mobility: Array
+    port: Array
+    stations: Array | None
+    seat: Array | None
+    supports: tuple[_Support, ...]
+    loads: Loads
+    drive: Drive
+    effects: tuple[Effect, ...]
+    axes: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, t: Array, state: State) -> State:
+        """The time derivative of `state` at time `t`.
+
+        Each load is eliminated first. With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c it obeys
+        u'' = H^-1 (r - E a), a the acceleration of the point that carries it, and pushes that point with -(W a + g),
+        W = m 1 - m J H^-1 E, g = m (J H^-1 r + c). E is m J^T, less what a friction proportional to the load's reaction adds.
+        A motor's rotor that is out of balance is one more such body. What is left is (1 + mobility W) a = a_free - mobility g,
+        one equation for each row of P, however many platforms and loads there are.
+        """
+        speed = rotor_speed(self.drive, t, state)
+        unforced = self._unforced(state, speed)
+        throw = self._throw(t, state)
+        loads = _kinematics(self.loads, state.angle, state.rate)
+
+        def accelerations(friction: Sequence[Friction]) -> tuple[list[Any], Array, _Eliminated, Array | None]:
+            part = self._eliminate(loads, state, speed, friction)
+            weight, reaction, spin = self._with_rotor(part, throw, speed)
+            a, carrier = self._close(weight, reaction, unforced)
+            return a, carrier, part, None if spin is None else spin[0] - _dot(spin[1], a)
+
+        friction = self._friction(state, speed)
+        if any(each.normal is not None for each in friction):
+            # The sign of a reaction that depends on the accelerations: that of the motion without its friction.
+            at_loads = self._at_loads(accelerations([each for each in friction if each.normal is None])[0])
+            friction = [each if each.normal is None else _signed(each, at_loads) for each in friction]
+        a, carrier, part, spin = accelerations(friction)
+        at_loads = self._at_loads(a)
+        change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
+        return State(state.velocity, carrier, state.rate, change, None if spin is None else (speed, spin))
+
+    def _unforced(self, state: State, speed: Array) -> Array:
+        """Accelerations of the carrier without loads and imbalance."""
+        flow = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
+        if self.gyroscopic is not None:
+            flow = flow - speed * _times(self.gyroscopic, state.velocity)
+        for support in self.supports:
+            x, v = _times(support.rows, state.displacement), _times(support.rows, state.velocity)
+            flow = flow - _times(support.push, support.effect.support_force(x, v))
+        return flow
+
+    def _friction(self, state: State, speed: Array) -> list[Friction]:
+        g = sum(effect.g for effect in self.effects if isinstance(effect, Gravity))
+        found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
+        return [_signed(each, {}) if each.normal is None else each for each in found if each is not None]
+
+    def _eliminate(self, kinematics: Any, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
+        loads, axes = self.loads, self.axes
+        columns, curvature = kinematics
+        torque = loads.resistance(state.angle, state.rate, speed)
+        drag, force = torque[0], list(torque)
+        for effect in self.effects:
+            for extra in (effect.load_force(loads, state.angle), effect.load_resistance(loads, state.angle, state.rate)):
+                if extra is not None:
+                    force = [f + e for f, e in zip(force, extra, strict=True)]
+        pull = None
+        for each in friction:
+            rub = each.lever * each.reaction
+            drag, force[0] = drag + rub, force[0] + rub
+            if each.normal is not None:
+                pull = {axis: each.lever * each.normal[axis] + (0.0 if pull is None else pull[axis]) for axis in axes}
+        m = loads.mass
+        inertia = loads.inertia_factor() * m
+        solve = small_inverse([[inertia * _dot(a, b) for b in columns] for a in columns])
+        free = solve(tuple(f - inertia * _dot(column, curvature) for f, column in zip(force, columns, strict=True)))
+        rows = {axis: [m * column[axis] for column in columns] for axis in axes}
+        if pull is not None:
+            rows = {axis: [row[0] - pull[axis], *row[1:]] for axis, row in rows.items()}
+        answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
+        across = {axis: [column[axis] for column in columns] for axis in axes}
+        # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
+        arms = self._arms()
+        onto = [(axis, arm) for arm in range(len(arms)) for axis in axes]
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * _dot(across[i], answers[k]) for i in axes for k in axes}
+        moments = {(i, k, n): self._total(own[i, k], *arms[1:2] * n) for i, k in own for n in range(2 * len(arms) - 1)}
+        weight = [[moments[i, k, first + second] for k, second in onto] for i, first in onto]
+        push = {i: m * (_dot(across[i], free) + curvature[i]) for i in axes}
+        reaction = [self._total(push[i], *arms[1:2] * n) for i, n in onto]
+        return _Eliminated(free, answers, weight, reaction, drag, pull)
+
+    def _with_rotor(
+        self, part: _Eliminated, throw: tuple[list[Array], list[Array]] | None, speed: Array
+    ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
+        """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
+        if not isinstance(self.drive, Motor):
+            if throw is None:
+                return part.weight, part.reaction, None
+            return part.weight, [g + b for g, b in zip(part.reaction, throw[1], strict=True)], None
+        free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
+        row = [jnp.zeros_like(free)] * len(part.reaction)
+        if part.pull is not None:
+            arms = self._arms()
+            row = [self._total(part.pull[i], *arms[1:2] * n) / self.drive.inertia for n in range(len(arms)) for i in self.axes]
+        if throw is None:
+            return part.weight, part.reaction, (free, row)
+        along, bend = throw
+        row = [r + d / self.drive.inertia for r, d in zip(row, along, strict=True)]
+        weight = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(part.weight, along, strict=True)]
+        reaction = [g + b + d * free for g, b, d in zip(part.reaction, bend, along, strict=True)]
+        return weight, reaction, (free, row)
+
+    def _throw(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
+        """With d(theta) (nP,) what is out of balance: d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2."""
+        if not any(effect.throws for effect in self.effects):
+            return None
+        turn, rate = rotor_angle(self.drive, t, state), rotor_speed(self.drive, t, state)
+
+        def thrown(angle: Array) -> tuple[Array, ...]:
+            found = [throw for throw in (effect.throw(angle) for effect in self.effects) if throw is not None]
+            static = tuple(_sum(throw.static[axis] for throw in found) for axis in self.axes)
+            if self.stations is None:
+                return static
+            lean = tuple(_sum(throw.lean[axis] for throw in found) for axis in self.axes)
+            if self.seat is not None:
+                lean = tuple(x + self.seat * y for x, y in zip(lean, static, strict=True))
+            return (*static, *lean)
+
+        def slope(angle: Array) -> tuple[Array, ...]:
+            return jax.jvp(thrown, (angle,), (jnp.ones_like(angle),))[1]
+
+        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        push = [b * rate**2 for b in bend]
+        if isinstance(self.drive, IdealDrive):
+            change = self.drive.acceleration_at(t)
+            push = [p + d * change for p, d in zip(push, along, strict=True)]
+        return list(along), push
+
+    def _close(self, weight: list[list[Array]], reaction: list[Array], unforced: Array) -> tuple[list[Any], Array]:
+        """Accelerations of P's rows and of the carrier."""
+        n = len(reaction)
+        free = _times(self.port, unforced)
+        matrix = [
+            [(1.0 if i == k else 0.0) + sum(self.mobility[i, j] * weight[j][k] for j in range(n)) for k in range(n)]
+            for i in range(n)
+        ]
+        right = tuple(free[i] - sum(self.mobility[i, j] * reaction[j] for j in range(n)) for i in range(n))
+        a = small_inverse(matrix)(right)
+        push = [-sum(weight[i][k] * a[k] for k in range(n)) - reaction[i] for i in range(n)]
+        return list(a), unforced + sum(self.push[:, i] * push[i] for i in range(n))
+
+    def _at_loads(self, a: list[Any]) -> dict[int, Any]:
+        """Accelerations of the points that carry the loads, by axis."""
+        n = len(self.axes)
+        if self.stations is None:
+            return dict(zip(self.axes, a[:n], strict=True))
+        return {axis: a[k] + self.stations * a[n + k] for k, axis in enumerate(self.axes)}
+
+    def _arms(self) -> list[Any]:
+        """The levers of the port's rows: 1, and where loads have stations those, for the tilts."""
+        return [1.0] if self.stations is None else [1.0, self.stations]
+
+    def _total(self, values: Array, *arms: Array) -> Array:
+        for arm in arms:
+            values = values * arm
+        return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
+
+
+def vector_field(scene: Scene) -> Dynamics:
+    """The right-hand side of the scene's equations of motion.
+
+        M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = what the effects add
+        kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B_j q'' = Q_u        (J = dp/du, for each load)
+        J_r theta'' = T(theta') - what loads and imbalance take off              (under a motor)
+
+    **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative; `jit`, `vmap` and
+    `grad` go through it and through the scene.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> rest = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
+    >>> round(float(jv.vector_field(scene)(0.0, rest).rate[0][0]), 4)     # b_W n / (kappa m), the platform giving way
+    143.8746
+
+    Source: the general form of all five papers; for platforms the antiphase paper, equation (2), for stations Artyunin 2013,
+    equation (1). A gyroscopic matrix acts with the rotor's speed alone: what its change would add, C theta'' psi / 2, is left
+    out as in the paper.
+    """
+    carrier, effects = scene.machine.carrier(), scene.effects
+    stations, port = carrier.stations, carrier.port
+    if carrier.tilt is not None and (stations is not None or any(effect.throws for effect in effects)):
+        port = jnp.concatenate([port, carrier.tilt])
+        stations = jnp.zeros_like(carrier.mass[0, 0]) if stations is None else stations
+    places = [(effect, effect.place(carrier)) for effect in effects]
+    places = [(effect, rows) for effect, rows in places if rows is not None]
+    parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for _, rows in places)]
+    if carrier.gyroscopic is not None:
+        parts.append(carrier.gyroscopic)
+    solved = jnp.linalg.solve(carrier.mass, jnp.concatenate(parts, axis=1))
+    stiffness, damping, push, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
+    return Dynamics(
+        stiffness=stiffness,
+        damping=damping,
+        gyroscopic=None if carrier.gyroscopic is None else rest[-1],
+        push=push,
+        mobility=port @ push,
+        port=port,
+        stations=stations,
+        seat=carrier.seat,
+        supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
+        loads=scene.loads,
+        drive=scene.drive,
+        effects=effects,
+        axes=carrier.axes,
+    )
+
+
+def rotor_speed(drive: Drive, t: Array, state: State) -> Array:
+    """The rotor's speed at time `t` in `state`, rad/s."""
+    if isinstance(drive, Motor):
+        assert state.rotor is not None
+        return state.rotor[1]
+    assert isinstance(drive, IdealDrive)
+    return drive.speed_at(t)
+
+
+def rotor_angle(drive: Drive, t: Array, state: State) -> Array:
+    """The rotor's angle at time `t` in `state`, rad."""
+    if isinstance(drive, Motor):
+        assert state.rotor is not None
+        return state.rotor[0]
+    assert isinstance(drive, IdealDrive)
+    return drive.angle_at(t)
+
+
+def _signed(friction: Friction, a: dict[int, Any]) -> Friction:
+    """A friction whose reaction is known to be positive or negative, so that it is linear in the accelerations."""
+    reaction = friction.reaction
+    if friction.normal is not None:
+        reaction = reaction + sum(friction.normal[axis] * x for axis, x in a.items())
+    sign = jnp.where(reaction < 0.0, -1.0, 1.0)
+    return Friction(friction.lever * sign, friction.reaction, friction.normal)
+
+
+def _kinematics(
+    loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]
+) -> tuple[list[tuple[Array, Array]], tuple[Array, Array]]:
+    """Columns of J and c = (dJ/dt) u', of all loads at once (the position acts elementwise)."""
+
+    def along(direction: tuple[Array, ...]) -> Callable[..., tuple[Array, Array]]:
+        return lambda *v: jax.jvp(loads.position, v, direction)[1]
+
+    columns = []
+    for i in range(len(u)):
+        direction = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
+        columns.append(along(direction)(*u))
+    return columns, jax.jvp(along(rate), u, rate)[1]
+
+
+def _sum(values: Iterable[Array]) -> Array:
+    return functools.reduce(operator.add, values)
+
+
+def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    return sum(a * b for a, b in zip(x, y, strict=True))
+
+
+def _times(matrix: Array, vector: Array) -> Array:
+    """Matrix times vector as a sum: a library call in the time loop would keep the compiler from fusing it."""
+    return jnp.sum(matrix * vector[None, :], axis=-1)

@@ -1,0 +1,129 @@
+"""Forces, energy and power of a state."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_field
+from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.drive import Motor
+from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.scene import Scene
+
+__all__ = ["energy", "foundation_force", "power"]
+
+
+def foundation_force(scene: Scene, state: State) -> Array:
+    """Force of all supports on the bed, gravity excluded, (nb,) N: R = sum_i (k_i y_i + b_i y_i').
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> state = jv.State(jnp.array([1e-3]), jnp.array([0.1]), (jnp.zeros(1),), (jnp.zeros(1),))
+    >>> float(jv.foundation_force(scene, state)[0])
+    43.0
+
+    Source: the antiphase paper, equation (7).
+    """
+    carrier = scene.machine.carrier()
+    force = carrier.bed_stiffness @ state.displacement + carrier.bed_damping @ state.velocity
+    for effect in scene.effects:
+        rows = effect.place(carrier)
+        if rows is not None:
+            force = force + effect.support_force(rows @ state.displacement, rows @ state.velocity)
+    return force
+
+
+def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
+    """Kinetic and potential energy of a state, J.
+
+    E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
+        + theta' d'(theta).P q' + J_r theta'^2/2
+
+    d what is out of balance in the rotor, J_r the inertia of a motor's rotor (an ideal drive has none). The time `t`, s, says
+    where an ideal drive has its rotor; it matters to an imbalance alone.
+    """
+    carrier, loads = scene.machine.carrier(), scene.loads
+    q, v = state.displacement, state.velocity
+    p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
+    at_load = _at_loads(carrier, v)
+    total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
+    own = loads.inertia_factor() - 1.0
+    parts = [
+        0.5 * (v @ carrier.mass @ v + q @ carrier.stiffness @ q),
+        jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate))),
+    ]
+    for effect in scene.effects:
+        potential = effect.load_potential(loads, state.angle)
+        if potential is not None:
+            parts.append(jnp.sum(jnp.broadcast_to(potential, (loads.count,))))
+        rows = effect.place(carrier)
+        if rows is not None:
+            parts.append(effect.support_potential(rows @ q))
+    t = jnp.asarray(t, q.dtype)
+    turn, rate = rotor_angle(scene.drive, t, state), rotor_speed(scene.drive, t, state)
+    parts.append(rate * _throw_rate(scene, turn) @ v)
+    if isinstance(scene.drive, Motor):
+        parts.append(0.5 * scene.drive.inertia * rate**2)
+    return sum(parts[1:], parts[0])
+
+
+def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
+    """Power that the rotor puts in, and power that dampers, drag and friction dissipate, W; dE/dt is their difference.
+
+    P_in = speed T, T the motor's torque, or that which turns an ideal drive's rotor against loads and imbalance:
+    T = sum_j M_j + d'(theta).P q'';    P_diss = q'.C q' + sum_j M_j (speed - phi_j') + what supports and contacts take,
+    M_j = b_W R^2 (speed - phi_j') + friction
+    """
+    carrier, loads = scene.machine.carrier(), scene.loads
+    turn, speed = rotor_angle(scene.drive, t, state), rotor_speed(scene.drive, t, state)
+    acceleration = vector_field(scene)(t, state).velocity
+    at_load = _at_loads(carrier, acceleration)
+    torque = loads.resistance(state.angle, state.rate, speed)
+    g = sum(effect.g for effect in scene.effects if isinstance(effect, Gravity))
+    lost = [state.velocity @ carrier.damping @ state.velocity]
+    for effect in scene.effects:
+        friction = effect.friction(loads, state.angle, state.rate, speed, g)
+        if friction is not None:
+            torque = (torque[0] + friction.torque(at_load), *torque[1:])
+        resistance = effect.load_resistance(loads, state.angle, state.rate)
+        if resistance is not None:
+            lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
+        rows = effect.place(carrier)
+        if rows is not None:
+            x, v = rows @ state.displacement, rows @ state.velocity
+            resisting = effect.support_resistance(x, v)
+            if resisting is not None:
+                lost.append(resisting @ v)
+    braking = jnp.sum(torque[0])
+    lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(torque, state.rate, strict=True))]
+    if isinstance(scene.drive, Motor):
+        supplied = speed * scene.drive.torque(speed)
+    else:
+        supplied = speed * (braking + _throw_rate(scene, turn) @ acceleration)
+    return supplied, sum(lost[1:], lost[0])
+
+
+def _at_loads(carrier: Carrier, rate: Array) -> dict[int, Array]:
+    """Velocities (or accelerations) of the points that carry the loads, (count,) or shared, by axis."""
+    port = carrier.port @ rate
+    if carrier.stations is not None and carrier.tilt is not None:
+        port = port[:, None] + (carrier.tilt @ rate)[:, None] * carrier.stations[None, :]
+    return dict(zip(carrier.axes, port, strict=True))
+
+
+def _throw_rate(scene: Scene, turn: Array) -> Array:
+    """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
+    carrier = scene.machine.carrier()
+    static, lean = carrier.port_at(0.0 if carrier.seat is None else carrier.seat), carrier.tilt
+    row = jnp.zeros_like(carrier.mass[0])
+    for effect in scene.effects:
+        rate = jax.jvp(effect.throw, (turn,), (jnp.ones_like(turn),))[1]
+        if rate is None:
+            continue
+        row = row + jnp.stack([rate.static[axis] for axis in carrier.axes]) @ static
+        if lean is not None:
+            row = row + jnp.stack([rate.lean[axis] for axis in carrier.axes]) @ lean
+    return row

@@ -1,0 +1,1 @@
+"""Effects that a scene may call for."""

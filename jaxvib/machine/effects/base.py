@@ -1,0 +1,199 @@
+"""Effects that a scene may call for. An effect that is not in the scene is not in the traced program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.loads import Loads
+from jaxvib.units import Number, number
+
+__all__ = ["Effect", "Friction", "Gravity", "MomentImbalance", "StaticImbalance", "Throw"]
+
+
+class Friction(NamedTuple):
+    """A friction torque `lever` |reaction + normal . a| on each load, a the acceleration of the point that carries it.
+
+    `lever` (count,) m, signed as the torque on the load; `reaction` (count,) N; `normal` two (count,) arrays (across, up) in
+    kg, or None where the reaction does not depend on accelerations.
+    """
+
+    lever: Array
+    reaction: Array
+    normal: tuple[Array, Array] | None
+
+    def torque(self, a: Mapping[int, Array]) -> Array:
+        """The torque on each load where the points that carry them have the acceleration `a`, by axis, m/s^2; {} for none."""
+        reaction = self.reaction
+        if self.normal is not None:
+            reaction = reaction + sum(self.normal[axis] * x for axis, x in a.items())
+        return self.lever * jnp.abs(reaction)
+
+
+class Throw(NamedTuple):
+    """What is out of balance in a rotor: `static` (across, up) kg m, `lean` about the tilts kg m^2."""
+
+    static: tuple[Array, Array]
+    lean: tuple[Array, Array]
+
+
+class Effect(eqx.Module):
+    """One effect says what it adds by the methods it overrides; what it leaves alone is not in the traced program.
+
+    Energies and forces are in J and N; a load's generalised force is in N m for an angle.
+    """
+
+    kind: eqx.AbstractVar[str]
+    repeatable: ClassVar[bool] = False
+    """Whether a scene may hold several of them (supports at several places)."""
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` where the effect does not go with this machine or these loads."""
+
+    def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array | None:
+        """Potential energy of the loads, J, an entry a load or a pair of them; None where the effect has none."""
+        return None
+
+    def load_resistance(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> tuple[Array, ...] | None:
+        """Generalised force that takes energy out of the loads' motion among each other, (count,) each; or None."""
+        return None
+
+    def friction(
+        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float
+    ) -> Friction | None:
+        """Friction of each load against the rotor that turns at `speed` under gravity `g`, see `Friction`; or None."""
+        return None
+
+    def throw(self, angle: Array) -> Throw | None:
+        """What is out of balance in the rotor at its `angle`, see `Throw`; or None."""
+        return None
+
+    def place(self, carrier: Carrier) -> Array | None:
+        """Rows (k, nd) that give the displacements at which the effect supports the carrier; or None."""
+        return None
+
+    def support_potential(self, displacement: Array) -> Array:
+        """Potential energy at the displacements (k,) of its place, J."""
+        raise NotImplementedError
+
+    def support_resistance(self, displacement: Array, velocity: Array) -> Array | None:
+        """Dissipative force on the bed at its place, (k,) N; or None."""
+        return None
+
+    @property
+    def throws(self) -> bool:
+        """Whether the effect puts the rotor out of balance."""
+        return type(self).throw is not Effect.throw
+
+    def load_force(self, loads: Loads, u: tuple[Array, ...]) -> tuple[Array, ...] | None:
+        """Generalised force of the potential on each load, by automatic differentiation; None where there is none."""
+        energy, back = jax.vjp(lambda *v: self.load_potential(loads, v), *u)
+        return None if energy is None else tuple(-g for g in back(jnp.ones_like(energy)))
+
+    def support_force(self, displacement: Array, velocity: Array) -> Array:
+        """Force on the bed at its place, (k,) N; minus that on the carrier."""
+        force = jax.grad(self.support_potential)(displacement)
+        resistance = self.support_resistance(displacement, velocity)
+        return force if resistance is None else force + resistance
+
+
+class Gravity(Effect):
+    """Gravity on the loads: V = m g p_up(u), so a load on a circle feels the torque - m g R cos phi.
+
+    Platforms are counted from static equilibrium, loads' weight included, so that gravity adds nothing there.
+
+    **Arguments**: `g` m/s^2.
+
+    **Raises** `InputError` for a wrong unit or a negative value.
+
+    >>> import jaxvib as jv
+    >>> float(jv.Gravity().g)
+    9.81
+    """
+
+    g: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, g: Number = 9.81):
+        self.g = number(g, "m/s^2", "effects.gravity.g", low=0.0)
+        self.kind = "gravity"
+
+    def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
+        """m g p_up(u)."""
+        return loads.mass * self.g * loads.position(*u)[1]
+
+
+class StaticImbalance(Effect):
+    """The rotor's mass centre lies off its axis, by e (cos(theta + angle), sin(theta + angle)) at the rotor's angle theta.
+
+    The force on the carrier, where the rotor sits, is - M e d^2/dt^2 of that direction.
+
+    **Arguments**: `moment` M e, kg m, not negative; `angle` rad, of the heavy side when the rotor's angle is 0.
+
+    **Raises** `InputError` for a wrong unit or a negative moment.
+
+    >>> import jaxvib as jv
+    >>> float(jv.StaticImbalance("9.25 g m").moment)
+    0.00925
+
+    Source: Artyunin 2013, equation (1), the terms with M e.
+    """
+
+    moment: Array
+    angle: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, moment: Number, angle: Number = 0.0):
+        self.moment = number(moment, "kg m", "effects.static_imbalance.moment", low=0.0)
+        self.angle = number(angle, "rad", "effects.static_imbalance.angle")
+        self.kind = "static_imbalance"
+
+    def throw(self, angle: Array) -> Throw:
+        """M e (cos, sin) of the heavy side."""
+        zero = jnp.zeros_like(self.moment)
+        turned = angle + self.angle
+        return Throw((self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)), (zero, zero))
+
+
+class MomentImbalance(Effect):
+    """The rotor's principal axis leans by a small angle delta to its axis of rotation.
+
+    It turns the carrier about its tilts with the moment - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
+
+    **Arguments**: `moment` (A - C) delta, kg m^2, of either sign; `angle` rad (- gamma in the paper).
+
+    **Raises** `InputError` for a wrong unit, and, by the scene, for a machine that cannot tilt.
+
+    >>> import jaxvib as jv
+    >>> float(jv.MomentImbalance(4e-4).moment)
+    0.0004
+
+    Source: Artyunin 2013, equation (1), the terms with (A - C) delta.
+    """
+
+    moment: Array
+    angle: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, moment: Number, angle: Number = 0.0):
+        self.moment = number(moment, "kg m^2", "effects.moment_imbalance.moment")
+        self.angle = number(angle, "rad", "effects.moment_imbalance.angle")
+        self.kind = "moment_imbalance"
+
+    def throw(self, angle: Array) -> Throw:
+        """(A - C) delta (cos, sin) of the lean."""
+        zero = jnp.zeros_like(self.moment)
+        turned = angle + self.angle
+        return Throw((zero, zero), (self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)))
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """A machine that can tilt."""
+        if machine.carrier().tilt is None:
+            raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {machine.kind!r}")

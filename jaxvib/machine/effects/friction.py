@@ -1,0 +1,108 @@
+"""Dry friction in the bearings of pendulums."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.effects.base import Effect, Friction
+from jaxvib.machine.loads import CircularLoads, Loads
+from jaxvib.units import Number, number
+
+__all__ = ["DryFriction", "dry_lever", "sliding_sign"]
+
+Reaction = Literal["exact", "run_up", "steady"]
+
+
+def sliding_sign(slip: Array, width: Array) -> Array:
+    """tanh(slip / width): the sign of a sliding speed, smooth over the `width`, so that sticking is a creep below it.
+
+    A joint that has to stick under the share f < 1 of what friction can hold creeps at width artanh(f): nothing is lost
+    but that creep, and it goes to zero with the width. A swing whose speed goes up to v loses the share (pi^2/24) (width/v)^2
+    less to dry friction than with the sharp sign.
+
+    >>> [round(float(sliding_sign(x, 0.1)), 4) for x in (-1.0, 0.0, 0.05, 1.0)]
+    [-1.0, 0.0, 0.4621, 1.0]
+    """
+    return jnp.tanh(slip / width)
+
+
+def dry_lever(coefficient: Array, diameter: Array, slip: Array, width: Array) -> Array:
+    """mu2 (d/2) sign(slip), m: what a bearing's radial load |N| is multiplied with to give the torque of dry friction, N m.
+
+    >>> round(float(dry_lever(0.0015, 0.02, -3.0, 0.01)), 9)
+    -1.5e-05
+    """
+    return 0.5 * coefficient * diameter * sliding_sign(slip, width)
+
+
+class DryFriction(Effect):
+    """Dry friction in the bearing of each load, proportional to the radial load N that the bearing carries.
+
+        M = mu2 (d / 2) |N| sign(speed - phi')
+
+    - `reaction="exact"`: N = m (R phi'^2 - n . a - g sin phi), n the load's direction, a the acceleration of the point that
+      carries it, g that of the scene's gravity. N is linear in the accelerations and is solved together with them
+    - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as the paper prints for a run-up (its second term mixes frames)
+    - `"steady"`: N = m R speed^2, as the paper prints for loads that turn with the rotor
+
+    **Arguments**: `coefficient` mu2 (about 0.0015 for ball bearings); `diameter` d, m, of the bearing; `reaction`; `width`,
+    rad/s, of the sliding speed over which the sign is smoothed, see `sliding_sign`. Viscous bearing friction is the loads'
+    `drag`, mu1 = b_W R^2.
+
+    The sign of N is that of the motion without this friction: where it differs from the one with it, N is smaller than
+    mu2 times the other forces, and so is the error.
+
+    **Raises** `InputError` for values that are not allowed.
+
+    >>> import jaxvib as jv
+    >>> jv.DryFriction(0.0015, diameter="12 mm").reaction
+    'exact'
+
+    Source: Artyunin and Sumenkov 2019, equations (1)-(5).
+    """
+
+    coefficient: Array
+    diameter: Array
+    width: Array
+    reaction: str = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        coefficient: Number,
+        diameter: Number,
+        reaction: Reaction = "exact",
+        width: Number = 0.01,
+    ):
+        field = "effects.dry_friction"
+        self.coefficient = number(coefficient, "", f"{field}.coefficient", low=0.0)
+        self.diameter = number(diameter, "m", f"{field}.diameter", low=0.0)
+        self.width = number(width, "rad/s", f"{field}.width", low=0.0, open_low=True)
+        if reaction not in get_args(Reaction):
+            raise InputError(f"{field}.reaction", f"is {reaction!r}; allowed: {', '.join(get_args(Reaction))}")
+        self.reaction = reaction
+        self.kind = "dry_friction"
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """Loads on a circle."""
+        if not isinstance(loads, CircularLoads):
+            raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {loads.kind!r}")
+
+    def friction(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float) -> Friction:
+        """mu2 d/2 and N."""
+        assert isinstance(loads, CircularLoads)
+        phi, turn = u[0], rate[0]
+        lever = dry_lever(self.coefficient, self.diameter, speed - turn, self.width)
+        m, r = loads.mass, loads.radius
+        if self.reaction == "steady":
+            return Friction(lever, m * r * speed**2 * jnp.ones_like(turn), None)
+        if self.reaction == "run_up":
+            return Friction(lever, m * r * (turn**2 - 2.0 * speed * (speed - turn)), None)
+        across, up = jnp.cos(phi), jnp.sin(phi)
+        return Friction(lever, m * (r * turn**2 - g * up), (-m * across, -m * up))

@@ -1,0 +1,149 @@
+"""Supports that are not linear: hardening springs and stops."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.loads import Loads
+from jaxvib.units import Number, number
+
+__all__ = ["CubicSupport", "Stop"]
+
+
+class _Support(Effect):
+    """A support to the bed at a platform, or around a rotor's axis at a distance from its mass centre."""
+
+    repeatable = True
+    platform: eqx.AbstractVar[int | None]
+    position: eqx.AbstractVar[Array | None]
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """Whether the machine has the place."""
+        self.place(machine.carrier())
+
+    def place(self, carrier: Carrier) -> Array:
+        """The row of the platform's coordinate, or the rows of the axis' two directions."""
+        n = len(carrier.coordinates)
+        if self.position is not None:
+            if carrier.tilt is None:
+                raise InputError(f"effects.{self.kind}.position", "goes with a rotor that can tilt; name a platform instead")
+            return carrier.port_at(self.position if carrier.seat is None else carrier.seat + self.position)
+        if carrier.axes != (1,):
+            if self.platform is not None:
+                raise InputError(f"effects.{self.kind}.platform", "goes with machines of platforms; a rotor needs a position")
+            return carrier.port
+        which = 1 if self.platform is None else self.platform
+        if which > n:
+            raise InputError(f"effects.{self.kind}.platform", f"is {which}; the machine has platforms 1 to {n}")
+        return jnp.eye(n, dtype=carrier.mass.dtype)[which - 1 : which]
+
+
+def _where(kind: str, platform: int | None, position: Number | None) -> tuple[int | None, Array | None]:
+    if platform is not None and position is not None:
+        raise InputError(f"effects.{kind}", "names a platform and a position; a support has one place")
+    if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
+        raise InputError(f"effects.{kind}.platform", f"is {platform!r}; it must be a whole number, at least 1")
+    return platform, None if position is None else number(position, "m", f"effects.{kind}.position")
+
+
+class CubicSupport(_Support):
+    """A support that hardens (or softens): force k3 r^2 x on the bed, r the distance from the rest position.
+
+    **Arguments**: `stiffness` k3 N/m^3, negative where the support softens; `platform` that it stands under (1 unless said
+    otherwise), or `position` along a rotor's axis, m from the rotor's mass centre.
+
+    **Raises** `InputError` for values that are not allowed, and, by the scene, for a place that the machine does not have.
+
+    >>> import jaxvib as jv
+    >>> float(jv.CubicSupport("2e9 N/m^3", platform=2).stiffness)
+    2000000000.0
+    """
+
+    stiffness: Array
+    platform: int | None = eqx.field(static=True)
+    position: Array | None
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, stiffness: Number, platform: int | None = None, position: Number | None = None):
+        self.kind = "cubic_support"
+        self.stiffness = number(stiffness, "N/m^3", "effects.cubic_support.stiffness")
+        self.platform, self.position = _where(self.kind, platform, position)
+
+    def support_potential(self, displacement: Array) -> Array:
+        """k3 r^4 / 4."""
+        return 0.25 * self.stiffness * jnp.sum(displacement**2) ** 2
+
+
+class Stop(_Support):
+    """A stop that the machine meets after a gap: force k (x - gap) + c x' while it presses, never pulling.
+
+    Under a platform it stops the motion on the sides named; around a rotor's axis it is a ring of radius `gap`.
+
+    **Arguments**: `stiffness` k N/m; `gap` m; `damping` c N s/m; `side` "above", "below" or "both" (platforms only);
+    `platform` or `position` as `CubicSupport`.
+
+    **Raises** `InputError` for values that are not allowed, and, by the scene, for a place that the machine does not have.
+
+    >>> import jaxvib as jv
+    >>> float(jv.Stop("5 kN/mm", gap="3 mm", side="below").gap)
+    0.003
+    """
+
+    stiffness: Array
+    gap: Array
+    damping: Array
+    side: str = eqx.field(static=True)
+    platform: int | None = eqx.field(static=True)
+    position: Array | None
+    kind: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        stiffness: Number,
+        gap: Number,
+        damping: Number = 0.0,
+        side: str = "both",
+        platform: int | None = None,
+        position: Number | None = None,
+    ):
+        self.kind = "stop"
+        self.stiffness = number(stiffness, "N/m", "effects.stop.stiffness", low=0.0)
+        self.gap = number(gap, "m", "effects.stop.gap", low=0.0)
+        self.damping = number(damping, "N s/m", "effects.stop.damping", low=0.0)
+        if side not in ("above", "below", "both"):
+            raise InputError("effects.stop.side", f"is {side!r}; allowed: above, below, both")
+        self.side = side
+        self.platform, self.position = _where(self.kind, platform, position)
+
+    def _beyond(self, displacement: Array) -> tuple[Array, Array]:
+        """How far the motion is beyond the gap (negative: free), and the direction (k,) in which it presses."""
+        if displacement.shape[0] == 1:
+            x = displacement[0]
+            sign = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}.get(self.side, jnp.where(x < 0.0, -1.0, 1.0))
+            return sign * x - self.gap, sign[None]
+        square = jnp.sum(displacement**2)
+        distance = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
+        return distance - self.gap, displacement / jnp.where(distance > 0.0, distance, 1.0)
+
+    def place(self, carrier: Carrier) -> Array:
+        """As every support's; a ring has no sides."""
+        rows = super().place(carrier)
+        if rows.shape[0] > 1 and self.side != "both":
+            raise InputError("effects.stop.side", f"is {self.side!r}; around a rotor's axis it must be 'both'")
+        return rows
+
+    def support_potential(self, displacement: Array) -> Array:
+        """k (x - gap)^2 / 2 beyond the gap."""
+        beyond, _ = self._beyond(displacement)
+        return 0.5 * self.stiffness * jnp.maximum(beyond, 0.0) ** 2
+
+    def support_resistance(self, displacement: Array, velocity: Array) -> Array:
+        """c x' while it presses; a stop that would pull lets go."""
+        beyond, direction = self._beyond(displacement)
+        closing = self.damping * jnp.sum(direction * velocity)
+        return jnp.where(beyond > 0.0, jnp.maximum(closing, -self.stiffness * beyond), 0.0) * direction

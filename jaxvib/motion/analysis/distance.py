@@ -1,0 +1,87 @@
+"""How far states are apart, each part of them in a unit of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.dynamics import State
+from jaxvib.units import traced
+
+__all__ = ["distance", "scales", "turned"]
+
+
+def scales(state: State, unit: State) -> State:
+    """What differences to a state count relative to, a number for each part of it.
+
+    Of displacements and velocities it is the largest of all, but no less than the natural unit: a motion that is at rest has
+    none of its own. Of angles and speeds it is the natural unit, 1 rad and the rotor's speed.
+
+    **Arguments**: `state` a `State`, or a stretch of them whose arrays have a leading axis; `unit` its `natural_units`.
+
+    **Returns** `State` of numbers, NumPy's where numbers are known: nothing is compiled for them.
+    """
+    xp = _library((state, unit))
+
+    def largest(x: Any, least: Any) -> Any:
+        return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
+
+    return State(
+        largest(state.displacement, unit.displacement),
+        largest(state.velocity, unit.velocity),
+        tuple(xp.asarray(unit.angle[0]) for _ in state.angle),
+        tuple(xp.asarray(unit.rate[0]) for _ in state.rate),
+        None if unit.rotor is None else (xp.asarray(unit.rotor[0]), xp.asarray(unit.rotor[1])),
+    )
+
+
+def distance(a: State, b: State, scale: State) -> Any:
+    """The largest difference of two states in all their numbers, each relative to its part's `scale`.
+
+    **Arguments**: `a`, `b` states, or stretches of them whose arrays have a leading axis; `scale` a `State` of numbers, see
+    `scales`.
+
+    **Returns** a number, NumPy's where numbers are known; NaN where one of the states is not finite.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> a, b = (jv.State(np.array([x]), np.zeros(1), (np.array([3.0]),), (np.array([50.0]),)) for x in (2e-3, 1e-3))
+    >>> unit = jv.State(1e-4, 5e-3, (1.0,), (50.0,))
+    >>> float(distance(a, b, scales(a, unit))), float(distance(a, b, scales(b, unit)))
+    (0.5, 1.0)
+    """
+    xp = _library((a, b, scale))
+
+    def apart(x: Any, y: Any, unit: Any) -> Any:
+        with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
+            return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
+
+    return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
+
+
+def turned(state: State, to: State) -> State:
+    """A state (or a stretch of them), its angles moved by whole turns to where they are nearest to those of another.
+
+    In single precision angles are kept within a turn, and of two runs that are close one may count a turn more.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> a, b = (jv.State(np.zeros(1), np.zeros(1), (np.array([phi]),), (np.array([50.0]),)) for phi in (3.1, -3.1))
+    >>> round(float(turned(a, b).angle[0][0]), 4)
+    -3.1832
+    """
+    xp = _library((state, to))
+
+    def near(x: Any, y: Any) -> Any:
+        return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))
+
+    rotor = None
+    if state.rotor is not None and to.rotor is not None:
+        rotor = (near(state.rotor[0], to.rotor[0]), state.rotor[1])
+    return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor)
+
+
+def _library(tree: Any) -> Any:
+    """NumPy, or JAX's where JAX is transforming the computation that a tree is part of."""
+    return jnp if any(traced(leaf) for leaf in jax.tree.leaves(tree)) else np

@@ -1,0 +1,183 @@
+"""What is read off a motion: amplitudes, jam speed, forces, energy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_field
+from jaxvib.equations.forces import foundation_force
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.extrema import _extremum, _places
+
+__all__ = ["Measured", "Trajectory", "measure"]
+
+
+class Trajectory(eqx.Module):
+    """States at some times.
+
+    **Attributes** (nt times): `time` (nt,) s; `state` a `State` whose arrays have a leading axis over the times;
+    `foundation_force` (nt, nb) N, what the supports exert on the bed in its nb directions; `rotor_angle` (nt,) rad, but
+    for whole turns, and `rotor_speed` (nt,) rad/s.
+    """
+
+    time: Array
+    state: State
+    foundation_force: Array
+    rotor_angle: Array
+    rotor_speed: Array
+
+
+class Measured(eqx.Module):
+    """A motion in numbers, over the last turns of a run.
+
+    **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
+    `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
+    directions the root of the sum of both squares; `drift` the largest change of an amplitude from the first to the second half
+    of those turns, relative to the largest amplitude, or of `omega` where that is more; `settled` whether it is below 1e-3.
+    """
+
+    omega: Array
+    load_speed: Array
+    amplitude: Array
+    foundation_force: Array
+    drift: Array
+
+    @property
+    def settled(self) -> Array:
+        """Whether the motion repeats itself, as far as amplitudes and speed tell."""
+        return self.drift < 1e-3
+
+    def extent(self, scene: Scene) -> str:
+        """Amplitudes and foundation force of the `scene` they belong to, a line for a person to read."""
+        structure = scene.machine.structure()
+        named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
+        amplitude = ", ".join(f"{name} {float(a):.4g} {unit}" for name, a, unit in named)
+        return f"amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N"
+
+
+def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
+    """States at times, with the forces and rotor speeds that belong to them."""
+    force = jax.vmap(lambda s: foundation_force(scene, s))(states)
+    angle = jax.vmap(lambda t, s: rotor_angle(scene.drive, t, s))(times, states)
+    speed = jax.vmap(lambda t, s: rotor_speed(scene.drive, t, s))(times, states)
+    return Trajectory(times, states, force, angle, speed)
+
+
+def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Measured:
+    """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
+
+    Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
+    samples. `field` gives the rates of a state at a time; arrays that carry derivatives it has as a tree, not as a function's
+    closure.
+    """
+    early, late, whole = _spans(scene, field, times, states)
+    nd, half = states.displacement.shape[1], times.shape[0] // 2
+
+    phi, rate = states.angle[0], states.rate[0]
+    turning = jax.vmap(lambda p, w: _mean_speed(times, p, w), in_axes=1)
+    speeds = turning(phi, rate)
+    late_speeds = jax.vmap(lambda p, w: _mean_speed(times[half:], p, w), in_axes=1)(phi[half:], rate[half:])
+    top = jnp.max(whole[:nd])
+    drift = jnp.max(jnp.abs(late - early)[:nd]) / jnp.where(top > 0.0, top, 1.0)
+    omega = jnp.mean(speeds)
+    speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
+    return Measured(
+        omega=omega,
+        load_speed=speeds,
+        amplitude=whole[:nd],
+        foundation_force=whole[nd] if whole.shape[0] == nd + 1 else jnp.sqrt(jnp.sum(whole[nd:] ** 2)),
+        drift=jnp.maximum(drift, speed_drift),
+    )
+
+
+@eqx.filter_custom_jvp
+def _spans(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Array:
+    """Half of peak to peak of displacements and foundation forces, over the first half of the samples, the second and all of
+    them, (3, outputs).
+
+    Derivatives, of any order, cost next to nothing: the equations are evaluated once more at the few samples beside the
+    extrema, and are differentiated there alone.
+    """
+    (low, high), _, _ = _extrema(scene, field, times, states)
+    return (high - low) / 2.0
+
+
+@_spans.def_jvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    _, samples, shares = jax.lax.stop_gradient(_extrema(*primals))
+    outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
+
+    def spans(scene: Scene, field: Any, times: Array, states: State) -> Array:
+        def extremum(output: Array, k: Array, share: Array) -> Array:
+            def sample(j: Array) -> list[Array]:
+                state = jax.tree.map(lambda leaf: leaf[j], states)
+                return [part[output] for part in _moving(scene, field, _step(times), times[j], state)]
+
+            return _extremum(sample(k), sample(k + 1), share)
+
+        low, high = jax.vmap(jax.vmap(jax.vmap(extremum)))(outputs, samples, shares)
+        return (high - low) / 2.0
+
+    return eqx.filter_jvp(spans, primals, tangents)
+
+
+def _extrema(scene: Scene, field: Any, times: Array, states: State) -> tuple[Array, Array, Array]:
+    """Least and greatest values of each output, and their places, see `_places`; (2, 3, outputs) each."""
+    step = _step(times)
+    samples = jax.vmap(lambda t, y: _moving(scene, field, step, t, y))(times, states)
+    return jax.vmap(_places, in_axes=1, out_axes=-1)(*samples)
+
+
+def _moving(scene: Scene, field: Any, step: Array, t: Array, state: State) -> tuple[Array, Array, Array]:
+    """Displacements and foundation forces with their first two derivatives, in units of the step."""
+
+    def outputs(state: State) -> Array:
+        return jnp.concatenate([state.displacement, foundation_force(scene, state)])
+
+    def first(s: Array, y: State) -> Array:
+        return jax.jvp(outputs, (y,), (field(s, y),))[1]
+
+    second = jax.jvp(first, (t, state), (jnp.ones_like(t), field(t, state)))[1]
+    return outputs(state), first(t, state) * step, second * step**2
+
+
+def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:
+    """Mean speed over as many whole turns as there are before the last sample; over all of it if there is none."""
+    total = phi[-1] - phi[0]
+    turns = jnp.floor(jnp.abs(total) / (2.0 * jnp.pi))
+    target = phi[-1] - jnp.sign(total) * 2.0 * jnp.pi * turns
+    i = jnp.clip(jnp.argmin(jnp.abs(phi - target)), 0, t.shape[0] - 1)
+    start = t[i] + (target - phi[i]) / _away_from_zero(rate[i])
+    # One secant step on the cubic through the sample: enough, the sample is next to it.
+    j = jnp.where(start > t[i], jnp.minimum(i + 1, t.shape[0] - 1), jnp.maximum(i - 1, 0))
+    h = jnp.where(i == j, 1.0, t[j] - t[i])
+    bend = (rate[j] - rate[i]) / h
+    start = t[i] + (target - phi[i]) / _away_from_zero(rate[i] + 0.5 * bend * (start - t[i]))
+    return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (t[-1] - start), total / (t[-1] - t[0]))
+
+
+def _step(times: Array) -> Array:
+    """Between even samples: of all of them, for late in a long run two neighbours are rounded each."""
+    return (times[-1] - times[0]) / (times.shape[0] - 1)
+
+
+def _away_from_zero(x: Array) -> Array:
+    tiny = jnp.sqrt(jnp.finfo(x.dtype).tiny)
+    return jnp.where(jnp.abs(x) < tiny, tiny, x)
+
+
+def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Array:
+    """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
+    acceleration = jax.vmap(vector_field(scene))(stretch.time, stretch.state).velocity
+    x, v, a = (
+        values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
+    )
+    step = _step(stretch.time)
+    (low, high), _, _ = _places(x, v * step, a * step**2)
+    return (high - low)[2] / 2.0

@@ -1,0 +1,224 @@
+"""What kind of motion a run has come to, with the evidence."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.machine.drive import Motor
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Trajectory, _mean_speed
+from jaxvib.steady.jams.patterns import PhasePattern, pattern_word, phase_pattern
+from jaxvib.steady.whirl import whirl
+
+__all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
+
+_SAME_SPEED = 3e-3
+"""Speeds of two loads, of a load and the rotor, or of one load early and late, that differ by less count as one."""
+
+_LOCKED = 0.1
+"""Relative phases that move by less than this between two halves of the window count as fixed, rad."""
+
+_BALANCED = 0.02
+"""What may be left out of balance, relative to what the loads would make together."""
+
+
+class RegimeName(eqx.Enumeration):
+    """Kinds of motion; the members are the sentences a user reads."""
+
+    swinging = "the loads swing and do not go round"
+    jammed = "the loads are jammed: they turn together, slower than the rotor"
+    unbalanced = "the loads turn with the rotor, which is not balanced"
+    balanced = "the loads turn with the rotor and balance it"
+    parted = "the loads have parted: they turn at different speeds that no longer change"
+    unsettled = "the loads have not come to a steady motion"
+
+
+REGIMES = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
+"""The words for the members of `RegimeName`, in their order."""
+
+
+class Regime(eqx.Module):
+    """The kind of motion over a stretch, and what it was judged by.
+
+    **Attributes**
+
+    - `name`: a `RegimeName`; `pattern`: a `PhasePattern` of the loads
+    - `load_speed` (count,) mean speeds over whole turns and `rotor_speed`, rad/s; `ripple` half of peak to peak of the loads'
+      speed, the largest
+    - `phase` (count,) rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
+    - `unbalance`: what loads and rotor together leave out of balance in the rotor's frame, relative to the loads' own together
+    - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed` rad/s
+    - `mode`: the jam mode, 0 where the loads are not jammed: 2 k falls from the k-th natural frequency, the last one below the
+      loads' mean speed, 2 k + 1 rises from there to the next one, or to the rotor's speed where that is less; it is the one
+      whose end the loads are nearer to, so that beyond the last of nd frequencies close to the rotor it is 2 nd + 1
+    - `caught`: whether the rotor itself is held at a resonance, below the speed that its motor would give it without a load
+    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's
+    """
+
+    name: RegimeName
+    pattern: PhasePattern
+    load_speed: Array
+    rotor_speed: Array
+    ripple: Array
+    phase: Array
+    unbalance: Array
+    resonance: Array
+    resonance_speed: Array
+    mode: Array
+    caught: Array
+    change: Array
+
+    @property
+    def label(self) -> str:
+        """The name's own word: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
+        return next(word for word in REGIMES if bool(self.name == getattr(RegimeName, word)))
+
+    @property
+    def pattern_label(self) -> str:
+        """The pattern's own word, see `pattern_word`."""
+        return pattern_word(self.pattern)
+
+    def summary(self) -> str:
+        """The name and its evidence, for a person to read."""
+        sentence = RegimeName[self.name]  # pyright: ignore[reportInvalidTypeArguments]
+        pattern = PhasePattern[self.pattern]  # pyright: ignore[reportInvalidTypeArguments]
+        speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
+        evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
+        if bool(self.name == RegimeName.jammed):
+            # A mode that rises to the rotor's speed has its resonance behind it.
+            where = "beyond" if int(self.mode) == 2 * int(self.resonance) + 1 else "by"
+            near = f"{where} resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
+            evidence += [near, pattern]
+        if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
+            evidence.append(f"{100.0 * float(self.unbalance):.2g} % of the loads' unbalance is left, {pattern}")
+        if bool(self.caught):
+            evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
+        evidence.append(f"speeds change by {float(self.change):.1e}")
+        return f"{sentence} ({'; '.join(evidence)})"
+
+
+def regime(scene: Scene, stretch: Trajectory) -> Regime:
+    """Names the motion over a stretch of a run of `scene`, such as `run.window`.
+
+    Loads that go round by less than a turn swing. Loads whose mean speed differs from the rotor's by less than 0.3 % turn with
+    it, balanced where loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about the tilts
+    where there are stations). Loads at one other speed, their relative phases fixed, are jammed. A speed that changes by more
+    than 0.3 % of the rotor's from one half of the stretch to the other is not steady.
+
+    **Returns** `Regime`; `jit` and `vmap` go through it.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> run = jv.simulate(scene, 10.0, start="jam", mode=1)
+    >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
+    (True, 1)
+    """
+    times, state = stretch.time, stretch.state
+    phi, rate = state.angle[0], state.rate[0]
+    half = times.shape[0] // 2
+    turn = stretch.rotor_angle
+
+    def mean_speed(part: slice) -> Array:
+        return jax.vmap(lambda p, w: _mean_speed(times[part], p, w), in_axes=1)(phi[part], rate[part])
+
+    early, late, whole = slice(0, half), slice(half, None), slice(None)
+    speed, rotor = mean_speed(whole), _mean_speed(times, turn, stretch.rotor_speed)
+    reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
+    change = jnp.max(jnp.abs(mean_speed(late) - mean_speed(early))) / reference
+    steady = change < _SAME_SPEED
+    swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
+    with_rotor = jnp.abs(speed - rotor) < _SAME_SPEED * reference
+    # Relative to the first load: exp(i k (phi_j - phi_1)), averaged; how far apart the halves' averages are says whether fixed.
+    to_first, moved = _relative(phi - phi[:, :1], half)
+    to_rotor, slid = _relative(phi - turn[:, None], half)
+    one_speed = (jnp.max(speed) - jnp.min(speed) < _SAME_SPEED * reference) & (jnp.max(moved) < _LOCKED)
+
+    unbalance = _unbalance(scene, to_rotor, turn)
+    name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
+    name = RegimeName.where(steady & one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
+    name = RegimeName.where(
+        steady & jnp.all(with_rotor),
+        RegimeName.where(unbalance < _BALANCED, RegimeName.balanced, RegimeName.unbalanced),
+        name,
+    )
+    name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
+
+    natural = _resonances(scene, rotor)
+    mean = jnp.mean(speed)
+    nearest = jnp.argmin(jnp.abs(natural - mean))
+    turning = jnp.all(with_rotor)
+    return Regime(
+        name=name,
+        pattern=phase_pattern(jnp.where(turning, to_rotor, to_first)),
+        load_speed=speed,
+        rotor_speed=rotor,
+        ripple=jnp.max(jnp.max(rate, axis=0) - jnp.min(rate, axis=0)) / 2.0,
+        phase=jnp.where(turning, to_rotor, to_first),
+        unbalance=unbalance,
+        resonance=nearest + 1,
+        resonance_speed=natural[nearest],
+        mode=jnp.where(name == RegimeName.jammed, _mode(natural, mean, rotor), 0),
+        caught=_caught(scene, natural, rotor),
+        change=jnp.maximum(change, jnp.where(turning, jnp.max(slid), 0.0)),
+    )
+
+
+def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
+    """The jam mode of loads at a mean speed between natural frequencies, ascending, infinite where there is none."""
+    ends = jnp.concatenate([jnp.zeros_like(natural[:1]), natural, jnp.full_like(natural[:1], jnp.inf)])
+    below = jnp.sum(natural <= mean)
+    rises = jnp.minimum(ends[below + 1], rotor) - mean < mean - ends[below]
+    return jnp.where(rises | (below == 0), 2 * below + 1, 2 * below)
+
+
+def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
+    """Whether a motor's rotor hangs at a resonance: less than 15 % below one, and more than 5 % below the motor's own speed."""
+    if not isinstance(scene.drive, Motor):
+        return jnp.zeros((), bool)
+    return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
+
+
+def _relative(angle: Array, half: int) -> tuple[Array, Array]:
+    """Mean direction (count,) rad of angles (nt, count), and how far it moved from the first to the second half."""
+    point = jnp.exp(1j * angle)
+    early, late = jnp.mean(point[:half], axis=0), jnp.mean(point[half:], axis=0)
+    return jnp.angle(jnp.mean(point, axis=0)), jnp.abs(jnp.angle(late * jnp.conj(early)))
+
+
+def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
+    """What is left out of balance when loads stand at `phase` to the rotor, relative to all of them at one angle.
+
+    Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
+    none to the rotor's radius of gyration.
+    """
+    carrier, loads = scene.machine.carrier(), scene.loads
+    across, up = loads.position(*(jnp.zeros((loads.count,), phase.dtype),))
+    each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
+    origin = jnp.zeros_like(turn[0])
+    thrown = [throw for throw in (effect.throw(origin) for effect in scene.effects) if throw is not None]
+    own = sum((throw.static[0] + 1j * throw.static[1] for throw in thrown), jnp.zeros_like(each[0]))
+    size = jnp.sum(jnp.abs(each))
+    left = jnp.abs(jnp.sum(each) + own) / size
+    if carrier.tilt is None:
+        return left
+    stations = jnp.zeros_like(phase) if carrier.stations is None else carrier.stations
+    lean = sum((throw.lean[0] + 1j * throw.lean[1] for throw in thrown), jnp.sum(stations * each))
+    lean = lean if carrier.seat is None else lean + carrier.seat * own
+    rows = [jnp.linalg.solve(carrier.mass, row[0]) @ row[0] for row in (carrier.port, carrier.tilt)]
+    whole = jnp.sum(jnp.abs(stations * each))
+    return jnp.maximum(left, jnp.abs(lean) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
+
+
+def _resonances(scene: Scene, rotor_speed: Array) -> Array:
+    """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
+    carrier = scene.machine.carrier()
+    if carrier.gyroscopic is None:
+        return natural_frequencies(scene)
+    found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
+    return jnp.sort(jnp.where(found.forward[0], found.speed[0], jnp.inf))

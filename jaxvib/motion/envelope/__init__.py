@@ -1,0 +1,1 @@
+"""Averaged motion of light loads."""

@@ -1,0 +1,337 @@
+"""Time integration of the averaged equations: steps of many turns."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.extend import core
+
+from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
+from jaxvib.equations.dynamics import State
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.drive import IdealDrive
+from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Measured
+from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
+from jaxvib.motion.integrate import is_finite
+from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.ode.control import Around, moved_on
+from jaxvib.ode.replay import solve
+from jaxvib.ode.rodas4 import Rodas4
+from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
+from jaxvib.units import Number, count, number, traced
+
+__all__ = ["envelope"]
+
+_WINDOW = 512
+"""Samples in the window at the end over which is measured: 25 in a beat of the slowest resonance."""
+
+_LONGEST = 256
+"""Turns of the rotor that the window is long at most, as in `simulate`."""
+
+
+class _Tolerance(Around):
+    """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
+
+    controller: Any
+    blocks: tuple[int, ...] = eqx.field(static=True)
+
+    def wrap(self, direction: Any) -> _Tolerance:
+        return _Tolerance(controller=self.controller.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
+    ) -> Any:
+        def sizes(y: Array) -> Array:
+            parts = jnp.split(jnp.abs(y), np.cumsum(self.blocks)[:-1])
+            # An angle grows without end; its error is never relative.
+            return jnp.concatenate([*(jnp.broadcast_to(jnp.max(x), x.shape) for x in parts[:-1]), jnp.zeros_like(parts[-1])])
+
+        # An error that is not a number would make the next step's length one that is not.
+        error = None if y_error is None else jnp.where(jnp.isnan(y_error), jnp.inf, y_error)
+        keep, start, end, jumped, state, result = self.controller.adapt_step_size(
+            t0, t1, sizes(y0), sizes(y1_candidate), args, error, error_order, controller_state
+        )
+        moved = moved_on(keep, start, t1, end)
+        return keep, start, end, jumped, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, moved, result)
+
+
+class _Units(eqx.Module):
+    """What counts as 1: the throw S/M of the loads, that times the rotor's speed, the rotor's speed; 1 rad."""
+
+    length: Array
+    speed: Array
+
+    def pack(self, state: Amplitudes) -> Array:
+        y, v = state.displacement / self.length, state.velocity / (self.length * self.speed)
+        return jnp.concatenate([y.real, y.imag, v.real, v.imag, state.rate / self.speed, state.phase])
+
+    def unpack(self, flat: Array, nd: int) -> Amplitudes:
+        loads = (flat.shape[-1] - 4 * nd) // 2
+        y0, y1, v0, v1, rate, phase = jnp.split(flat, np.cumsum([nd, nd, nd, nd, loads]), axis=-1)
+        speed = self.length * self.speed
+        return Amplitudes((y0 + 1j * y1) * self.length, (v0 + 1j * v1) * speed, rate * self.speed, phase)
+
+
+def envelope(
+    scene: Scene,
+    until: Number,
+    *,
+    start: Start | State = "rest",
+    mode: int | None = None,
+    spin_up: Number | None = None,
+    save: Literal["all", "window"] = "all",
+    samples: int = 256,
+    turns: int = 20,
+    tolerance: float = 1e-4,
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 2**16,
+    throw: bool = True,
+) -> Envelope:
+    """Integrates the averaged equations of `scene` from 0 to `until`: amplitudes and load speeds in place of vibrations.
+
+    A run-up through resonances, a capture or a passage takes steps of many turns. What it answers is the limit of light
+    loads: its relative error is of first order in their share of the mass times the dynamic magnification, and about as large
+    as the result's `ripple`; its equilibria are those of `jam_modes`. `averaged_field` has the equations.
+
+    Near the line between capture and passage the smallest difference decides: there ask `simulate`.
+
+    **Arguments**
+
+    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `controller`, `throw`: as `simulate`
+    - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
+    - `tolerance`: error a step may make, relative to the largest amplitude, and absolute in natural units: the throw S/M of the
+      loads for displacements, that times the rotor's speed for velocities, that speed for rates, 1 rad for phases
+    - `solver`: diffrax's, for stiff systems; `Rodas4` unless said otherwise
+    - `max_steps`: the run fails after so many steps
+
+    Gravity has no mean torque on a load that turns; where one turns too slowly against it, or its drag does not lift it from
+    the bottom of its track, the status is `not_turning`. Effects other than gravity are refused.
+
+    **Returns** `Envelope`. Gradients, forward and reverse, go through all of it; `jit` and `vmap` too.
+
+    **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish or is
+    `not_turning`.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> run = jv.envelope(scene, 60.0, start="spin_up")
+    >>> bool(run.settled), round(float(run.omega), 1), int(run.steps) < 200      # caught below the resonance at 28.1 rad/s
+    (True, 27.4, True)
+
+    Source: see `averaged_field`.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    averaged_loads(scene)
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    if save not in ("all", "window"):
+        raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
+    count(samples, "samples", low=2)
+    count(turns, "turns")
+    precision = float(jnp.finfo(end.dtype).eps)
+    if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
+        raise InputError(
+            "tolerance", f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and below 1"
+        )
+    scene = brought_up(scene, end, start, spin_up)
+    if isinstance(start, State):
+        state = whole_state(scene, start, mode)
+    else:
+        # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
+        known = start in ("rest", "spin_up") and mode is None
+        state = None if known else initial_state(scene, start, mode=mode, throw=throw)
+    run = _run(
+        scene,
+        end,
+        state,
+        solver,
+        jnp.asarray(tolerance, end.dtype) if controller is None else controller,
+        adjoint,
+        samples if save == "all" else 0,
+        turns,
+        count(max_steps, "max_steps"),
+    )
+    if throw and not traced(run.steps):
+        _raise_if_failed(run, max_steps)
+    return run
+
+
+@eqx.filter_jit
+def _run(
+    scene: Scene,
+    end: Array,
+    state: State | None,
+    solver: diffrax.AbstractSolver | None,
+    control: diffrax.AbstractStepSizeController | Array,
+    adjoint: diffrax.AbstractAdjoint | None,
+    samples: int,
+    turns: int,
+    max_steps: int,
+) -> Envelope:
+    begin = _at_rest(scene) if state is None else amplitudes_of(scene, state)
+    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    exists = is_finite(begin)
+    begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
+    field, nd = averaged_field(scene), begin.displacement.shape[0]
+    frozen = jax.lax.stop_gradient(scene)
+    units = _units(frozen)
+    speed, frequencies = frozen.drive.speed, natural_frequencies(frozen)
+    slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
+    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _LONGEST / speed)
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
+    if samples:
+        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+
+    controller = diffrax.PIDController(rtol=control, atol=control) if isinstance(control, Array) else control
+
+    rates, args = _rates(units.pack(begin), (field, units), nd)
+    solution = solve(
+        diffrax.ODETerm(rates),
+        Rodas4() if solver is None else solver,
+        end=end,
+        first_step=0.05 / jnp.maximum(speed, jnp.max(frequencies)),
+        y0=units.pack(begin),
+        args=args,
+        saveat=diffrax.SaveAt(subs=saves),
+        controller=_Tolerance(controller=controller, blocks=(2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),  # pyright: ignore[reportCallIssue]
+        adjoint=adjoint,
+        max_steps=max_steps,
+    )
+    assert solution.ts is not None and solution.ys is not None
+
+    def envelopes(times: Array, flat: Array) -> Envelopes:
+        return jax.vmap(lambda t, y: _at(scene, field, t, units.unpack(y, nd)))(times, flat)
+
+    kept = envelopes(solution.ts[0], solution.ys[0])
+    finite = is_finite(kept)
+    turning = _turning(scene, field, begin, kept)
+    result = solution.result
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.dt_min_reached, EnvelopeStatus.not_finite, EnvelopeStatus.no_step)
+    failed = EnvelopeStatus.where(result == diffrax.RESULTS.max_steps_reached, EnvelopeStatus.max_steps_reached, failed)
+    status = EnvelopeStatus.where(turning, EnvelopeStatus.done, EnvelopeStatus.not_turning)
+    status = EnvelopeStatus.where(finite, status, EnvelopeStatus.not_finite)
+    status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
+    status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
+    whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
+    seen = (_measure(kept), jnp.max(kept.ripple, axis=0), whole, kept)
+    measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
+    return Envelope(
+        **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
+        ripple=ripple,
+        status=status,
+        trajectory=whole,
+        window=kept,
+        steps=solution.stats["num_steps"],
+        rejected=solution.stats["num_rejected_steps"],
+        scene=scene,
+    )
+
+
+def _at_rest(scene: Scene) -> Amplitudes:
+    rest = initial_state(scene)
+    (angle,), (rate,) = rest.angle, rest.rate
+    return Amplitudes(rest.displacement + 0.0j, rest.velocity + 0.0j, rate, angle - jnp.mean(angle))
+
+
+def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
+    """The averaged equations on the integrator's vector, and their arguments: on single numbers, where there are few."""
+
+    def on_arrays(t: Any, y: Array, args: tuple[Averaged, _Units]) -> Array:
+        field, units = args
+        return units.pack(field(t, units.unpack(y, nd)))
+
+    program = program_on_numbers(on_arrays, jnp.zeros((), y.dtype), y, args) if y.size <= MOST_NUMBERS else None
+    if program is None:
+        return on_arrays, args
+
+    def on_numbers(t: Any, y: Array, args: list[Array]) -> Array:
+        return jnp.stack(core.jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
+
+    return on_numbers, numbers_of(args)
+
+
+def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
+    carrier = scene.machine.carrier()
+    assert isinstance(scene.drive, IdealDrive)
+    return Envelopes(
+        time=t,
+        displacement=state.displacement,
+        velocity=state.velocity,
+        amplitude=magnitude(state.displacement),
+        foundation_force=magnitude(carrier.bed_stiffness @ state.displacement + carrier.bed_damping @ state.velocity),
+        omega=jnp.mean(state.rate),
+        load_speed=state.rate,
+        phase=state.phase,
+        rotor_speed=scene.drive.speed_at(t),
+        ripple=field.ripple(state),
+    )
+
+
+def _measure(window: Envelopes) -> Measured:
+    """The window in the numbers of `Measured`: means of speeds, the greatest of each amplitude."""
+    half = window.time.shape[0] // 2
+    amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
+    speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
+    change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
+    top, omega = jnp.max(amplitude), jnp.mean(speeds)
+    drift = jnp.max(change) / jnp.where(top > 0.0, top, 1.0)
+    speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
+    return Measured(
+        omega=omega,
+        load_speed=speeds,
+        amplitude=amplitude,
+        foundation_force=force[0] if force.shape[0] == 1 else jnp.sqrt(jnp.sum(force**2)),
+        drift=jnp.maximum(drift, speed_drift),
+    )
+
+
+def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
+    """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
+    and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
+    loads, pulling = scene.loads, [effect for effect in scene.effects if isinstance(effect, Gravity)]
+    if not pulling:
+        return jnp.asarray(True)
+    angles = jnp.linspace(0.0, 2.0 * jnp.pi, 64, endpoint=False)
+    around = [jnp.broadcast_to(angle, (loads.count,)) for angle in angles]
+    height = jnp.stack([sum(effect.load_potential(loads, (u,)) for effect in pulling) for u in around])
+    slope = jax.vmap(jax.grad(lambda u: sum(jnp.sum(effect.load_potential(loads, (u,))) for effect in pulling)))
+    torque = slope(jnp.stack(around))
+    passes = (jnp.max(height, axis=0) - jnp.min(height, axis=0)) / field.inertia
+    lifted = field.drag * jnp.max(window.rotor_speed) > jnp.max(jnp.abs(torque), axis=0)
+    return jnp.all((jnp.min(window.load_speed**2, axis=0) > passes) & (lifted | (begin.rate**2 > passes)))
+
+
+def _units(scene: Scene) -> _Units:
+    mass = jnp.mean(jnp.diagonal(scene.machine.carrier().mass))
+    return _Units(averaged_loads(scene).unbalance() / mass, scene.drive.speed)
+
+
+def _raise_if_failed(run: Envelope, max_steps: int) -> None:
+    if bool(run.status == EnvelopeStatus.done):
+        return
+    require_numbers(run.scene)
+    names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_turning")
+    name = next(name for name in names if bool(run.status == getattr(EnvelopeStatus, name)))
+    hint = {
+        "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
+        "no_step": "; give a smaller tolerance, or leave the solver out",
+        "not_turning": "; integrate the full equations with simulate",
+    }
+    raise ComputationError(name, run.message + hint.get(name, ""))

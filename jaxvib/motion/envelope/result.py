@@ -1,0 +1,99 @@
+"""What an averaged run is: its motion, its quantities, how it ended."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Measured
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
+
+
+class EnvelopeStatus(eqx.Enumeration):
+    """How an averaged run ended; the members are the sentences a user reads."""
+
+    done = "the averaged run reached its end"
+    max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
+    not_finite = "the motion grew beyond all bounds"
+    no_step = "a step of the method could not be computed: its implicit equations were not solved"
+    no_start = "the state to start from does not exist or is not finite"
+    not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
+
+
+class Envelopes(eqx.Module):
+    """Averaged motion at some times.
+
+    **Attributes** (nt times): `time` (nt,) s; `displacement` (nt, nd) m and `velocity` (nt, nd) m/s, complex amplitudes at the
+    loads' mean angle; `amplitude` (nt, nd) m and `foundation_force` (nt, nb) N, zero to peak; `omega` (nt,) mean speed of the
+    loads and `load_speed` (nt, count), rad/s; `phase` (nt, count) of each load relative to the mean angle, rad;
+    `rotor_speed` (nt,) rad/s; `ripple` (nt, count) rad, see `Envelope`.
+    """
+
+    time: Array
+    displacement: Array
+    velocity: Array
+    amplitude: Array
+    foundation_force: Array
+    omega: Array
+    load_speed: Array
+    phase: Array
+    rotor_speed: Array
+    ripple: Array
+
+
+class Envelope(Measured):
+    """An averaged run of a scene: the quantities of `Measured` over the last turns, and the averaged motion.
+
+    **Attributes**: those of `Measured`; `status` an `EnvelopeStatus`; `ripple` (count,) rad, by how much the vibration that
+    averaging leaves out shakes each load's angle, largest over the window: amplitudes and speeds are off by a share of about
+    this size; `trajectory` and `window` as `Envelopes`, the former None where only the window was asked for; `steps`,
+    `rejected`; `scene`.
+    """
+
+    ripple: Array
+    status: EnvelopeStatus
+    trajectory: Envelopes | None
+    window: Envelopes
+    steps: Array
+    rejected: Array
+    scene: Scene
+
+    @property
+    def message(self) -> str:
+        """How the run ended, a sentence."""
+        return EnvelopeStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
+    def summary(self) -> str:
+        """What happened, for a person to read; amplitudes zero to peak."""
+        speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
+        state = "settled" if bool(self.settled) else "not settled"
+        return "\n".join(
+            [
+                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
+                f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
+                f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
+                f"  {self.extent(self.scene)}",
+                f"  averaged: relative error of the order of {float(jnp.max(self.ripple)):.1e}",
+            ]
+        )
+
+    def plot(self) -> Figure:
+        """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time. **Returns** a figure."""
+        from jaxvib.draw.charts import time_histories
+
+        kept = self.window if self.trajectory is None else self.trajectory
+        return time_histories(
+            *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
+            names=self.scene.machine.structure().coordinates,
+            units=self.scene.machine.structure().units,
+        )

@@ -1,0 +1,1 @@
+"""Small linear algebra, roots and Fourier interpolation on plain arrays."""

@@ -1,0 +1,233 @@
+"""Small linear algebra, written out: no library call stands in a time loop or waits in a large batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+__all__ = [
+    "damped_newton",
+    "eliminate",
+    "hermitian_modes",
+    "magnitude",
+    "relative_to",
+    "root_or_zero",
+    "small_inverse",
+    "small_solve",
+    "written_inverse",
+]
+
+
+def small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
+    """x of a x = b for a few equations, written out; the entries may be arrays of many such systems."""
+    n = len(a)
+    if n == 1:
+        return lambda b: (b[0] / a[0][0],)
+    if n == 2:
+        det = a[0][0] * a[1][1] - a[0][1] * a[1][0]
+        return lambda b: ((a[1][1] * b[0] - a[0][1] * b[1]) / det, (a[0][0] * b[1] - a[1][0] * b[0]) / det)
+    return lambda b: _eliminate(a, b)
+
+
+def _eliminate(a: Sequence[Sequence[Any]], b: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Gauss' elimination, in each column the row with the largest entry first."""
+    rows = [[*line, right] for line, right in zip(a, b, strict=True)]
+    n = len(rows)
+    for k in range(n):
+        for i in range(k + 1, n):
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = (
+                [jnp.where(swap, y, x) for x, y in zip(rows[k], rows[i], strict=True)],
+                [jnp.where(swap, x, y) for x, y in zip(rows[k], rows[i], strict=True)],
+            )
+        for i in range(k + 1, n):
+            factor = rows[i][k] / rows[k][k]
+            rows[i] = [y - factor * x if j > k else y for j, (x, y) in enumerate(zip(rows[k], rows[i], strict=True))]
+    x: list[Any] = [None] * n
+    for i in reversed(range(n)):
+        x[i] = (rows[i][n] - sum(rows[i][j] * x[j] for j in range(i + 1, n))) / rows[i][i]
+    return tuple(x)
+
+
+def relative_to(metric: Array, matrix: Array) -> tuple[Array, Array]:
+    """L^-1 A L^-T (nd, nd) and L^-1 of a positive definite metric L L^T; its eigenvalues solve A x = value L L^T x."""
+    n = metric.shape[0]
+    if n > 3:
+        eye = jnp.eye(n, dtype=metric.dtype)
+        inverse = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(metric), eye, lower=True)
+    else:
+        inverse = _small_factor_inverse(metric)
+    return inverse @ matrix @ inverse.T, inverse
+
+
+def _small_factor_inverse(metric: Array) -> Array:
+    """L^-1 of L L^T up to 3 x 3, written out: see `_small_modes`."""
+    n = metric.shape[0]
+    zero = jnp.zeros_like(metric[0, 0])
+    factor: list[list[Array]] = [[zero] * n for _ in range(n)]
+    inverse: list[list[Array]] = [[zero] * n for _ in range(n)]
+    for i in range(n):
+        for j in range(i):
+            factor[i][j] = (metric[i, j] - sum(factor[i][k] * factor[j][k] for k in range(j))) / factor[j][j]
+        factor[i][i] = jnp.sqrt(metric[i, i] - sum(factor[i][k] ** 2 for k in range(i)))
+        for j in range(i):
+            inverse[i][j] = -sum(factor[i][k] * inverse[k][j] for k in range(j, i)) / factor[i][i]
+        inverse[i][i] = 1.0 / factor[i][i]
+    return jnp.stack([jnp.stack(row) for row in inverse])
+
+
+def root_or_zero(values: Array) -> Array:
+    """Roots of eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its derivative."""
+    there = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
+    return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
+
+
+@jax.custom_jvp
+def hermitian_modes(square: Array) -> tuple[Array, Array]:
+    """Ascending eigenvalues (..., n) and eigenvectors (..., n, n) of Hermitian matrices.
+
+    The vectors of equal eigenvalues, which are not unique, have derivative 0 among each other in place of NaN.
+    """
+    if square.shape[-1] > 3 or jnp.iscomplexobj(square):
+        return jnp.linalg.eigh(square)
+    return _small_modes(square)
+
+
+def _small_modes(square: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by Jacobi's rotations, written out.
+
+    Not for speed alone: on two cores, library calls for large batches in one program can wait for each other for
+    ever (jaxlib 0.10), and machines of up to three platforms are the ones that are judged by the hundred thousand.
+    """
+    n = square.shape[-1]
+    entries = tuple(tuple(square[..., i, j] for j in range(n)) for i in range(n))
+    axes = tuple(tuple(jnp.full_like(square[..., 0, 0], float(i == j)) for j in range(n)) for i in range(n))
+
+    def sweep(_: int, state: tuple) -> tuple:
+        a, v = ([list(row) for row in part] for part in state)
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                off = a[p][q]
+                ratio = (a[q][q] - a[p][p]) / (2.0 * jnp.where(off == 0.0, 1.0, off))
+                tangent = jnp.where(ratio < 0.0, -1.0, 1.0) / (jnp.abs(ratio) + jnp.sqrt(ratio**2 + 1.0))
+                tangent = jnp.where(off == 0.0, 0.0, tangent)
+                cosine = 1.0 / jnp.sqrt(tangent**2 + 1.0)
+                sine = tangent * cosine
+                a[p][p], a[q][q] = a[p][p] - tangent * off, a[q][q] + tangent * off
+                a[p][q] = a[q][p] = jnp.zeros_like(off)
+                for r in range(n):
+                    if r not in (p, q):
+                        a[r][p], a[r][q] = cosine * a[r][p] - sine * a[r][q], sine * a[r][p] + cosine * a[r][q]
+                        a[p][r], a[q][r] = a[r][p], a[r][q]
+                    v[r][p], v[r][q] = cosine * v[r][p] - sine * v[r][q], sine * v[r][p] + cosine * v[r][q]
+        return tuple(tuple(row) for row in a), tuple(tuple(row) for row in v)
+
+    a, v = jax.lax.fori_loop(0, (0, 0, 1, 6)[n], sweep, (entries, axes))
+    values = jnp.stack([a[i][i] for i in range(n)], axis=-1)
+    vectors = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
+    order = jnp.argsort(values, axis=-1)
+    return jnp.take_along_axis(values, order, -1), jnp.take_along_axis(vectors, order[..., None, :], -1)
+
+
+@hermitian_modes.defjvp
+def _hermitian_modes_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    values, vectors = hermitian_modes(*primals)
+    change = (tangents[0] + tangents[0].conj().mT) / 2.0
+    turned = vectors.conj().mT @ change @ vectors
+    gap = values[..., None, :] - values[..., :, None]
+    top = jnp.max(jnp.abs(values), axis=-1)[..., None, None]
+    apart = jnp.abs(gap) > values.shape[-1] * jnp.finfo(values.dtype).eps * top
+    mixing = jnp.where(apart, turned / jnp.where(apart, gap, 1.0), 0.0)
+    return (values, vectors), (jnp.diagonal(turned, axis1=-2, axis2=-1).real, vectors @ mixing)
+
+
+def magnitude(value: Array) -> Array:
+    """|value| of complex numbers, with derivative 0 in place of NaN where the value is exactly 0."""
+    square = value.real**2 + value.imag**2
+    zero = square == 0.0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
+
+
+def small_solve(a: Array, b: Array) -> Array:
+    """x of a x = b; written out for 1, 2 and 3 equations (many times faster than a library call under `vmap`)."""
+    n = b.shape[0]
+    if n == 1:
+        return b / a[0, 0]
+    if n == 2:
+        det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+        return jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]]) / det
+    if n == 3:
+        rows = [[a[i, 0], a[i, 1], a[i, 2]] for i in range(3)]
+        minors = [_cross(rows[1], rows[2]), _cross(rows[2], rows[0]), _cross(rows[0], rows[1])]
+        det = sum(rows[0][k] * minors[0][k] for k in range(3))
+        return jnp.stack([sum(minors[i][k] * b[i] for i in range(3)) for k in range(3)]) / det
+    return jnp.linalg.solve(a, b)
+
+
+def _cross(x: list[Array], y: list[Array]) -> list[Array]:
+    return [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+
+
+def damped_newton(balance: Callable[[Array], Array], start: Array, iterations: int = 40) -> Array:
+    """A zero of `balance`, by steps that are damped where they do not help (Levenberg, Marquardt), from `start`."""
+
+    def step(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        x, value, slopes, damping = carry
+        normal = slopes.T @ slopes
+        damped = normal + damping * jnp.diag(jnp.diagonal(normal) + jnp.finfo(x.dtype).tiny)
+        change = eliminate(damped, slopes.T @ value)
+        trial = x - jnp.clip(change, -0.5, 0.5)
+        new = balance(trial)
+        better = jnp.sum(new**2) < jnp.sum(value**2)  # and not NaN
+        slopes = jnp.where(better, jax.jacfwd(balance)(trial), slopes)
+        damping = jnp.clip(jnp.where(better, 0.1 * damping, 8.0 * damping), 1e-14, 1e8)
+        return jnp.where(better, trial, x), jnp.where(better, new, value), slopes, damping
+
+    first = (start, balance(start), jax.jacfwd(balance)(start), jnp.asarray(1e-2, start.dtype))
+    return jax.lax.fori_loop(0, iterations, step, first)[0]
+
+
+def eliminate(a: Array, b: Array) -> Array:
+    """x (n,) or (n, m) of a x = b, by elimination with pivots.
+
+    Library calls for large batches in one program can wait for each other for ever (jaxlib 0.10, two cores).
+    """
+    n = a.shape[0]
+    place = jnp.arange(n)
+
+    def eliminated(k: int, rows: Array) -> Array:
+        pivot = jnp.argmax(jnp.where(place >= k, jnp.abs(rows[:, k]), -1.0))
+        rows = rows[jnp.where(place == k, pivot, jnp.where(place == pivot, k, place))]
+        line = rows[k] / rows[k, k]
+        return jnp.where((place == k)[:, None], line[None, :], rows - rows[:, k][:, None] * line[None, :])
+
+    rows = jnp.concatenate([a, b.reshape(n, -1).astype(a.dtype)], axis=1)
+    return jax.lax.fori_loop(0, n, eliminated, rows)[:, n:].reshape(b.shape)
+
+
+@jax.custom_jvp
+def written_inverse(matrix: Array) -> Array:
+    """The inverse by Gauss and Jordan's elimination, written out: a library call would keep the compiler from fusing the
+    time loop, and large batches of them can wait for each other for ever on few cores (jaxlib 0.10).
+
+    There is no search for pivots. It is for matrices whose diagonal outweighs the rest: 1/(gamma h) - J does where h is
+    small, and a step that lost its digits is refused by its own error estimate, and tried again with a smaller h.
+    """
+    for i in range(matrix.shape[0]):
+        here = np.arange(matrix.shape[0]) == i
+        pivot = 1.0 / matrix[i, i]
+        row = jnp.where(here, pivot, matrix[i] * pivot)
+        others = jnp.where(here[None, :], 0.0, matrix) - matrix[:, i][:, None] * row[None, :]
+        matrix = jnp.where(here[:, None], row[None, :], others)
+    return matrix
+
+
+@written_inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    inverse = written_inverse(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse

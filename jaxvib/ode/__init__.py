@@ -1,0 +1,1 @@
+"""The integration engine: solvers, step-size control and adjoints for any pytree of arrays."""

@@ -1,0 +1,131 @@
+"""A stiff solver without iterations, for small systems whose Jacobian is cheap."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jaxvib.numerics.linalg import written_inverse
+from jaxvib.ode.batching import VECTOR
+
+__all__ = ["Rodas4"]
+
+_A = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.544, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [0.9466785280815826, 0.2557011698983284, 0.0, 0.0, 0.0, 0.0],
+        [3.314825187068521, 2.896124015972201, 0.9986419139977817, 0.0, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.687886036105895, 1.0, 0.0],
+    ]
+)
+_C = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [-5.6688, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [-2.430093356833875, -0.2063599157091915, 0.0, 0.0, 0.0, 0.0],
+        [-0.1073529058151375, -9.594562251023355, -20.47028614809616, 0.0, 0.0, 0.0],
+        [7.496443313967647, -10.24680431464352, -33.99990352819905, 11.7089089320616, 0.0, 0.0],
+        [8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054, 0.0],
+    ]
+)
+_NODES = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
+_SLOPES = np.array([0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0])
+_GAMMA = 0.25
+_DENSE = (
+    (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
+    (-0.6762803392801253, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
+)
+
+
+class _Interpolation(diffrax.AbstractLocalInterpolation):
+    """The method's own continuous answer, of order 3: a cubic through both ends, without derivatives that stiffness spoils."""
+
+    t0: Any
+    t1: Any
+    y0: Array
+    y1: Array
+    bend: Array
+    twist: Array
+
+    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Array:
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        span = self.t1 - self.t0
+        s = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
+        return (1.0 - s) * self.y0 + s * (self.y1 + (1.0 - s) * (self.bend + s * self.twist))
+
+
+class Rodas4(diffrax.AbstractAdaptiveSolver):
+    """Hairer and Wanner's RODAS: a Rosenbrock method of order 4 with 6 stages, an error estimate of order 3 and its own
+    interpolant. L-stable and stiffly accurate.
+
+        (1/(gamma h) - J) k_i = f(t + c_i h, y + sum_j a_ij k_j) + sum_j (c_ij / h) k_j + h d_i df/dt,   y_new = y + sum b_i k_i
+
+    A step costs one Jacobian J by forward mode, one inverse and 6 evaluations, whatever the step's length; there is no
+    Newton iteration to wait for or to fail. The state is one vector of a few dozen numbers at most.
+
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, section IV.7.
+    """
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
+
+    def order(self, terms: Any) -> int:
+        """4."""
+        return 4
+
+    def error_order(self, terms: Any) -> int:
+        """4: the error estimate falls with the fourth power of the step."""
+        return 4
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Array, args: Any) -> None:
+        """Nothing is carried from step to step."""
+
+    def func(self, terms: Any, t0: Any, y0: Array, args: Any) -> Array:
+        """The vector field."""
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Array, args: Any, solver_state: None, made_jump: Any) -> Any:
+        """One step from t0 to t1."""
+        h = t1 - t0
+        # A padded step has no length; its inverse must not be a division by 0.
+        per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
+        jacobian, change = _slopes(terms, t0, y0, args)
+        inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
+
+        def mixed(weights: Any, stages: Array) -> Array:
+            return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))
+
+        def stage(i: Array, stages: Array) -> Array:
+            a, c, node, slope = (jnp.asarray(table, y0.dtype)[i] for table in (_A, _C, _NODES, _SLOPES))
+            right = terms.vf(t0 + node * h, y0 + mixed(a, stages), args) + slope * h * change + per_step * mixed(c, stages)
+            return lax.dynamic_update_index_in_dim(stages, jnp.sum(inverse * right[None, :], axis=1), i, 0)
+
+        stages = lax.fori_loop(0, len(_A), stage, jnp.zeros((len(_A), *y0.shape), y0.dtype))
+        y1 = y0 + mixed(_A[-1].tolist(), stages) + stages[-1]
+        bend, twist = (mixed(row, stages) for row in _DENSE)
+        dense = dict(y0=y0, y1=y1, bend=bend, twist=twist)
+        return y1, stages[-1], dense, None, diffrax.RESULTS.successful
+
+
+def _slopes(terms: Any, t: Array, y: Array, args: Any) -> tuple[Array, Array]:
+    """df/dy (n, n) and df/dt (n,): derivatives of numbers in directions along a last axis, filled up to whole vectors."""
+    n = y.shape[0]
+    directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
+
+    def slope(*direction: Array) -> Array:
+        numbers = (t, *(y[i] for i in range(n)))
+        return jax.jvp(lambda t, *y: terms.vf(t, jnp.stack(y), args), numbers, direction)[1]
+
+    found = jax.vmap(slope, in_axes=-1, out_axes=-1)(*directions)
+    return found[:, 1 : n + 1], found[:, 0]

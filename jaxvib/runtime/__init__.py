@@ -1,0 +1,1 @@
+"""Compiler settings and compiled programs kept on disk."""

@@ -1,0 +1,1 @@
+"""Auto-balancing: characteristic speeds, the criterion, stability."""

@@ -1,0 +1,172 @@
+"""The empirical criterion of auto-balancing: at which rotor speeds loads spread and cancel, at which they gather."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import circular_loads, turning
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+
+__all__ = ["Criterion", "CriterionStatus", "criterion", "criterion_functional", "criterion_table"]
+
+
+class CriterionStatus(eqx.Enumeration):
+    """What is known of a machine that was judged; the members are the sentences a user reads."""
+
+    judged = "every rotor speed is judged"
+    free = "no support holds the machine against one of its motions: its lowest resonance is 0, and it can drift"
+
+
+class Criterion(eqx.Module):
+    """The criterion's answer for one machine with its loads.
+
+    **Attributes**: `status` a `CriterionStatus`; `speeds` the `CharacteristicSpeeds`; intervals of rotor speed, rows
+    [from, to] in rad/s, `inf` where there is no end, NaN rows where there is no interval: `balancing` (nd, 2) where f
+    < 0 and auto-balancing is stable, `gathering` (nd, 2) where f > 0 and loads gather, with the machine's damping,
+    and `undamped_balancing`, `undamped_gathering` without.
+    """
+
+    status: CriterionStatus
+    speeds: CharacteristicSpeeds
+    balancing: Array
+    gathering: Array
+    undamped_balancing: Array
+    undamped_gathering: Array
+
+    @property
+    def resonances(self) -> Array:
+        """Undamped, (nd,) rad/s."""
+        return self.speeds.resonances
+
+    @property
+    def additional(self) -> Array:
+        """Undamped, (nd - 1,) rad/s."""
+        return self.speeds.additional
+
+    def balances(self, speed: Array) -> Array:
+        """Whether the criterion calls auto-balancing stable at a rotor speed (any shape, rad/s)."""
+        w = jnp.asarray(speed)
+        return jnp.any(jnp.stack([(start < w) & (w < end) for start, end in self.balancing]), axis=0)
+
+    def summary(self) -> str:
+        """A table a person can read."""
+
+        def written(intervals: list[list[float | None]]) -> str:
+            return ", ".join(f"{a:.6g} .. {'infinity' if b is None else f'{b:.6g}'}" for a, b in intervals)
+
+        table = criterion_table(self)
+        lines = [f"{table['status']}", self.speeds.summary()]
+        lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
+        return "\n".join(lines)
+
+
+def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:
+    """The criterion's functional at speed `omega` (scalar, rad/s): mean of S . r over one turn, kg m^2.
+
+        f(S, w) = (S^2 w^2 / 2) Re(e^H A(w) e)
+
+    S is the loads' common unbalance and r the displacement of the exciter's axis under it, A the receptance of the
+    port and e the direction that turns; for a port of two directions e^H A e is the trace of A, plus what a
+    gyroscopic coupling adds. Where f < 0 the axis moves away from the loads and they spread until they balance; where
+    f > 0 they gather. The paper claims it for two or more loads, and approximately: see `balanced_stability` for the
+    exact answer.
+
+    **Arguments**: `unbalance` S kg m; left out, that of all loads collected at one point.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> [bool(jv.criterion_functional(scene, w) < 0) for w in (28.0, 29.0)]     # the resonance is at 28.28 rad/s
+    [False, True]
+
+    Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
+    """
+    direction = turning(scene.machine.carrier())
+    size = circular_loads(scene).unbalance() if unbalance is None else unbalance
+    receptance = jnp.sum(direction.conj() * (port_receptance(scene, omega) @ direction)).real
+    return size**2 * omega**2 / 2.0 * receptance
+
+
+def criterion(scene: Scene) -> Criterion:
+    """Judges every rotor speed of a scene's machine: where its loads balance it, where they gather.
+
+    The functional f of `criterion_functional` changes sign at the characteristic speeds alone, from + to - at a
+    resonance and back at an additional speed, so these are the ends of the intervals.
+
+    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`. **Raises** `InputError` as there.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
+    ...                         link_damping=0.01, rho=1.0, eps=1e-3, beta=1.0, speed=3.0, count=2)
+    >>> [[round(float(w), 4) for w in row] for row in jv.criterion(form.scene()).balancing]
+    [[0.3334, 0.7467], [0.998, inf]]
+
+    Source: Filimonikhin et al. 2022, sections 5.1-5.3, for any carrier.
+    """
+    speeds = characteristic_speeds(scene)
+    return Criterion(
+        status=CriterionStatus.where(speeds.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged),
+        speeds=speeds,
+        balancing=_balancing(speeds.damped_resonances, speeds.damped_additional),
+        gathering=_gathering(speeds.damped_resonances, speeds.damped_additional),
+        undamped_balancing=_balancing(speeds.resonances, speeds.additional),
+        undamped_gathering=_gathering(speeds.resonances, speeds.additional),
+    )
+
+
+def _balancing(resonances: Array, additional: Array) -> Array:
+    ends = jnp.append(jnp.where(jnp.isnan(additional), jnp.inf, additional), jnp.inf)
+    return jnp.stack([resonances, jnp.where(jnp.isnan(resonances), jnp.nan, ends)], axis=1)
+
+
+def _gathering(resonances: Array, additional: Array) -> Array:
+    starts = jnp.concatenate([jnp.zeros_like(resonances[:1]), additional])
+    ends = jnp.where(jnp.isnan(resonances), jnp.inf, resonances)
+    return jnp.stack([starts, jnp.where(jnp.isnan(starts), jnp.nan, ends)], axis=1)
+
+
+def criterion_table(result: Criterion) -> dict[str, Any]:
+    """A machine's judgement as plain lists and numbers, ready for JSON; speeds in rad/s.
+
+    **Returns** a dict: `status` a sentence; `resonances`, `additional` lists of speeds without damping,
+    `damped_resonances`, `damped_additional` with; `balancing`, `gathering` lists of [from, to] with damping,
+    `undamped_balancing`, `undamped_gathering` without. `to` is None where the interval has no end. Intervals that
+    touch are one; empty ones are left out.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=49.0, stiffness=1e6, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> table = jv.criterion_table(jv.criterion(scene))
+    >>> [[round(a, 3), b] for a, b in table["balancing"]], [[a, round(b, 3)] for a, b in table["gathering"]]
+    ([[141.421, None]], [[0.0, 141.421]])
+    """
+    speeds = result.speeds
+    lists = {
+        name: [float(w) for w in getattr(speeds, name) if not np.isnan(w)]
+        for name in ("resonances", "additional", "damped_resonances", "damped_additional")
+    }
+    intervals = {
+        name: _joined(np.asarray(getattr(result, name)))
+        for name in ("balancing", "gathering", "undamped_balancing", "undamped_gathering")
+    }
+    return {"status": CriterionStatus[result.status], **lists, **intervals}
+
+
+def _joined(rows: np.ndarray) -> list[list[float | None]]:
+    """Rows [from, to] without the empty ones, those that touch joined, both as far as rounding can tell."""
+    joined: list[list[float]] = []
+    close = np.sqrt(np.finfo(rows.dtype).eps)
+    for start, end in rows[~np.isnan(rows[:, 0])].tolist():
+        if end - start <= close * start:
+            continue
+        if joined and start - joined[-1][1] <= close * start:
+            joined[-1][1] = end
+        else:
+            joined.append([start, end])
+    return [[start, None if np.isinf(end) else end] for start, end in joined]

@@ -1,0 +1,249 @@
+"""Characteristic speeds of a machine: where the mean pull of its exciter on collected loads changes sign."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import dynamic_stiffness, loaded_mass, require_one_point, turning
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.numerics.roots import bracketed_root
+from jaxvib.units import traced
+
+__all__ = ["CharacteristicSpeeds", "characteristic_speeds", "port_receptance"]
+
+_POINTS = 24
+"""Grid points on each side of each resonance, where sign changes of the damped machine are looked for."""
+
+
+class CharacteristicSpeeds(eqx.Module):
+    """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN where there is none.
+
+    **Attributes** (nd coordinates)
+
+    - `resonances` (nd,): poles of the receptance without damping, where a load's pull turns from gathering to balancing
+    - `additional` (nd - 1,): its zeros, where it turns back; they are the resonances of the machine with its port held
+    - `shapes` (nd, nd): the resonances' mode shapes, a column each, of unit modal mass, the sign free
+    - `damped_resonances` (nd,), `damped_additional` (nd - 1,): the same changes of sign with the machine's damping
+    - `coordinates`: the names of the rows of `shapes`
+
+    A mode that does not move the port has its resonance among the additional speeds too: nothing changes sign there.
+    """
+
+    resonances: Array
+    additional: Array
+    shapes: Array
+    damped_resonances: Array
+    damped_additional: Array
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+
+    def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
+        """Every speed with its label ("resonance 1", "additional 1", ...), ascending."""
+        kinds = ("resonance", "additional")
+        speeds = (self.damped_resonances, self.damped_additional) if damped else (self.resonances, self.additional)
+        rows = zip(kinds, speeds, strict=True)
+        pairs = [(f"{kind} {k + 1}", float(w)) for kind, row in rows for k, w in enumerate(row)]
+        # Where speeds coincide the order is resonance k, additional k, resonance k + 1.
+        pairs.sort(key=lambda pair: (int(pair[0].split()[1]), pair[0][0] != "r"))
+        return [pair for pair in pairs if pair[1] == pair[1]]
+
+    def summary(self) -> str:
+        """A table a person can read: each speed without and with damping, and each resonance's mode shape."""
+        damped = dict(self.labelled(damped=True))
+        lines = [f"{'':14s}{'undamped':>12s}{'damped':>12s}  rad/s; mode shape ({', '.join(self.coordinates)})"]
+        for label, speed in self.labelled():
+            line = f"{label:14s}{speed:12.6g}{f'{damped[label]:.6g}' if label in damped else 'none':>12s}"
+            if label.startswith("resonance"):
+                shape = self.shapes[:, int(label.split()[1]) - 1]
+                largest = shape[jnp.argmax(jnp.abs(shape))]
+                line += "  " + ", ".join(f"{x:.3g}" for x in (shape / largest).tolist())
+            lines.append(line)
+        return "\n".join(lines)
+
+
+def port_receptance(scene: Scene, omega: Array) -> Array:
+    """The exciter's port: displacement per force at speed `omega` (scalar, rad/s), (np, np) complex, m/N.
+
+        A(w) = B [K - w^2 (M + sum m_j B^T B) + i w (C + w G)]^-1 B^T,     displacement = Re(A F exp(i w t))
+
+    The loads' masses move with the port; G, where there is one, takes the rotor's speed w.
+
+    **Arguments**: `scene`; `omega`.
+
+    **Returns** (np, np) complex. It raises nothing of its own: at a resonance that nothing damps its numbers are not finite.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> print(jv.port_receptance(scene, 100.0)[0, 0].real)      # 1 / (40000 - 100^2 * 50)
+    -2.173913...e-06
+
+    Source: Filimonikhin et al. 2022, equations (14), (30), (48), for any carrier.
+    """
+    port = scene.machine.carrier().port
+    stiffness = dynamic_stiffness(scene, jnp.asarray(omega, dtype=port.dtype))
+    columns = [small_solve(stiffness, row.astype(stiffness.dtype)) for row in port]
+    return port @ jnp.stack(columns, axis=1)
+
+
+def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
+    """Resonances and additional speeds of a scene's machine with its loads, without and with damping.
+
+    Collected loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
+    one direction, (1, -i) for two). What is judged is the mean of push times displacement, with b = B^T e:
+
+        Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)
+
+    which without coupling through the rotor's speed is the trace of A. Undamped, its poles are the eigenvalues of
+    K y = w^2 (M_S - i G) y, its zeros those of the same problem on b^H y = 0 (the port held), and they interlace.
+    Damped, its sign changes are bracketed on a grid between the lowest and the highest undamped resonance: outside that
+    range damping cannot change the sign, since Re(b^H D^-1 b) = y^H (K - w^2 M_S) y with y = D^-1 b. A damper between
+    the exciter's platform and the bed moves no speed at all: it adds to the imaginary part of 1/A alone.
+
+    **Returns** `CharacteristicSpeeds`; every speed has exact derivatives with respect to every number of the scene,
+    forward and reverse, finite for equal resonances and for links without stiffness (0 for a resonance at speed 0).
+    Two sign changes closer to each other than 1e-11 of the highest resonance count as none. `vmap` over scenes judges
+    many machines.
+
+    **Raises** `InputError` where no coordinate moves the port, a spring is too stiff beside the others for the
+    precision, a gyroscopic carrier has a motion that no spring holds, or loads have stations of their own.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
+    ...                         link_damping=0.01, rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> speeds = jv.characteristic_speeds(form.scene())
+    >>> [(label, round(w, 4)) for label, w in speeds.labelled()]
+    [('resonance 1', 0.3333), ('additional 1', 0.7454), ('resonance 2', 1.0)]
+    >>> [(label, round(w, 4)) for label, w in speeds.labelled(damped=True)]
+    [('resonance 1', 0.3334), ('additional 1', 0.7467), ('resonance 2', 0.998)]
+
+    Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints mended, for any carrier.
+    """
+    require_one_point(scene)
+    _require_port_that_moves(scene)
+    return _characteristic_speeds(scene)
+
+
+@eqx.filter_jit
+def _characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
+    carrier = scene.machine.carrier()
+    direction = _direction(scene)
+    if carrier.gyroscopic is None:
+        square, inverse = relative_to(loaded_mass(scene), carrier.stiffness)
+        values, vectors, held = _free_and_held_modes(square, inverse @ direction)
+        resonances, additional = root_or_zero(values), root_or_zero(held)
+        shapes = inverse.T @ vectors
+    else:
+        # K is the metric: with a large polar moment M_S - i G is not positive definite, and a resonance is missing.
+        square, inverse = relative_to(carrier.stiffness, loaded_mass(scene) - 1j * carrier.gyroscopic)
+        values, vectors, held = _free_and_held_modes(square, inverse @ direction)
+        resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
+        shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
+    changes = _sign_changes(scene, direction, resonances, additional, shapes)
+    return CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
+
+
+def _direction(scene: Scene) -> Array:
+    """b = B^T e (nd,); real for a port with one direction, whose phase does not matter."""
+    carrier = scene.machine.carrier()
+    return carrier.port[0] if len(carrier.axes) == 1 else carrier.port.T @ turning(carrier)
+
+
+def _require_port_that_moves(scene: Scene) -> None:
+    """Input checks, for concrete numbers only."""
+    carrier = scene.machine.carrier()
+    parts = (carrier.port, carrier.stiffness, loaded_mass(scene))
+    if any(traced(part) for part in parts):
+        return
+    port, stiffness, mass = (np.asarray(part) for part in parts)
+    if not np.any(port):
+        problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
+        raise InputError("machine.port", problem)
+    if carrier.gyroscopic is not None:
+        if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
+            raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
+        return
+    # Resonances that rounding takes to 0 beside the highest, though a spring holds the motion.
+    rounding = mass.shape[0] * np.finfo(mass.dtype).eps
+    inverse = np.linalg.inv(np.linalg.cholesky(mass))
+    squares = np.linalg.eigvalsh(inverse @ stiffness @ inverse.T)
+    size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
+    free = np.sum(np.linalg.eigvalsh(stiffness / np.outer(size, size)) <= 100.0 * rounding)
+    if np.sum(squares <= rounding * squares[-1]) > free:
+        stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
+        name = carrier.coordinates[stiff]
+        cannot = "cannot move beside the others in this precision; soften its spring, or leave it out of the machine"
+        if np.any(port[:, stiff]):
+            raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
+        raise InputError("machine.stiffness", f"is so high at {name} that it {cannot}")
+
+
+def _inverse_root(values: Array) -> Array:
+    there = values > 0.0
+    return jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.nan)
+
+
+def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
+    """Ascending eigenvalues, vectors of `square` (nd, nd), and its eigenvalues (nd - 1,) on what is orthogonal to c."""
+    size = magnitude(c[0])
+    phase = jnp.where(size > 0.0, c[0] / jnp.where(size > 0.0, size, 1.0), 1.0)
+    # The reflection that turns c into the first axis leaves the other axes as a basis of what is orthogonal to c.
+    mirror = c.at[0].add(phase * jnp.sqrt(jnp.sum((c * c.conj()).real)))
+    length = jnp.sum((mirror * mirror.conj()).real)
+    reflect = jnp.eye(c.shape[0], dtype=c.dtype) - 2.0 * jnp.outer(mirror, mirror.conj()) / length
+    held = (reflect @ square @ reflect).at[0, :].set(0.0).at[:, 0].set(0.0)
+    # One call for both; the port's own direction gets an eigenvalue above all others.
+    held = held.at[0, 0].set(2.0 * jnp.sqrt(jnp.sum(jnp.abs(jax.lax.stop_gradient(square)) ** 2)))
+    values, vectors = hermitian_modes(jnp.stack([square.astype(held.dtype), held]))
+    return values[0], vectors[0], values[1, :-1]
+
+
+def _sign_changes(scene: Scene, direction: Array, resonances: Array, additional: Array, shapes: Array) -> Array:
+    """Where Re(b^H D(w)^-1 b) changes sign, ascending (2 nd - 1,), the first from + to -; NaN where there is none."""
+    frozen, b, poles, zeros, forms = jax.lax.stop_gradient((scene, direction, resonances, additional, shapes))
+    carrier = scene.machine.carrier()
+    last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
+    trace = jnp.finfo(last.dtype).eps ** 0.75 * last
+    # Adds nothing to the real part of 1/A, so moves no sign change, and makes the function smooth at the poles.
+    mobility = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
+    smooth = 1j * last**2 / mobility * jnp.outer(b, b.conj())
+
+    def pull(s: Scene, w: Array) -> Array:
+        # A trace of damping: a mode that never moves the port and has none would divide 0 by 0 at its resonance.
+        matrix = dynamic_stiffness(s, w) + 2j * w * trace * loaded_mass(frozen) + smooth
+        return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
+
+    width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + trace
+    poles = jnp.where(jnp.isnan(poles), last, poles)
+    if carrier.gyroscopic is not None:
+        # A rotor with a large polar moment can have its last sign change above the last resonance.
+        end = 4.0 * jnp.maximum(last, jnp.max(jnp.where(jnp.isnan(zeros), 0.0, zeros), initial=0.0))
+        poles, width = jnp.append(poles, end), jnp.append(width, last)
+    s = (jnp.arange(_POINTS) + 0.5)[None, :] / _POINTS
+    half = (poles[1:] - poles[:-1])[:, None] / 2.0
+    left, right = width[:-1, None], width[1:, None]
+    inside = jnp.concatenate(
+        [
+            poles[:-1, None] + left * jnp.sinh(s * jnp.arcsinh(half / left)),
+            poles[1:, None] - right * jnp.sinh(s[:, ::-1] * jnp.arcsinh(half / right)),
+        ],
+        axis=1,
+    )
+    grid = jnp.concatenate([0.999 * poles[:1], inside.ravel(), 1.001 * poles[-1:]])
+
+    # Below the first resonance the sign is + whatever the damping; a machine that can drift has its change at speed 0.
+    # (A loop, so that many machines at once need the memory of one grid point each.)
+    positive = jnp.append(jnp.asarray([True]), jax.lax.map(lambda w: pull(frozen, w) > 0.0, grid[1:]))
+    passed = jnp.cumsum(positive[1:] != positive[:-1])
+    order = jnp.arange(2 * resonances.shape[0] - 1)
+    cell = jnp.minimum(jnp.sum(passed[None, :] <= order[:, None], axis=1), passed.shape[0] - 1)
+    found = order < passed[-1]
+    refine = lambda lo, hi: bracketed_root(lambda w: pull(scene, w), lo, hi)  # noqa: E731
+    roots = jax.vmap(refine)(grid[cell], grid[cell + 1])
+    roots = jnp.where((order == 0) & (grid[0] == 0.0), 0.0, roots)
+    return jnp.where(found, roots, jnp.nan)

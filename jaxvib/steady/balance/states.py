@@ -1,0 +1,363 @@
+"""The balanced motion: how loads can cancel each other, and whether that motion is stable, exactly."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.linear import circular_loads, natural_frequencies
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
+
+__all__ = [
+    "BalanceStatus",
+    "BalancedStability",
+    "BalancedStates",
+    "balanced_growth",
+    "balanced_intervals",
+    "balanced_stability",
+    "balanced_states",
+]
+
+_BATCH = 16
+"""Rotor speeds whose monodromies are computed side by side."""
+
+
+class BalanceStatus(eqx.Enumeration):
+    """Whether loads can cancel each other; the members are the sentences a user reads."""
+
+    unique = "the loads cancel in one arrangement, up to a common turn and a mirror image"
+    family = "the loads cancel in a family of arrangements, with neutral directions besides the common turn"
+    alone = "a single load has nothing to cancel it"
+    outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together: nothing can cancel it"
+
+
+class BalancedStates(eqx.Module):
+    """How a set of loads can cancel each other and the rotor's imbalance, in the frame of the rotor.
+
+    **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
+    0 unless the rotor is out of balance (no rows where nothing cancels); `dimension` of the set of arrangements, the
+    common turn counted: N - 2, but 1 for two loads on a rotor in balance; `neutral` (k, N, d) orthonormal changes of
+    the angles that keep each arrangement balanced to first order; and their `names` (d,): "turn of all loads" first
+    (not where the rotor is out of balance), then "shape 1", ...
+
+    Loads in one line have one neutral direction more than the family has dimensions.
+    """
+
+    status: BalanceStatus
+    angles: np.ndarray
+    dimension: int
+    neutral: list[np.ndarray]
+    names: tuple[str, ...]
+
+    def summary(self) -> str:
+        """A table a person can read."""
+        rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
+        directions = f"neutral directions: {', '.join(self.names) or 'none'}"
+        return "\n".join([BalanceStatus[self.status], *rows, directions])
+
+
+def balanced_states(scene: Scene) -> BalancedStates:
+    """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`.
+
+        sum_j m_j R_j exp(i alpha_j) + M e exp(i angle) = 0
+
+    Two loads cancel if equal, opposite each other. Three do in one triangle and its mirror image. From four on there
+    is a family with N - 2 dimensions; the arrangement given for it spreads the loads most (the sides m_j R_j of a
+    polygon inscribed in a circle: equal loads are evenly spaced), and its mirror image; `neutral` says where the
+    family goes. A rotor's imbalance is one more side of the polygon, and the loads then have no common turn.
+
+    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle at one point, and for an
+    imbalance that tilts the rotor, of a moment or static elsewhere on its axis, which they cannot cancel.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> loads = jv.balls(count=3, mass=[0.3, 0.4, 0.5], radius=0.1, drag=1.0)
+    >>> states = jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0)))
+    >>> print(states.summary())
+    the loads cancel in one arrangement, up to a common turn and a mirror image
+      0, 90, 233.1 deg
+      0, 270, 126.9 deg
+    neutral directions: turn of all loads
+    >>> loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    >>> imbalance = jv.StaticImbalance("50 g m", angle="90 deg")    # as much as each of the balls
+    >>> print(jv.balanced_states(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), (imbalance,))).summary())
+    the loads cancel in one arrangement, up to a common turn and a mirror image
+      210, 330 deg
+      330, 210 deg
+    neutral directions: none
+
+    Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
+    """
+    loads = _sides(circular_loads(scene))
+    n = loads.size
+    imbalance = _imbalance(scene)
+    free = imbalance == 0.0
+    sides = loads if free else np.append(loads, abs(imbalance))
+    largest = sides.max()
+    rest = sides.sum() - largest
+    rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
+    if largest > rest + rounding:
+        status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
+        return BalancedStates(status, np.zeros((0, n)), 0, [], ())
+    if largest > rest - rounding:
+        # In one line: the largest against all others.
+        one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
+    else:
+        one = _inscribed(sides) * np.array([[1.0], [-1.0]])
+    fixed, at = (0, 0.0) if free else (n, np.angle(imbalance))
+    angles = np.mod(one - one[:, fixed, None] + at, 2.0 * np.pi)[:, :n]
+    neutral = [_neutral(loads, row, turns=free) for row in angles]
+    turn = ("turn of all loads",) if free else ()
+    names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
+    status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
+    dimension = max(n - 2, 1 if free else 0)
+    return BalancedStates(status, angles, dimension, neutral, names)
+
+
+def _sides(loads: CircularLoads) -> np.ndarray:
+    return np.asarray(jnp.broadcast_to(loads.mass * loads.radius, (loads.count,)))
+
+
+def _imbalance(scene: Scene) -> complex:
+    """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
+    thrown = [effect.throw(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
+    static = [complex(*map(float, each.static)) for each in thrown if each is not None]
+    lean = [complex(*map(float, each.lean)) for each in thrown if each is not None]
+    seat = scene.machine.carrier().seat
+    lean += [] if seat is None else [float(seat) * each for each in static]
+    if abs(sum(lean)) > 1e-9 * max(map(abs, lean), default=0.0):
+        problem = (
+            "tilt the rotor: loads at one point cannot cancel a moment imbalance, nor a static one away from them "
+            "(it sits at the rotor's mass centre); leave it out, or simulate"
+        )
+        raise InputError("effects", problem)
+    return sum(static, 0j)
+
+
+def _inscribed(sides: np.ndarray) -> np.ndarray:
+    """Directions of the sides of the polygon inscribed in a circle, in the order of the loads, the first at 0."""
+    largest = int(np.argmax(sides))
+    low, high = 0.0, 1.0
+
+    def centre_angles(x: float) -> np.ndarray:
+        return 2.0 * np.arcsin(np.minimum(sides / sides[largest] * x, 1.0))
+
+    # x = largest side / diameter. The centre is inside the polygon where the sides reach all round at x = 1; else it is
+    # beyond the largest side, which then turns by what the others turn, backward.
+    inside = centre_angles(1.0).sum() >= 2.0 * np.pi
+    others = np.arange(sides.size) != largest
+
+    def excess(x: float) -> float:
+        turns = centre_angles(x)
+        return turns.sum() - 2.0 * np.pi if inside else turns[largest] - turns[others].sum()
+
+    if not inside:
+        low = 1e-9  # at 0 both are 0
+    for _ in range(200):
+        middle = (low + high) / 2.0
+        if excess(middle) > 0.0:
+            high = middle
+        else:
+            low = middle
+    turns = centre_angles(high)
+    if not inside:
+        turns[largest] = 2.0 * np.pi - turns[largest]
+    direction = np.cumsum(turns) - turns / 2.0
+    return direction - direction[0]
+
+
+def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np.ndarray:
+    """Orthonormal changes of the angles (N, d) that keep the sum to first order; the common turn first, if free."""
+    n = sides.size
+    change = np.stack([-sides * np.sin(angles), sides * np.cos(angles)]) / sides.max()
+    _, values, right = np.linalg.svd(change)
+    others = right[int(np.sum(values > 1e-6)) :].T
+    if not turns:
+        return others
+    common = np.full((n, 1), 1.0 / np.sqrt(n))
+    basis, size, _ = np.linalg.svd(others - common @ (common.T @ others), full_matrices=False)
+    return np.concatenate([common, basis[:, size > 0.5]], axis=1)
+
+
+class BalancedStability(eqx.Module):
+    """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
+
+    **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
+    neutral directions left out; `multipliers` (2 (nd + N),) complex, the largest first; `neutral` the number of those
+    that are 1 because the arrangements form a family (the common turn at least); `error` of the multipliers,
+    estimated from half the number of steps.
+    """
+
+    stable: bool
+    growth: float
+    multipliers: np.ndarray
+    neutral: int
+    error: float
+
+
+def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
+    """Exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
+
+    The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
+    for heavy loads or weak drag, as the criterion does.
+
+    **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel each other and the scene's
+    `StaticImbalance`; left out, the first of `balanced_states`. `steps` of a sixth-order Magnus method over one turn.
+
+    **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, for a machine
+    that can drift, for effects that disturb the balanced motion (gravity), and as `balanced_states`; `ComputationError`
+    with its status if nothing cancels.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> loads = jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0)
+    >>> [jv.balanced_stability(jv.Scene(machine, loads, jv.ConstantSpeed(n))).stable for n in (20.0, 40.0)]
+    [False, True]
+
+    Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
+    """
+    angles, neutral = _arrangement(scene, angles)
+    matrix = _monodromies(scene, jnp.asarray(angles), steps)
+    fine = np.linalg.eigvals(np.asarray(matrix[0]))
+    coarse = np.linalg.eigvals(np.asarray(matrix[1]))
+    growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
+    # A sixth-order method: half the steps have 64 times the error.
+    error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
+    order = np.argsort(-np.abs(fine))
+    return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
+
+
+def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int = 48) -> np.ndarray:
+    """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
+
+    **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own
+    speed is not used.
+
+    **Returns** an array of the shape of `speeds`. **Raises** as `balanced_stability`.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
+    >>> jv.balanced_growth(scene, [20.0, 40.0]) < 0.0
+    array([False,  True])
+    """
+    angles, neutral = _arrangement(scene, angles)
+    flat = np.ravel(np.asarray(speeds, dtype=float))
+    # Whole batches only, so that few shapes are compiled.
+    padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
+    flows = _flows(at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(padded), steps)[: flat.size]
+    return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
+
+
+@eqx.filter_jit
+def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
+    def flow(speed: Array) -> Array:
+        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
+
+    return jax.lax.map(flow, speeds, batch_size=_BATCH)
+
+
+def balanced_intervals(
+    scene: Scene,
+    low: float,
+    high: float,
+    angles: ArrayLike | None = None,
+    *,
+    points: int = 200,
+    steps: int = 48,
+) -> list[list[float]]:
+    """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
+
+    Looked for on `points` speeds and refined by halving to 1e-7 of the speed; an interval narrower than the spacing
+    of the points can be missed. What the criterion says of the same range is `criterion(scene).balancing`.
+
+    **Raises** as `balanced_stability`, and `InputError` for a range that is none.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
+    >>> [[round(w, 2) for w in row] for row in jv.balanced_intervals(scene, 20.0, 60.0, points=40)]
+    [[28.28, 60.0]]
+    """
+    if not 0.0 < low < high:
+        raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")
+    grid = np.linspace(low, high, points)
+    stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
+    changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
+    ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]
+    return [[float(a), float(b)] for a, b in zip(ends[0::2], ends[1::2], strict=True)]
+
+
+def stability_changes(
+    scene: Scene,
+    speeds: np.ndarray,
+    stable: np.ndarray,
+    angles: ArrayLike | None = None,
+    *,
+    close: float = 1e-7,
+    steps: int = 48,
+) -> np.ndarray:
+    """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
+
+    `stable` says for each of `speeds` whether the motion is; a change between two of them is found.
+    """
+    (change,) = np.nonzero(stable[1:] != stable[:-1])
+    left, right = speeds[change], speeds[change + 1]
+    while left.size and np.max((right - left) / right) > close:
+        middle = (left + right) / 2.0
+        same = (balanced_growth(scene, middle, angles, steps=steps) < 0.0) == stable[change]
+        left, right = np.where(same, middle, left), np.where(same, right, middle)
+    return (left + right) / 2.0
+
+
+def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
+    """Angles at which the loads are known to cancel, and how many neutral directions they have."""
+    sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
+    if not float(jnp.min(natural_frequencies(scene))) > 0.0:
+        problem = (
+            "lets the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
+        )
+        raise InputError("machine.stiffness", problem)
+    if angles is None:
+        states = balanced_states(scene)
+        if not len(states.angles):
+            raise ComputationError(_name(states.status), BalanceStatus[states.status])
+        angles = states.angles[0]
+    angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
+    if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
+        raise InputError("angles", "leave an unbalance; take them from balanced_states(scene).angles")
+    _require_undisturbed(scene, angles)
+    return angles, _neutral(sides, angles, turns=imbalance == 0.0).shape[1]
+
+
+def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: int) -> np.ndarray:
+    """The largest growth rate, 1/s, of multipliers (..., n) over a turn, without the `neutral` ones nearest to 1."""
+    nearest = np.argsort(np.abs(multipliers - 1.0), axis=-1)
+    others = np.take_along_axis(multipliers, nearest[..., neutral:], -1)
+    return np.log(np.max(np.abs(others), axis=-1)) * np.asarray(speed) / (2.0 * np.pi)
+
+
+def _name(status: BalanceStatus) -> str:
+    return next(name for name in ("unique", "family", "alone", "outweighed") if getattr(BalanceStatus, name) == status)
+
+
+def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
+    field = vector_field(at_constant_speed(scene))
+    speed = float(scene.drive.speed)
+    for turn in (0.0, 1.0, 2.0):
+        change = field(jnp.asarray(turn / speed), balanced_motion(scene, jnp.asarray(angles), jnp.asarray(turn)))
+        if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
+            raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
+
+
+@eqx.filter_jit
+def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
+    return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)

@@ -1,0 +1,1 @@
+"""Jams of light loads: speeds, folds, phase patterns."""

@@ -1,0 +1,211 @@
+"""The branch n(Omega) of light loads, cut at its folds into monotone pieces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.collected import light_friction
+from jaxvib.equations.linear import _modes, jammed_loads, loaded_mass, steady_displacement, turning
+from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.roots import bracketed_root
+
+__all__ = ["Folds", "jam_rotor_speed"]
+
+_POINTS = 64
+"""Grid points on each side of each pole, where folds are looked for."""
+
+
+class Folds(eqx.Module):
+    """Where two jam modes appear or merge: dn/dOmega = 0.
+
+    **Attributes**, all (2 nd,), ascending in `omega`, padded at the end where `exists` is False: `omega` load speed rad/s;
+    `rotor_speed` rad/s; `exists`.
+    """
+
+    omega: Array
+    rotor_speed: Array
+    exists: Array
+
+
+def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
+    """The rotor's speed n (rad/s) at which the loads jam, collected, at speed `omega` (scalar, rad/s), for light loads.
+
+        n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
+
+    with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
+    `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
+    Dry friction helps the drag with mu2 (d/2) N sign(n - w) a load; n is then the root of that balance between w and the
+    above, N = m R w^2 (the loads' weight left out: it adds nothing on the average of a turn unless it exceeds that). An
+    imbalance of the rotor shakes at n and not at w, and adds nothing here.
+
+    **Returns** n, a scalar. **Raises** `InputError` as `jam_modes` does for scenes it cannot judge.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> round(float(jv.jam_rotor_speed(form.scene(), 1.0015)), 4)
+    5.1829
+
+    Source: the antiphase paper, equations (31), (35).
+    """
+    loads = jammed_loads(scene)
+    carrier = scene.machine.carrier()
+    port = carrier.port @ steady_displacement(scene, omega, speed)
+    torque = -loads.unbalance() * omega**2 * jnp.sum(jnp.conj(turning(carrier)) * port).imag / 2.0
+    free = omega + torque / loads.drag_sum()
+    if not any(isinstance(effect, DryFriction) for effect in scene.effects):
+        return free
+
+    def left_over(n: Array) -> Array:
+        return loads.drag_sum() * (n - omega) + light_friction(scene, omega, n) - torque
+
+    return bracketed_root(left_over, omega, free)
+
+
+def branch_slope(scene: Scene, omega: Array) -> Array:
+    """dn/dOmega along the branch."""
+    return jax.jvp(lambda w: jam_rotor_speed(scene, w), (omega,), (jnp.ones_like(omega),))[1]
+
+
+class Pieces(NamedTuple):
+    """Monotone pieces of a branch: load speeds at their ends and mode numbers, (2 nd + 1,) each; resonances and folds."""
+
+    low: Array
+    high: Array
+    mode: Array
+    resonances: Array
+    folds: Folds
+
+
+def branch_pieces(scene: Scene) -> Pieces:
+    """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
+    frozen = jax.lax.stop_gradient(scene)
+    grid, resonances = fold_points(frozen, _POINTS)
+    nd = resonances.shape[0]
+    grid, slopes = _with_close_folds(lambda w: branch_slope(frozen, w), grid, 2 * nd)
+    falling = slopes < 0.0
+    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
+    found = change < grid.shape[0] - 1
+    change = jnp.minimum(change, grid.shape[0] - 2)
+    ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
+    omega = jax.vmap(partial(bracketed_root, lambda w: branch_slope(scene, w)))(*ends)
+    speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
+    main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
+    omega, speeds, found = omega[main], speeds[main], found[main]
+    end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
+    folds = Folds(
+        omega=jnp.where(found, omega, jnp.nan),
+        rotor_speed=jnp.where(found, speeds, jnp.nan),
+        exists=found,
+    )
+    cuts = jax.lax.stop_gradient(jnp.where(found, omega, end))
+    low = jnp.concatenate([jnp.zeros_like(cuts[:1]), cuts])
+    high = jnp.concatenate([cuts, jnp.reshape(end, (1,))])
+
+    return Pieces(low, high, piece_modes(cuts, found, resonances), resonances, folds)
+
+
+def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
+    """Mode numbers (2 nd + 1,) of the pieces of a branch, which turns at load speeds `cuts` (2 nd,) where they are `found`.
+
+    Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
+    """
+    nd = resonances.shape[0]
+    owners: list[Array] = []
+    later = jnp.sum(found) // 2 - 1
+    for k, peak in enumerate(cuts[0::2]):
+        nearest = 1 + jnp.argmin(jnp.abs(resonances - peak))
+        free = jnp.clip(nd - (later - k), 1, nd)
+        owners.append(jnp.minimum(jnp.maximum(nearest, owners[-1] + 1 if owners else 1), free))
+    mode = []
+    for k, owner in enumerate(owners):
+        last = 2 * nd + 1
+        mode += [jnp.where(found[2 * k], 2 * owner - 1, last), jnp.where(found[2 * k], 2 * owner, last)]
+    return jnp.stack([*mode, jnp.asarray(2 * nd + 1)])
+
+
+def without_ripples(speeds: Array, count: Array, most: int) -> Array:
+    """Indices of the `most` folds that matter, of twice as many with rotor speeds `speeds`, of which the first `count` exist.
+
+    A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
+    """
+    index = jnp.arange(2 * most)
+    keep = index
+    for _ in range(most // 2):
+        known = speeds[keep]
+        span = jnp.abs(jnp.log(known[1:] / known[:-1]))
+        least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
+        skip = (count > most) & (index >= least)
+        keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * most - 1), index)]
+        count = jnp.where(count > most, count - 2, count)
+    return keep[:most]
+
+
+def fold_points(scene: Scene, per_side: int) -> tuple[Array, Array]:
+    """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances.
+
+    Folds lie between some of these points. They crowd about the poles s of det(K + s^2 M + s C) = 0, not about undamped
+    resonances: a strong damper between two platforms locks them into one, whose sharp peak is at neither's resonance.
+    """
+    resonances, _ = _modes(scene)
+    carrier = scene.machine.carrier()
+    damping = carrier.damping
+    if carrier.gyroscopic is not None:
+        damping = damping + scene.drive.speed * carrier.gyroscopic
+    poles = _poles(loaded_mass(scene), damping, carrier.stiffness)
+    top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
+    tiny = jnp.finfo(top.dtype).eps * 16.0
+    width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
+    low = 1e-3 * jnp.min(jnp.where(resonances > 0.0, resonances, top))
+    s = jnp.linspace(0.0, 1.0, per_side)[None, :]
+
+    def crowded(reach: Array) -> Array:
+        return width * jnp.sinh(s * jnp.arcsinh(reach / width))
+
+    # Of a pair of poles one has the points above, the other one those below; a pole that is real has nothing below.
+    centre = jnp.abs(poles.imag)[:, None]
+    below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, 5.0 * top))
+    points = jnp.where(poles.imag[:, None] >= 0.0, above, below)
+    return jnp.sort(jnp.maximum(points.ravel(), low)), resonances
+
+
+def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
+    """The 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    n = mass.shape[0]
+    solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
+    return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
+
+
+def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
+    """The grid and the slope at it, with points added where that comes closest to 0 and turns back: two folds may hide in one
+    interval."""
+    value = jax.vmap(slope)(grid)
+    sign, size = jnp.sign(value), jnp.abs(value)
+    same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
+    dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
+    (at,) = jnp.nonzero(dips, size=most, fill_value=0)
+    step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
+
+    def lowest(low: Array, high: Array, side: Array) -> Array:
+        def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            a, b = bracket
+            x, y = b - step * (b - a), a + step * (b - a)
+            at_x, at_y = jax.vmap(slope)(jnp.stack([x, y]))
+            left = side * at_x < side * at_y
+            return jnp.where(left, a, x), jnp.where(left, y, b)
+
+        a, b = jax.lax.fori_loop(0, 16, narrow, (low, high))
+        return (a + b) / 2.0
+
+    added = jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])
+    order = jnp.argsort(jnp.concatenate([grid, added]))
+    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, jax.vmap(slope)(added)])[order]

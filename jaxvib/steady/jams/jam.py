@@ -1,0 +1,228 @@
+"""Leading-order jam modes: where light loads get stuck, by algebra alone."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import jammed_loads, loaded_mass, natural_frequencies, steady_displacement
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.numerics.roots import bracketed_root
+from jaxvib.runtime.programs import kept
+from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, jam_rotor_speed
+from jaxvib.units import traced
+
+__all__ = ["Jam", "JamModes", "JamStatus", "jam_modes"]
+
+
+class JamStatus(eqx.Enumeration):
+    """What is known of a jam mode; the members are the sentences a user reads."""
+
+    found = "the loads can jam in this mode"
+    absent = "this mode does not exist at this rotor speed"
+    at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
+    unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+
+
+class Jam(eqx.Module):
+    """One jam mode of a scene.
+
+    **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
+    the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude`
+    (nd,) m, of tilts rad, and `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed
+    squares of their peaks (sqrt 2 times the force of a circular whirl).
+    """
+
+    mode: Array
+    status: JamStatus
+    omega: Array
+    rotor_speed: Array
+    stable: Array
+    slope: Array
+    displacement: Array
+    amplitude: Array
+    foundation_force: Array
+
+    @property
+    def message(self) -> str:
+        """What is known of this mode, a sentence."""
+        return JamStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
+
+class JamModes(Jam):
+    """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
+
+    A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`.
+    Adds `resonances` (nd,) rad/s and the `folds` of the branch. Derivatives of a mode that does not exist are 0, so that it
+    does not spoil those of a batch: ask the status, not the gradient.
+    """
+
+    resonances: Array
+    folds: Folds
+
+    @property
+    def exists(self) -> Array:
+        """Which modes there are, one Boolean a mode."""
+        return self.status != JamStatus.absent
+
+    def mode_numbers(self) -> list[int]:
+        """The numbers of the modes that exist."""
+        return [int(k) for k, there in zip(np.asarray(self.mode), np.asarray(self.exists), strict=True) if there]
+
+    def select(self, mode: int, *, throw: bool = True) -> Jam:
+        """The jam mode of that number.
+
+        **Raises** `InputError` for a number there can never be, `ComputationError` (status "absent") where it does not exist
+        at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
+        """
+        most = self.mode.shape[0]
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
+            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+        fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
+        jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
+        if throw and not traced(self.omega) and not np.asarray(self.exists)[mode - 1]:
+            there = ", ".join(map(str, self.mode_numbers()))
+            raise ComputationError(
+                "absent",
+                f"jam mode {mode} does not exist at rotor speed {float(self.rotor_speed[0]):.6g} rad/s; there: {there}",
+            )
+        return jam
+
+    def summary(self) -> str:
+        """A table a person can read; amplitudes zero to peak."""
+        lines = [f"rotor speed {float(self.rotor_speed[0]):.6g} rad/s, resonances "]
+        lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
+        for k in self.mode_numbers():
+            jam = self.select(k)
+            amplitude = ", ".join(f"{float(a):.4g}" for a in jam.amplitude)
+            lines.append(
+                f"  mode {k}: Omega {float(jam.omega):.6g} rad/s, {'stable' if jam.stable else 'unstable'}, "
+                f"amplitude {amplitude} m, foundation force {float(jam.foundation_force):.4g} N"
+            )
+        return "\n".join(lines)
+
+
+def jam_modes(scene: Scene) -> JamModes:
+    """Every way in which light, collected loads can jam at the scene's rotor speed, held back by drag and dry friction.
+
+    The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that reaches
+    the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls
+    from it, 2 nd + 1 is beyond the last; so mode 3 is the jam just below the second resonance even where the first one is
+    damped so much that modes 1 and 2 have vanished. Rising pieces (odd modes) are stable by slope, falling ones are not.
+    Where the branch has more peaks than resonances, the lowest ripples, each over a narrow range of rotor speeds, are left out.
+
+    A rotor out of balance (`StaticImbalance`, `MomentImbalance`) leaves a jam where it is: it shakes at the rotor's speed,
+    loads at theirs, so that no mean torque comes of it at this order. Its vibration and force come on top: the amplitudes and
+    the foundation force are the loads' alone. Where both count, ask `simulate`.
+
+    **Returns** `JamModes`; derivatives of every number with respect to every number of the scene are exact (implicit
+    function theorem), forward and reverse. `vmap` over scenes gives many rotor speeds at once.
+
+    **Raises** `InputError` for loads without drag or at stations of their own, a machine whose coordinates couple through the
+    rotor's speed, a motor in place of a given speed, and effects that this theory leaves out (`CubicSupport`, `Stop`).
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> modes = jv.jam_modes(form.scene())
+    >>> modes.mode_numbers(), round(float(modes.omega[2]), 4)
+    ([3, 4, 5], 0.9721)
+
+    Source: the antiphase paper, section 5.2, equations (30)-(39).
+    """
+    drag = jammed_loads(scene).drag
+    if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
+        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+    return _jam_modes(scene)
+
+
+@kept
+def _jam_modes(scene: Scene) -> JamModes:
+    n = scene.drive.speed
+    pieces = branch_pieces(scene)
+    omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(scene, lo, hi))(pieces.low, pieces.high)
+
+    numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
+    hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
+    there = jnp.any(hits, axis=1)
+    chosen = jnp.argmax(hits, axis=1)
+    omega = jnp.where(there, omega[chosen], n)
+
+    # Closer to a fold than this, its rotor speed cannot be told from the scene's, and a derivative has no digits left.
+    speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
+    close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
+    close = (close | jnp.roll(close, -1))[chosen]
+
+    def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
+        found = _jam_at(scene, number, w, n, flat)
+        values = jax.tree.map(
+            lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
+            found,
+        )
+        return eqx.tree_at(
+            lambda j: (j.status, j.stable, j.rotor_speed),
+            values,
+            (JamStatus.where(is_there, found.status, JamStatus.absent), is_there & found.stable, n),
+        )
+
+    jams = jax.vmap(jam)(numbers, omega, there, close)
+    fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
+    return JamModes(**fields, resonances=natural_frequencies(scene), folds=pieces.folds)
+
+
+def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+    displacement = steady_displacement(scene, omega)
+    # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
+    throw = jammed_loads(scene).unbalance() / jnp.min(jnp.diagonal(loaded_mass(scene)))
+    bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(throw.dtype).eps < throw)
+    displacement = jnp.where(bounded, displacement, jnp.nan)
+    slope = jnp.where(bounded, branch_slope(scene, omega), jnp.nan)
+    status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
+    return Jam(
+        mode=number,
+        status=JamStatus.where(bounded, status, JamStatus.unbounded),
+        omega=omega,
+        rotor_speed=rotor_speed,
+        stable=slope > 0.0,
+        slope=slope,
+        displacement=displacement,
+        amplitude=magnitude(displacement),
+        foundation_force=_bed_force(scene, omega, displacement),
+    )
+
+
+def branch_points(scene: Scene, omega: Array) -> tuple[Jam, Folds]:
+    """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
+    pieces = branch_pieces(scene)
+    cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
+    numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
+
+    def jam(number: Array, w: Array) -> Jam:
+        flat = jnp.abs(branch_slope(scene, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
+        return _jam_at(scene, number, w, jam_rotor_speed(scene, w), flat)
+
+    jams = jax.vmap(jam)(numbers, omega)
+    return jams, pieces.folds
+
+
+def _bed_force(scene: Scene, omega: Array, displacement: Array) -> Array:
+    carrier = scene.machine.carrier()
+    forces = (carrier.bed_stiffness + 1j * omega * carrier.bed_damping) @ displacement
+    return magnitude(forces[0]) if forces.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(forces) ** 2))
+
+
+def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
+    """The load speed on a monotone piece at which the branch has the scene's rotor speed, and whether there is one."""
+
+    def gap(w: Array) -> Array:
+        return jam_rotor_speed(scene, w) - scene.drive.speed
+
+    gap_low, gap_high = jax.vmap(gap)(jnp.stack([jnp.where(low > 0.0, low, high), high]))
+    gap_low = jnp.where(low > 0.0, gap_low, -scene.drive.speed)
+    exists = (high > low) & (gap_low * gap_high <= 0.0)
+    return bracketed_root(gap, low, high, (gap_low, gap_high)), exists

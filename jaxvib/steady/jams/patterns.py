@@ -1,0 +1,37 @@
+"""Phase patterns of loads."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+__all__ = ["PhasePattern", "phase_pattern"]
+
+
+class PhasePattern(eqx.Enumeration):
+    """How loads that turn at one speed stand to each other; the members are the words a user reads."""
+
+    together = "all together"
+    opposite = "in two opposite groups"
+    spread = "spread so that they cancel each other"
+    other = "at other phases"
+
+
+def pattern_word(pattern: PhasePattern) -> str:
+    """The pattern's own word: "together", "opposite", "spread" or "other"."""
+    words = ("together", "opposite", "spread", "other")
+    return next(word for word in words if bool(pattern == getattr(PhasePattern, word)))
+
+
+def phase_pattern(phase: Array) -> PhasePattern:
+    """The pattern of phases (count,) rad: by their resultants |mean exp(i k phase)| for k = 1 and 2.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> bool(jv.phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)
+    True
+    """
+    first, second = (jnp.abs(jnp.mean(jnp.exp(1j * k * phase))) for k in (1, 2))
+    pattern = PhasePattern.where(first < 0.1, PhasePattern.spread, PhasePattern.other)
+    pattern = PhasePattern.where((first < 0.25) & (second > 0.9), PhasePattern.opposite, pattern)
+    return PhasePattern.where(first > 0.9, PhasePattern.together, pattern)

@@ -1,0 +1,60 @@
+"""The picture of a branch, however exactly it was computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.machine.scene import Scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["picture"]
+
+
+class _Branch(Protocol):
+    """What a branch has, an entry a point along the load speed."""
+
+    omega: Array
+    rotor_speed: Array
+    stable: Array
+    amplitude: Array
+    foundation_force: Array
+    scene: Scene
+
+
+def picture(
+    branch: _Branch, marks: Sequence[tuple[str, float, float]], unit: Literal["rad/s", "rpm"], most: float | None
+) -> Figure:
+    """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
+
+    **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
+    rotor speed shown, rad/s (a third above the scene's if None).
+
+    **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+    """
+    from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
+
+    at = float(branch.scene.drive.speed)
+    top = 4.0 / 3.0 * at if most is None else most
+    kinds = sorted({kind for kind, _, _ in marks})
+    shown = {kind: np.array([(w, n) for k, w, n in marks if k == kind and n <= top]).reshape(-1, 2) for kind in kinds}
+    rotor_speed = np.asarray(branch.rotor_speed)
+    return branch_diagram(
+        np.where(rotor_speed <= top, rotor_speed, np.nan),
+        np.asarray(branch.omega),
+        np.asarray(branch.stable),
+        amplitude=np.asarray(branch.amplitude),
+        force=np.asarray(branch.foundation_force),
+        resonances=np.asarray(natural_frequencies(branch.scene)),
+        marks=[(kind.replace("_", " "), points[:, 1], points[:, 0]) for kind, points in shown.items()],
+        names=branch.scene.machine.structure().coordinates,
+        units=branch.scene.machine.structure().units,
+        at=at,
+        unit=unit,
+    )

@@ -1,0 +1,1 @@
+"""Exact periodic motions and their stability."""

@@ -1,0 +1,310 @@
+"""Periodic motions of collected loads: the carrier eliminated harmonic by harmonic, the load's lag by collocation."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import bodies, circle, load_torque, torque_slopes
+from jaxvib.equations.linear import dynamic_stiffness, jammed_loads
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import Grid, grid_of
+from jaxvib.numerics.linalg import small_solve
+
+__all__ = ["Along", "Given", "Harmonics", "Motion", "along", "harmonics_of", "periodic_motion"]
+
+Given = Literal["omega", "rotor_speed"]
+
+_STEPS = 60
+"""Newton steps, those that were refused included; ordinary points take 4 to 6."""
+
+
+def receptance(scene: Scene, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+    """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
+
+    D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
+    """
+    push = scene.machine.carrier().port.T.astype(complex)
+
+    def at(k: Array) -> Array:
+        w = k * omega
+        return small_solve(dynamic_stiffness(scene, w, speed), w**2 * push)
+
+    return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
+
+
+def _answer(scene: Scene, grid: Grid, omega: Array, speed: Array) -> Array:
+    """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
+    w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
+    return -(w**2)[:, None, None] * (scene.machine.carrier().port @ receptance(scene, omega, speed, grid.orders))
+
+
+def _feedback(grid: Grid, answer: Array) -> Array:
+    """(np, np, M, M): the port's acceleration at the points, from sum_g S_g e(phi_g) at the points."""
+    by_distance = jnp.einsum("kab,dk->abd", answer.real, grid.cosine) - jnp.einsum("kab,dk->abd", answer.imag, grid.sine)
+    return by_distance[:, :, grid.pairs]
+
+
+class _Balance(NamedTuple):
+    """The torques on the bodies at the points, per drag and load speed: what is left over (G, M), what it is judged by, and
+    what its derivative needs."""
+
+    left_over: Array
+    scale: Array
+    acceleration: Array
+    moving: Array
+    pull: Array
+
+
+def _balance(scene: Scene, grid: Grid, answer: Array, lag: Array, omega: Array, speed: Array) -> _Balance:
+    whole = bodies(scene)
+    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
+    point, moving = circle(scene, phi)
+    along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", whole.unbalance, point) @ grid.analysis)
+    acceleration = (along_port @ grid.synthesis).real
+    size, unit = whole.unbalance[:, None], (whole.drag * omega)[:, None]
+    vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
+    torque = load_torque(scene, phi, rate, speed, acceleration)
+    inertia = (whole.inertia * omega**2)[:, None] * (lag @ grid.second.T)
+    largest = jnp.max((jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration)) / unit)
+    return _Balance(
+        (inertia - torque + vibration) / unit,
+        1.0 + jnp.abs(speed / omega) + largest,
+        acceleration,
+        moving,
+        -size * jnp.einsum("agi,ai->gi", point, acceleration) / unit,
+    )
+
+
+def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: Array, omega: Array, speed: Array) -> Array:
+    """d left_over / d lag (G M, G M)."""
+    whole = bodies(scene)
+    g, m = lag.shape
+    unit = (whole.drag * omega)[:, None]
+    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
+    by_angle, by_rate, by_acceleration = torque_slopes(scene, phi, rate, speed, balance.acceleration)
+    own = (
+        (whole.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
+        + (balance.pull - by_angle / unit)[:, :, None] * np.eye(m)[None]
+        - (omega * by_rate / unit)[:, :, None] * grid.first[None]
+    )
+    shake = whole.unbalance[None, :, None] * balance.moving
+    # Dry friction answers to the acceleration that the others cause as well.
+    answers = (shake - by_acceleration) / unit[None]
+    coupling = jnp.einsum("agi,abij,bhj->gihj", answers, _feedback(grid, answer), shake)
+    return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
+
+
+class Motion(NamedTuple):
+    """A periodic motion on its grid: `lag` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
+    balance at the points, relative to the torques in it."""
+
+    lag: Array
+    omega: Array
+    rotor_speed: Array
+    residual: Array
+
+
+def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
+    """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
+
+        I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
+        a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
+        D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
+
+    at the M points of `grid`, with the index k for harmonics, a the port's acceleration, e the point of a load on the unit
+    circle. The unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter
+    starts from, `lag` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
+    residual.
+
+    Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
+    """
+    if lag is None:
+        lag = jnp.zeros((1 if jammed_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
+    frozen = jax.lax.stop_gradient((start, lag))
+    psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
+    omega, speed = _both(given, value, x)
+    found = _balance(scene, grid, _answer(scene, grid, omega, speed), psi, omega, speed)
+    return Motion(psi, omega, speed, jnp.max(jnp.abs(found.left_over)) / found.scale)
+
+
+def _both(given: Given, value: Array, x: Array) -> tuple[Array, Array]:
+    """Load speed and rotor speed."""
+    return (value, x) if given == "omega" else (x, value)
+
+
+class _State(NamedTuple):
+    """A step of Newton: the unknowns, the equations there with their derivative, how far the next step may go, and whether it
+    is the last one: because it needs no look at where it leads, or because there is no better one (`lost`)."""
+
+    steps: Array
+    lag: Array
+    x: Array
+    left_over: Array
+    matrix: Array
+    norm: Array
+    scale: Array
+    length: Array
+    settled: Array
+    lost: Array
+
+
+@eqx.filter_custom_jvp
+def _newton(
+    scene: Scene, value: Array, start: Array, lag: Array, *, grid: tuple[int, bool], given: Given
+) -> tuple[Array, Array]:
+    on = grid_of(*grid)
+    tiny = 128.0 * jnp.finfo(value.dtype).eps
+    # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
+    fixed = given == "omega" and scene.machine.carrier().gyroscopic is None
+    known = _answer(scene, on, value, start) if fixed else None
+    no = jnp.asarray(False)
+
+    def look(steps: Array, lag: Array, x: Array, length: Array) -> _State:
+        left_over, matrix, scale = _linearised(scene, on, given, value, lag, x, known)
+        norm = jnp.sqrt(jnp.mean(left_over[:-1] ** 2))
+        return _State(steps, lag, x, left_over, matrix, norm, scale, length, norm < tiny * scale, no)
+
+    def change_of(now: _State) -> tuple[Array, Array]:
+        """Newton's step, and the part of it that may be taken."""
+        change = -jnp.linalg.solve(now.matrix, now.left_over)
+        # A lag changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
+        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
+        if given == "rotor_speed":
+            most = jnp.minimum(most, 0.5 * jnp.abs(now.x / change[-1]))
+        return change, jnp.minimum(now.length, most)
+
+    def moved(now: _State, change: Array, take: Array) -> tuple[Array, Array]:
+        return now.lag + take * change[:-1].reshape(now.lag.shape), now.x + take * change[-1]
+
+    def step(now: _State) -> _State:
+        change, take = change_of(now)
+        then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
+        better = then.norm < now.norm
+        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
+        # first step gains, from psi = 0, says nothing of that yet.
+        sure = then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale
+        then = then._replace(settled=sure & (then.steps > 1))
+        lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
+        rounded = now.norm < 16.0 * tiny * now.scale
+        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
+
+    begin = look(jnp.asarray(0), lag, start, jnp.ones_like(start))
+    end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
+    change, take = change_of(end)
+    good = end.settled & ~end.lost
+    return moved(end, jnp.where(good, change, 0.0), jnp.where(good, take, 0.0))
+
+
+@_newton.def_jvp
+def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Given):
+    scene, value, start, lag = primals
+    lag, x = _newton(scene, value, start, lag, grid=grid, given=given)
+    on = grid_of(*grid)
+
+    def equations(scene: Scene, value: Array) -> Array:
+        omega, speed = _both(given, value, x)
+        left_over = _balance(scene, on, _answer(scene, on, omega, speed), lag, omega, speed).left_over
+        return jnp.append(left_over, 0.0)
+
+    push = eqx.filter_jvp(equations, (scene, value), tangents[:2])[1]
+    change = -jnp.linalg.solve(_linearised(scene, on, given, value, lag, x, None)[1], push)
+    return (lag, x), (change[:-1].reshape(lag.shape), change[-1])
+
+
+def _linearised(
+    scene: Scene, grid: Grid, given: Given, value: Array, lag: Array, x: Array, known: Array | None
+) -> tuple[Array, Array, Array]:
+    """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
+    if known is None:
+        answer, by_x = jax.jvp(lambda z: _answer(scene, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
+    else:
+        answer, by_x = known, jnp.zeros_like(known)
+
+    def left_over(z: Array, answer: Array) -> tuple[Array, _Balance]:
+        found = _balance(scene, grid, answer, lag, *_both(given, value, z))
+        return found.left_over.ravel(), found
+
+    at, column, found = jax.jvp(left_over, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
+    matrix = _jacobian(scene, grid, answer, found, lag, *_both(given, value, x))
+    return jnp.append(at, jnp.mean(lag)), _pinned(matrix, column), found.scale
+
+
+class Along(NamedTuple):
+    """`slope` dn/dOmega of the branch; `speed_error`, relative, of the rotor speed at this load speed and `lag_error`, rad: an
+    estimate of what the number of points leaves."""
+
+    slope: Array
+    speed_error: Array
+    lag_error: Array
+
+
+def along(scene: Scene, grid: Grid, motion: Motion) -> Along:
+    """How the branch goes on from a periodic motion, and how good the motion is.
+
+    The error is what one Newton step would change that sees the residual at twice as many points, with the highest
+    harmonic of psi for the lag.
+    """
+    lag, omega, speed = motion.lag, motion.omega, motion.rotor_speed
+    _, matrix, _ = _linearised(scene, grid, "omega", omega, lag, speed, None)
+
+    def left_over(w: Array) -> Array:
+        return _balance(scene, grid, _answer(scene, grid, w, speed), lag, w, speed).left_over.ravel()
+
+    by_omega = jax.jvp(left_over, (omega,), (jnp.ones_like(omega),))[1]
+    fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
+    lag_k = _lag_harmonics(grid, lag)
+    there = (lag_k @ np.exp(1j * grid.lag_orders[:, None] * fine.theta)).real
+    between = _balance(scene, fine, _answer(scene, fine, omega, speed), there, omega, speed).left_over
+    low = _lag_harmonics(fine, between)[:, : grid.lag_orders.shape[0]]
+    seen = (low @ np.exp(1j * grid.lag_orders[:, None] * grid.theta)).real.ravel()
+    # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
+    slope = jnp.linalg.solve(matrix, -jnp.append(by_omega, 0.0))[-1]
+    error = jnp.linalg.solve(matrix, jnp.append(jax.lax.stop_gradient(seen), 0.0))
+    last = jnp.max(lag_k[:, -1].real ** 2 + lag_k[:, -1].imag ** 2)
+    return Along(slope, jnp.abs(error[-1] / speed), jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)))
+
+
+def _pinned(by_lag: Array, by_unknown: Array) -> Array:
+    """The whole Jacobian: the equations' derivative by psi and by the last unknown, and the row mean psi = 0."""
+    m = by_lag.shape[0]
+    pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
+    return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
+
+
+def _lag_harmonics(grid: Grid, values: Array) -> Array:
+    """(G, J) of values (G, M) at the points."""
+    m = grid.theta.shape[0]
+    return values @ (grid.lag_weights / m * np.exp(-1j * grid.lag_orders * grid.theta[:, None]))
+
+
+class Harmonics(NamedTuple):
+    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (G, J) rad; `displacement` (nd, K) m of
+    the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+
+    lag: Array
+    displacement: Array
+    acceleration: Array
+    force: Array
+
+
+def harmonics_of(scene: Scene, grid: Grid, motion: Motion) -> Harmonics:
+    """The harmonics of psi and of everything that the carrier does."""
+    carrier = scene.machine.carrier()
+    point, _ = circle(scene, grid.theta[None] + motion.lag)
+    push = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
+    answer = receptance(scene, motion.omega, motion.rotor_speed, grid.orders)
+    displacement = jnp.einsum("kdp,pk->dk", answer, push)
+    w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
+    return Harmonics(
+        _lag_harmonics(grid, motion.lag),
+        displacement,
+        -(carrier.port @ displacement) * w[None] ** 2,
+        carrier.bed_stiffness @ displacement + 1j * (carrier.bed_damping @ displacement) * w[None],
+    )

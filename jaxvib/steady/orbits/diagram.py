@@ -1,0 +1,226 @@
+"""The whole diagram of exact jams, and the points where their stability changes."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import has_half_turn
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.jams.folds import fold_points
+from jaxvib.steady.jams.picture import picture
+from jaxvib.steady.orbits.floquet import Floquet, steps_for
+from jaxvib.steady.orbits.orbit import OrbitStatus, light_rotor_speed, orbits
+from jaxvib.units import Number, count, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
+
+_LANES = 100
+"""Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
+
+_POINTS = (8, 16, 32, 64)
+
+
+class SpecialPoint(NamedTuple):
+    """Where the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker), "period_doubling"
+    or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
+
+    kind: str
+    omega: float
+    rotor_speed: float
+
+
+class ExactBranches(eqx.Module):
+    """The branch n(Omega) of exact jams, ascending in Omega, a leading axis over its P points.
+
+    **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m, of tilts rad, and
+    `foundation_force` (P,) N, zero to peak, as in `Orbit`; `power` (P,) W; `stable`, `multiplier` (P,) and `multipliers` (P,
+    ...) as in `Orbit`; `residual`, `error` (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in
+    Omega; `scene`.
+    """
+
+    status: OrbitStatus
+    omega: Array
+    rotor_speed: Array
+    slope: Array
+    amplitude: Array
+    foundation_force: Array
+    power: Array
+    stable: Array
+    multiplier: Array
+    multipliers: Array
+    residual: Array
+    error: Array
+    scene: Scene
+    special: tuple[SpecialPoint, ...] = eqx.field(static=True)
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
+        """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
+        return picture(self, list(self.special), unit, most)
+
+
+def exact_branches(
+    scene: Scene,
+    *,
+    points: int = 2000,
+    least: Number | None = None,
+    most: Number | None = None,
+    accuracy: float = 1e-8,
+) -> ExactBranches:
+    """The whole branch n(Omega) of exact jams with its stability, and the points where that changes.
+
+    Every point is solved for itself at its own load speed, so folds need no continuation. Special points are bracketed by
+    the points of the diagram and then found as roots: of dn/dOmega (fold), of prod (1 - s_i s_j) over pairs of multipliers
+    (torus), of prod (1 + s_i) (period doubling; the loss of symmetry, where s is the growth over half a period with the
+    half-turn), of prod (1 - s_i) for loads that part from each other (loss of symmetry).
+
+    **Arguments**: `points` along Omega, crowded about the resonances; `least`, `most` load speeds, rad/s or text (a fifth of
+    the lowest resonance, a third above the scene's rotor speed); `accuracy` of the rotor speeds, relative.
+
+    **Returns** `ExactBranches`; a point that could not be solved has NaN and a status. **Raises** `InputError`.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=0.05, beta=1.0, speed=1.5)
+    >>> diagram = jv.branches(form.scene(), exact=True, points=200, least=0.3)
+    >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
+    [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
+    """
+    count(points, "points", low=2)
+    crowded, resonances = fold_points(scene, 64)
+    lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
+    low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)
+    high = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
+    if not float(high) > float(low):
+        raise InputError("most", f"is {float(high):.6g} rad/s; it must be above the least, {float(low):.6g} rad/s")
+    inside = np.asarray(crowded)
+    inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
+    omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
+    values = _Solver(scene, accuracy)(omega)
+    fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene")}
+    return ExactBranches(**fields, scene=scene, special=_special_points(scene, accuracy, values))
+
+
+class _Values(NamedTuple):
+    """Exact jams, a leading axis over them; `tests` (P, 4) change sign where stability changes, see `_tests`."""
+
+    status: OrbitStatus
+    omega: np.ndarray
+    rotor_speed: np.ndarray
+    slope: np.ndarray
+    amplitude: np.ndarray
+    foundation_force: np.ndarray
+    power: np.ndarray
+    stable: np.ndarray
+    multiplier: np.ndarray
+    multipliers: np.ndarray
+    residual: np.ndarray
+    error: np.ndarray
+    tests: Any
+
+
+class _Solver:
+    """Exact jams at given load speeds, in batches, with as many harmonics as each asks for."""
+
+    def __init__(self, scene: Scene, accuracy: float):
+        self.scene, self.accuracy = scene, accuracy
+
+    def __call__(self, omega: np.ndarray) -> _Values:
+        """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
+        half = has_half_turn(self.scene)
+        first, *more = _POINTS if half else [2 * p + 1 for p in _POINTS]
+        found = self._batches(omega, first)
+        for many in more:
+            todo = np.flatnonzero(~(found.error <= self.accuracy))
+            if todo.size == 0:
+                break
+            found = jax.tree.map(functools.partial(_put, todo), found, self._batches(omega[todo], many))
+        return found
+
+    def _batches(self, omega: np.ndarray, many: int) -> _Values:
+        padded = np.concatenate([omega, np.full(-omega.size % _LANES, omega[-1])]).reshape(-1, _LANES)
+        # All batches are sent off before the first one is waited for.
+        parts = [_values(self.scene, jnp.asarray(part), many, self.accuracy) for part in padded]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: omega.size], *parts)
+
+
+def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    old = old.copy()
+    old[where] = new
+    return old
+
+
+@eqx.filter_jit
+def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
+    start = jax.vmap(lambda w: light_rotor_speed(scene, w))(omega)
+    orbit, growth = orbits(
+        scene, omega, start, "omega", many, jnp.max(jax.vmap(lambda w, n: steps_for(scene, w, n))(omega, start)), accuracy
+    )
+    return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
+
+
+_KINDS = ("torus", "half_turn", "half_turn", "symmetry")
+"""What a sign change of each test means; where there is no half-turn, s = -1 is a period doubling."""
+
+
+def _tests(growth: Floquet) -> Array:
+    """(P, 4) from the growths s over a turn of the grid: prod (1 - s_i s_j) over pairs, prod (1 + s_i); of loads that part
+    from each other prod (1 + s_i), prod (1 - s_i)."""
+    s = growth.roots
+    first, second = np.triu_indices(s.shape[0], 1)
+    tests = [jnp.prod(1.0 - s[first] * s[second], axis=0), jnp.prod(1.0 + s, axis=0)]
+    inner = jnp.zeros((1, s.shape[1])) if growth.inner is None else growth.inner
+    tests += [jnp.prod(1.0 + inner, axis=0), jnp.prod(1.0 - inner, axis=0)]
+    return jnp.stack([test.real for test in tests], axis=-1)
+
+
+def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[SpecialPoint, ...]:
+    """Every sign change between neighbours that are both known, followed to its root."""
+    kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS)]
+    if not has_half_turn(scene):
+        kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS)]
+
+    def read(values: _Values) -> np.ndarray:
+        return np.concatenate([values.slope[:, None], values.tests], axis=1)
+
+    tests = read(grid)
+    row, which = np.nonzero(tests[:-1] * tests[1:] < 0.0)
+    if row.size == 0:
+        return ()
+    solve = _Solver(scene, accuracy)
+    pick = np.arange(row.size)
+    low, high = grid.omega[row].copy(), grid.omega[row + 1].copy()
+    f_low, f_high = tests[row, which], tests[row + 1, which]
+    middle, values = low, grid
+    # False position that never keeps an end twice (Illinois), with a halving now and then.
+    for turn in range(60):
+        before = middle
+        with np.errstate(all="ignore"):
+            aim = (low * f_high - high * f_low) / (f_high - f_low)
+        middle = np.where((turn % 5 == 4) | ~((aim > low) & (aim < high)), (low + high) / 2.0, aim)
+        values = solve(middle)
+        f = read(values)[pick, which]
+        if np.all((np.abs(middle - before) < 1e-10 * middle) | ~np.isfinite(f)):
+            break
+        left = f * f_low > 0.0
+        f_high = np.where(left, f_high / 2.0, f)
+        f_low = np.where(left, f, f_low / 2.0)
+        low, high = np.where(left, middle, low), np.where(left, high, middle)
+    points = []
+    for k in range(row.size):
+        s = values.multipliers[k]
+        # Two real multipliers with product 1 pass the torus test without being a bifurcation.
+        real = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
+        if np.isfinite(values.rotor_speed[k]) and not real:
+            points.append(SpecialPoint(kinds[which[k]], float(middle[k]), float(values.rotor_speed[k])))
+    return tuple(sorted(points, key=lambda point: point.omega))

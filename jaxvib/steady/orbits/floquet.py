@@ -1,0 +1,218 @@
+"""Floquet multipliers: whether a periodic jam lasts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import bodies, circle, has_half_turn, torque_slopes
+from jaxvib.equations.linear import jammed_loads, loaded_mass, natural_frequencies
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import Grid
+from jaxvib.steady.orbits.collocation import Harmonics, Motion
+
+__all__ = ["Floquet", "floquet", "steps_for"]
+
+_PHASE = 0.7
+"""What the fastest part of the carrier turns through in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
+
+# The tableau's last stage is the step itself, there to be evaluated for the next one.
+_TABLEAU = diffrax.Dopri8.tableau
+_NODES = np.concatenate([[0.0], _TABLEAU.c[:-1]])
+_ROWS = np.stack([np.pad(row, (0, len(_NODES) - len(row))) for row in [np.zeros(0), *_TABLEAU.a_lower[:-1]]])
+_WEIGHTS = _TABLEAU.b_sol[:-1]
+
+
+class Floquet(NamedTuple):
+    """How small disturbances of a periodic jam grow, trailing axis over the orbits.
+
+    **Attributes**: `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, that is half a period followed by the
+    half-turn where the motion has that symmetry (multipliers are their squares), else a period (they are the multipliers);
+    the trivial one, a shift in time, is taken out. `inner` (2, P): the same for two loads that part while the others
+    stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
+    """
+
+    roots: Array
+    inner: Array | None
+    trivial: Array
+
+
+def steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
+    """How many integration steps a turn of the grid asks for at the load speed `omega` and the rotor's `speed` (rad/s)."""
+    carrier = scene.machine.carrier()
+    half = jnp.linalg.inv(jnp.linalg.cholesky(loaded_mass(scene)))
+    decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
+    fastest = jnp.maximum(jnp.max(natural_frequencies(scene)), decay)
+    if carrier.gyroscopic is not None:
+        fastest = fastest + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
+    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
+
+
+class _Coefficients(NamedTuple):
+    """What of the orbit enters the linear equations at one angle: s e', what is left of it as the loads give way to the port
+    (dry friction takes a part), derivatives of s e' (np, G, P); the rest (G, P)."""
+
+    moving: Array
+    giving: Array
+    moving1: Array
+    moving2: Array
+    by_angle: Array
+    by_rate: Array
+
+
+def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, steps: int | Array) -> Floquet:
+    """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
+
+    With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
+
+        Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
+        I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
+
+    T the torque on the body, which dry friction lets depend on the port's acceleration a = Omega^2 B q'' too;
+    and for loads of one body that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last
+    term. Loads that lie side by side are pressed together, and do not part.
+    Fixed steps of Dormand and Prince's order 8, of the same length for all orbits.
+
+    **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
+    derivatives exist) or a scalar array.
+    """
+    carrier, whole = scene.machine.carrier(), bodies(scene)
+    mass = loaded_mass(scene)
+    nd, count = mass.shape[0], whole.inertia.shape[0]
+    inverse = jnp.linalg.inv(mass)
+    stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping
+    gyroscopic = None if carrier.gyroscopic is None else inverse @ carrier.gyroscopic
+    total = jnp.sum(whole.unbalance)
+    share = whole.unbalance / total
+    shift = inverse @ carrier.port.T * total
+    length = jnp.max(jnp.abs(shift))
+    shift = shift / length
+    port = carrier.port * length
+    mobility = port @ shift
+    # What a body of loads gives way with, per share of the unbalance.
+    lever = (total / whole.inertia)[None, :, None, None]
+    omega, speed = motion.omega, motion.rotor_speed
+    lanes, w, n = omega.shape[0], omega[None, None], speed[None, None]
+    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    h = turn / steps
+
+    def coefficients(theta: Array) -> _Coefficients:
+        lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
+        phi, rate = theta[None, :, None] + lag, 1.0 + lag1
+        point, moving = circle(scene, phi)
+        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        slopes = jax.vmap(lambda p, r, w, n, a: torque_slopes(scene, p, w * r, n, a), in_axes=-1, out_axes=-1)
+        by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
+        stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
+        moving2 = -point * lag2[None] - moving * rate[None] ** 2
+        s = share[None, :, None, None]
+        unit = whole.inertia[:, None, None] * omega[None, None] ** 2
+        by_rate = by_rate * omega[None, None] / unit
+        giving = s * moving - by_acceleration / total
+        return _Coefficients(s * moving, giving, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
+
+    def damped(q1: Array, w: Array, n: Array) -> Array:
+        answer = _times(damping, q1) / w
+        return answer if gyroscopic is None else answer + n * _times(gyroscopic, q1) / w
+
+    def full(c: _Coefficients, x: Array) -> Array:
+        q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[2 * nd : 2 * nd + count], x[2 * nd + count :]
+        t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
+        below = q - _times(shift, jnp.sum(t * d[None], axis=1))
+        below1 = q1 - _times(shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
+        q2 = -damped(below1, w, n) - _times(stiffness, below) / w**2
+        pushed = _times(port, q2) - _times(mobility, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
+        torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
+        # The port's acceleration with the bodies giving way to it: an equation for each of its directions.
+        answers = lever * c.giving[:, :, None]
+        weight = jnp.sum(t[:, None] * answers[None], axis=2)
+        acceleration = _small_solve(_times(mobility, weight), pushed - _times(mobility, jnp.sum(t * torque[None], axis=1)))
+        return jnp.concatenate([q1, q2, d1, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
+
+    def apart(c: _Coefficients, x: Array) -> Array:
+        return jnp.stack([x[1], c.by_rate * x[1] + c.by_angle * x[0]])
+
+    def start(n: int) -> Array:
+        return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
+
+    loads = jammed_loads(scene)
+    parting = loads.alike and loads.count > 1 and loads.own_radius is None
+    sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
+    fields = (full, apart)[: len(sizes)]
+    begin = tuple(start(n) for n in sizes)
+
+    def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        at = coefficients((k + _NODES) * h)
+
+        # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
+        def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
+            c = _Coefficients(*(part[..., i, :] for part in at))
+            return tuple(
+                rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
+                for field, x, rate in zip(fields, state, rates, strict=True)
+            )
+
+        rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
+        rates = jax.lax.fori_loop(0, len(_NODES), stage, rates)
+        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+
+    rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
+    end = jax.lax.fori_loop(0, steps, step, begin)
+    flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), np.ones(2 * count)])
+    monodromy = flip[:, None, None] * end[0]
+
+    # A shift in time: q' and phi' along the orbit itself.
+    zero = jnp.zeros((1,), dtype=omega.dtype)
+    at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
+    lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, zero, k) for k in range(3))
+    _, moving = circle(scene, lag)
+    along = jnp.concatenate([
+        at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + lag1)[None], axis=1)),
+        -damped(at1, w, n) - _times(stiffness, at) / w**2,
+        1.0 + lag1,
+        lag2,
+    ])[:, 0]  # fmt: skip
+    trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
+    roots = jnp.linalg.eigvals(rest).T
+    inner = jnp.linalg.eigvals(jnp.moveaxis(end[1], -1, 0)).T if len(end) > 1 else None
+    return Floquet(roots, inner, trivial)
+
+
+def _signal(orders: np.ndarray, harmonics: Array, theta: Array, derivative: int) -> Array:
+    """A derivative of Re sum_k c_k exp(i k theta) at the angles theta (n,); c (..., K, P) gives (..., n, P)."""
+    k = jnp.asarray(orders, dtype=theta.dtype)
+    wave = (1j * k[None]) ** derivative * jnp.exp(1j * theta[:, None] * k[None])
+    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum("nk,...kp->...np", wave.imag, harmonics.imag)
+
+
+def _times(matrix: Array, vectors: Array) -> Array:
+    """Matrix (a, b) times (b, columns, P); written out where it is small, so that it melts into what surrounds it."""
+    a, b = matrix.shape
+    if a * b > 16:
+        return jnp.tensordot(matrix, vectors, 1)
+    return jnp.stack([sum(matrix[i, k] * vectors[k] for k in range(b)) for i in range(a)])
+
+
+def _small_solve(weight: Array, right: Array) -> Array:
+    """x (np, ...) of (1 - weight) x = right, np = 1 or 2 written out, weight (np, np, ...)."""
+    a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
+    if weight.shape[0] == 1:
+        return right / a[0]
+    det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    return jnp.stack([a[1, 1] * right[0] - a[0, 1] * right[1], a[0, 0] * right[1] - a[1, 0] * right[0]]) / det[None]
+
+
+def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:
+    """The eigenvalue that belongs to the eigenvector `known`, and a matrix that has the others."""
+    unit = known / jnp.linalg.norm(known)
+    mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
+    mirror = mirror / jnp.linalg.norm(mirror)
+    turned = matrix - 2.0 * jnp.outer(mirror, mirror @ matrix)
+    turned = turned - 2.0 * jnp.outer(turned @ mirror, mirror)
+    return unit @ (matrix @ unit), turned[1:, 1:]

@@ -1,0 +1,233 @@
+"""Exact jams by name: the one of a mode, of a load speed, or near one."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.linear import jammed_loads
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.collocation import Given, along, periodic_motion
+from jaxvib.steady.orbits.floquet import steps_for
+from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
+from jaxvib.units import Number, number, traced
+
+__all__ = ["exact_mode_speeds", "jam_orbit"]
+
+_POINTS = (16, 32, 64, 128)
+"""Points on half a period, tried in turn until the asked accuracy holds."""
+
+_SEARCH, _LANES = 800, 100
+"""Points of the exact branch that are looked at where the leading order does not lead to a mode, and of them at once."""
+
+_FAR = 0.02
+"""Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
+
+
+def jam_orbit(
+    scene: Scene,
+    *,
+    mode: int | None = None,
+    omega: Number | None = None,
+    near: Number | None = None,
+    accuracy: float | None = None,
+    points: int | None = None,
+    throw: bool = True,
+) -> Orbit:
+    """The exact motion in which collected loads jam: no assumption that they are light.
+
+        I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
+        D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
+
+    with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
+    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
+    that share every number are collected at one point, or side by side where they have an `own_radius` (S is then
+    m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other, on the average of a period, the status is
+    `held`). Loads that differ have a psi_j each: they take the places next to each other that their torques ask for.
+    The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. Where friction
+    can hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status says so.
+
+    **Arguments**, one of the first three
+
+    - `mode`: the number of a jam mode, see `jam_modes`: the motion at the scene's rotor speed that continues it. Where the
+      leading order lacks it or is too far from it, the whole exact branch is searched (not under a JAX transformation)
+    - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
+    - `near`: a load speed to start from: a motion at the scene's rotor speed
+    - `accuracy`: harmonics are added until the estimated relative error is below it (1e-9 unless said otherwise, in single
+      precision 1e-3)
+    - `points`: a fixed number of collocation points (on half a period without gravity, else on a period) in place of that.
+      Under `jit` and `vmap` shapes cannot follow numbers: there it is 16 (33) unless said otherwise, the status tells
+    - `throw`: raise where there is no such motion; else, and under a JAX transformation, the status says so
+
+    **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function
+    theorem, forward and reverse.
+
+    **Raises** `InputError` for wrong arguments, loads without drag, a `mode` of a machine with gyroscopic coupling (its
+    resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives
+    that at the lowest one); `ComputationError` with the status "absent" or "not_converged".
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=0.05, beta=1.0, speed=3.0)
+    >>> orbit = jv.jam_orbit(form.scene(), mode=3)
+    >>> round(float(orbit.omega), 6), bool(orbit.stable)
+    (0.972666, True)
+
+    Source: the antiphase paper, equations (2) and (21), solved without its expansion in eps.
+    """
+    named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
+    if len(named) != 1:
+        given = " and ".join(named) if named else "none"
+        raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
+    scene = jax.tree.map(jnp.asarray, scene)
+    frozen = jax.lax.stop_gradient(scene)
+    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
+    floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+    if accuracy is None:
+        accuracy = 1e-9 if floor < 1e-9 else 1e-3
+    if not accuracy >= floor:
+        raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
+    drag = jammed_loads(frozen).drag_sum()
+    if not traced(drag) and not float(drag) > 0.0:
+        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+
+    exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
+    if mode is not None:
+        if frozen.machine.carrier().gyroscopic is not None:
+            raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
+        jam = jam_modes(frozen).select(mode, throw=False)
+        direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
+        exists = jnp.isfinite(jam.omega)
+        start = jnp.where(exists, jam.omega, frozen.drive.speed)
+    elif near is not None:
+        start = number(near, "rad/s", "near", low=0.0, open_low=True)
+    which: Given = "rotor_speed"
+    value = scene.drive.speed
+    if omega is not None:
+        value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
+        which, start = "omega", light_rotor_speed(frozen, jax.lax.stop_gradient(value))
+
+    half = has_half_turn(scene)
+    if points is None and not concrete:
+        points = 16 if half else 33
+    tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
+    still = jax.lax.stop_gradient(value)
+    # Reverse-mode derivatives ask for a number of steps that is part of the program.
+    steps = steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
+    static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
+    differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
+    many, found, settle = tried[0], None, False
+
+    def attempt() -> Orbit:
+        nonlocal many
+        for many in tried[:-1]:
+            orbit = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
+            if not float(orbit.error) > accuracy:
+                return orbit
+        many = tried[-1]
+        return _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
+
+    if concrete:
+        found = attempt()
+        if mode is not None and not bool(jnp.abs(found.omega / start - 1.0) < _FAR):
+            # The leading order has no such mode, or it is far from the exact one: look at the whole exact branch.
+            searched = exact_mode_speeds(frozen).get(int(mode))
+            exists = jnp.asarray(searched is not None)
+            start = start if searched is None else jnp.asarray(searched, dtype=start.dtype)
+            settle = True
+            found = attempt()
+    if found is None or differentiated:
+        found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy, settle)
+    elif throw:
+        for status in ("absent", "not_converged"):
+            if bool(found.status == getattr(OrbitStatus, status)):
+                raise ComputationError(status, OrbitStatus[getattr(OrbitStatus, status)])
+    return found
+
+
+@eqx.filter_jit
+def _orbit(
+    scene: Scene,
+    value: Array,
+    start: Array,
+    exists: Array,
+    direction: Array | None,
+    given: Given,
+    points: int,
+    steps: int | Array,
+    accuracy: float,
+    settle: bool = False,
+) -> Orbit:
+    """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
+    lag = None
+    if settle:
+        grid = grid_of(points, has_half_turn(scene))
+        lag = periodic_motion(scene, grid, "omega", start, light_rotor_speed(scene, start)).lag[None]
+    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, lag)
+    orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
+    # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
+    there = exists
+    if direction is not None:
+        there = exists & (~(orbit.slope * direction < 0.0) | (orbit.status == OrbitStatus.at_fold))
+    orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
+    status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
+    return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))
+
+
+def exact_mode_speeds(scene: Scene) -> dict[int, float]:
+    """Load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode: where to start from for each.
+
+    The exact branch n(Omega) is looked at point by point, cut where it turns, and its pieces numbered as `jam_modes` does.
+    """
+    crowded, resonances = fold_points(scene, _SEARCH)
+    crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
+    crowded = np.sort(np.append(crowded, target))
+    omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
+    speed, slope = (np.ravel(x) for x in _branch(scene, jnp.asarray(omega).reshape(-1, _LANES)))
+    known = np.isfinite(speed)
+    omega, speed = _between(omega[known], speed[known], slope[known])
+    rising = speed[1:] > speed[:-1]
+    turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
+    padded = np.pad(turn, (0, 4 * nd - turn.size))
+    main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
+    there = main < turn.size
+    cuts = np.where(there, omega[padded[main]], np.inf)
+    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
+    found: dict[int, float] = {}
+    for k in np.flatnonzero((speed[1:] - target) * (speed[:-1] - target) <= 0.0):
+        part = (target - speed[k]) / (speed[k + 1] - speed[k])
+        found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
+    # So close to a fold that it lies between two points: both of its modes are about there.
+    for k in turn[np.abs(speed[turn] - target) < 1e-6 * target]:
+        for side in (k - 1, k + 1):
+            found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
+    return found
+
+
+def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cubics through (x, y) with these slopes, 32 an interval."""
+    t, h = np.arange(32) / 32, np.diff(x)[:, None]
+    a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
+    cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
+    return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
+
+
+@eqx.filter_jit
+def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
+    """Rotor speeds and slopes of exact jams at load speeds, in batches; NaN where there is none."""
+    grid = grid_of(*((16, True) if has_half_turn(scene) else (33, False)))
+
+    def one(w: Array) -> tuple[Array, Array]:
+        motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
+        there = motion.residual < 4096.0 * jnp.finfo(w.dtype).eps
+        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, along(scene, grid, motion).slope, jnp.nan)
+
+    return jax.lax.map(jax.vmap(one), omega)

@@ -1,0 +1,261 @@
+"""Exact jams: what is known of a periodic motion of the full equations in which collected loads are stuck."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import bodies, circle, each_load, has_half_turn, load_torque, rotor_torque, torque_of_each
+from jaxvib.equations.linear import jammed_loads
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import Grid, grid_of
+from jaxvib.numerics.roots import bracketed_root
+from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.orbits.collocation import Given, Harmonics, Motion, along, harmonics_of, periodic_motion
+from jaxvib.steady.orbits.floquet import Floquet, floquet
+
+__all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
+
+
+class OrbitStatus(eqx.Enumeration):
+    """What is known of an exact jam; the members are the sentences a user reads."""
+
+    found = "the loads can jam in this periodic motion"
+    absent = "this mode does not exist at this rotor speed"
+    not_converged = "no periodic motion was found: the torque balance could not be met"
+    coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
+    held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
+    at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
+
+
+class Orbit(eqx.Module):
+    """An exact jam: phi = theta + psi(theta), theta = Omega t, psi periodic with mean 0; everything else follows it.
+
+    Numbers are NaN where the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
+
+    **Attributes**
+
+    - `status` an `OrbitStatus`; `residual` of the torque balance, relative; `error` estimate of the relative error of the
+      speeds (and, rad, of psi) that the number of harmonics leaves
+    - `omega`, `rotor_speed` rad/s; `slope` dn/dOmega along the branch
+    - `amplitude` (nd,) m, of tilts rad, and `foundation_force` N: zero to peak, (max - min)/2 over the period; of two
+      directions of the force the root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
+    - `power` W: mean power that the loads take from the rotor, by drag and dry friction
+    - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
+      Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
+      the multiplier that is 1, as computed
+    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, of tilts rad, `force_harmonics` (nb, K) N: the c_k; loads
+      that share every number have one lag (G = 1), else each has its own (G = count)
+    - `units` (nd,): of the amplitudes, "m" or "rad"
+    - `lag_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
+    """
+
+    status: OrbitStatus
+    omega: Array
+    rotor_speed: Array
+    slope: Array
+    stable: Array
+    multiplier: Array
+    multipliers: Array
+    trivial: Array
+    amplitude: Array
+    foundation_force: Array
+    power: Array
+    residual: Array
+    error: Array
+    lag_harmonics: Array
+    displacement_harmonics: Array
+    force_harmonics: Array
+    offsets: Array
+    lag_orders: tuple[int, ...] = eqx.field(static=True)
+    orders: tuple[int, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def message(self) -> str:
+        """What is known of this motion, a sentence."""
+        return OrbitStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+
+    @property
+    def harmonics(self) -> int:
+        """The highest harmonic of the carrier's motion that was used."""
+        return self.orders[-1]
+
+    def at(self, theta: Array) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
+        """The motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',) rad/s.
+
+        Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
+        the motion.
+        """
+        k, j = np.asarray(self.orders), np.asarray(self.lag_orders)
+        wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
+        phi = theta + (self.lag_harmonics @ lag_wave).real
+        rate = self.omega * (1.0 + (self.lag_harmonics @ (1j * j * lag_wave)).real)
+        return (
+            (self.displacement_harmonics @ wave).real,
+            self.omega * (self.displacement_harmonics @ (1j * k * wave)).real,
+            (self.offsets + phi,),
+            (jnp.broadcast_to(rate, self.offsets.shape),),
+        )
+
+    def summary(self) -> str:
+        """A few lines a person can read; amplitudes zero to peak."""
+        kinds = {unit: [k for k, each in enumerate(self.units) if each == unit] for unit in dict.fromkeys(self.units)}
+        amplitude = "; ".join(
+            f"{', '.join(f'{float(self.amplitude[k]):.6g}' for k in places)} {unit}" for unit, places in kinds.items()
+        )
+        return (
+            f"loads {float(self.omega):.9g} rad/s, rotor {float(self.rotor_speed):.9g} rad/s, "
+            f"{'stable' if self.stable else 'unstable'} (largest multiplier {float(self.multiplier):.6g})\n"
+            f"amplitude {amplitude}, foundation force {float(self.foundation_force):.6g} N, "
+            f"power {float(self.power):.6g} W\n"
+            f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
+        )
+
+
+def light_rotor_speed(scene: Scene, omega: Array) -> Array:
+    """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
+
+    Where the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
+    it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
+    """
+    if scene.machine.carrier().gyroscopic is None:
+        return jam_rotor_speed(scene, omega)
+
+    def left_over(n: Array) -> Array:
+        return n - jam_rotor_speed(scene, omega, n)
+
+    speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
+    above = jax.vmap(left_over)(speeds) > 0.0
+    first = jnp.maximum(jnp.argmax(above), 1)
+    return bracketed_root(left_over, speeds[first - 1], speeds[first])
+
+
+def orbits(
+    scene: Scene,
+    value: Array,
+    start: Array,
+    given: Given,
+    points: int,
+    steps: int | Array,
+    accuracy: float,
+    lag: Array | None = None,
+) -> tuple[Orbit, Floquet]:
+    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from, `lag`
+    (P, G, M) where psi does.
+
+    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
+    """
+    grid = grid_of(points, has_half_turn(scene))
+
+    def one(v: Array, s: Array, lag: Array | None) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
+        motion = periodic_motion(scene, grid, given, v, s, lag)
+        harmonics = harmonics_of(scene, grid, motion)
+        return motion, harmonics, _measured(scene, grid, motion, harmonics)
+
+    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, lag)
+    growth = floquet(scene, grid, motion, harmonics, steps)
+    roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
+    multipliers = roots**2 if grid.symmetric else roots
+    trivial = growth.trivial**2 if grid.symmetric else growth.trivial
+    largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
+
+    slope, speed_error, lag_error, amplitude, force, power, push = measured
+    tiny = jnp.finfo(slope.dtype).eps
+    relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
+    met = motion.residual < 4096.0 * tiny
+    error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), lag_error)
+    flat = (relative < tiny**0.25) & (given == "rotor_speed")
+
+    parts = push < 0.0
+
+    def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
+        known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
+        known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
+        known = OrbitStatus.where(pulls, OrbitStatus.held, known)
+        return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
+
+    def or_nan(values: Array) -> Array:
+        return jnp.moveaxis(jnp.where(met, values, jnp.nan), -1, 0)
+
+    orbit = Orbit(
+        status=jax.vmap(status)(met, flat, error <= accuracy, parts),
+        omega=or_nan(motion.omega),
+        rotor_speed=or_nan(motion.rotor_speed),
+        slope=or_nan(slope),
+        stable=met & (largest < 1.0) & ~parts,
+        multiplier=or_nan(largest),
+        multipliers=or_nan(multipliers),
+        trivial=or_nan(trivial),
+        amplitude=or_nan(amplitude),
+        foundation_force=or_nan(force),
+        power=or_nan(power),
+        residual=motion.residual,
+        error=or_nan(error),
+        lag_harmonics=or_nan(harmonics.lag),
+        displacement_harmonics=or_nan(harmonics.displacement),
+        force_harmonics=or_nan(harmonics.force),
+        lag_orders=tuple(map(int, grid.lag_orders)),
+        orders=tuple(map(int, grid.orders)),
+        units=scene.machine.structure().units,
+        offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
+    )
+    return orbit, growth
+
+
+def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
+    """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
+    branch = along(scene, grid, motion)
+    phi, rate = grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T)
+    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, acceleration, rotor_torque), axis=0))
+    # Directions of the force on the bed are put together as those of a vector.
+    force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
+    push = _least_push(scene, grid, motion, harmonics)
+    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
+
+
+def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> Array:
+    """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
+
+    Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
+    vibration that holds a jam presses the loads together at every instant.
+    """
+    loads = jammed_loads(scene)
+    if loads.own_radius is None or loads.count == 1:
+        return jnp.zeros_like(motion.omega)
+    phi, rate = each_load(scene, grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T))
+    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, phi)[1], acceleration)
+    needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)
+    return jnp.min(-jnp.cumsum(needed)[:-1])
+
+
+def _swing(grid: Grid, harmonics: Array) -> Array:
+    """(max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
+    orders = grid.orders
+    samples = 2.0 * np.pi * np.arange(max(64, 4 * int(orders[-1]))) / max(64, 4 * int(orders[-1]))
+    spacing = samples[1]
+    signal = (harmonics @ np.exp(1j * orders[:, None] * samples)).real
+
+    def extremum(c: Array, values: Array, sign: float) -> Array:
+        def newton(_: int, theta: Array) -> Array:
+            wave = still * jnp.exp(1j * orders * theta)
+            first, second = jnp.sum(-orders * wave.imag), jnp.sum(-(orders**2) * wave.real)
+            step = first / jnp.where(sign * second < 0.0, second, -sign * jnp.inf)
+            return theta - jnp.clip(step, -spacing, spacing)
+
+        still = jax.lax.stop_gradient(c)
+        theta = jnp.asarray(samples, dtype=values.dtype)[jnp.argmax(sign * values)]
+        # The value at an extremum does not change with where the extremum is: its place needs no derivative.
+        theta = jax.lax.fori_loop(0, 3, newton, theta)
+        return jnp.sum(c * jnp.exp(1j * orders * theta)).real
+
+    def swing(c: Array, values: Array) -> Array:
+        highest = extremum(c, values, 1.0)
+        return highest if grid.symmetric else (highest - extremum(c, values, -1.0)) / 2.0
+
+    return jax.vmap(swing)(harmonics, signal)

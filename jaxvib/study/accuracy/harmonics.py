@@ -1,0 +1,82 @@
+"""How many harmonics an exact jam asks for."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.draw.comparison import convergence_chart
+from jaxvib.equations.collected import has_half_turn
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.orbits.collocation import along, periodic_motion
+from jaxvib.steady.orbits.orbit import light_rotor_speed
+from jaxvib.units import Number, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["HarmonicConvergence", "harmonic_convergence"]
+
+
+class HarmonicConvergence(NamedTuple):
+    """What the number of harmonics leaves: `harmonics` (n,) highest one of the carrier; of the jams at `omega` (w,) rad/s the
+    relative `error` (n, w) of the rotor speed against twice as many points as the last, and the estimate of it that each jam
+    comes with, `known` (n, w)."""
+
+    omega: np.ndarray
+    harmonics: np.ndarray
+    error: np.ndarray
+    known: np.ndarray
+
+    def plot(self) -> Figure:
+        """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed."""
+        names = [f"{w:.4g} rad/s" for w in self.omega]
+        return convergence_chart(self.harmonics, self.error, self.known, names=names)
+
+
+def harmonic_convergence(
+    scene: Scene, omega: Sequence[Number], *, points: Sequence[int] = (4, 6, 8, 10, 12, 16, 20, 24)
+) -> HarmonicConvergence:
+    """The error of exact jams over the number of collocation points: it falls exponentially (spectral convergence).
+
+    **Arguments**: `omega` load speeds, rad/s or text; `points` of the collocation, ascending, see `jam_orbit`.
+
+    **Returns** `HarmonicConvergence`. **Raises** `InputError` for points that do not ascend, speeds not positive.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=0.05, beta=1.0, speed=3.0)
+    >>> found = harmonic_convergence(form.scene(), [0.97], points=(4, 8))
+    >>> [bool(error < most) for error, most in zip(found.error[:, 0], (1e-4, 1e-10))]
+    [True, True]
+
+    Source: ours, on `jam_orbit`.
+    """
+    if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
+        raise InputError("points", f"are {points!r}; give numbers of points in ascending order")
+    speeds = jnp.stack([number(w, "rad/s", "omega", low=0.0, open_low=True) for w in omega])
+    half = has_half_turn(scene)
+    rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]
+    n, known = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))
+    highest = np.array([grid_of(m, half).orders[-1] for m in points])
+    return HarmonicConvergence(np.asarray(speeds), highest, np.abs(n[:-1] / n[-1] - 1.0), known[:-1])
+
+
+@eqx.filter_jit
+def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
+    grid = grid_of(points, has_half_turn(scene))
+
+    def one(w: Array) -> tuple[Array, Array]:
+        motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
+        return motion.rotor_speed, along(scene, grid, motion).speed_error
+
+    return jax.vmap(one)(omega)

@@ -1,0 +1,90 @@
+"""What the leading order is worth: jams of light-load theory against exact ones as the loads get heavier."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.linear import jammed_loads
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.jams.jam import Jam, jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Tier", "Tiers", "compare_tiers"]
+
+
+class Tier(NamedTuple):
+    """One tier's answers, NaN where it has none: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
+    `stable` (n,); `message` (n sentences) says of each whether it is there, or why not."""
+
+    omega: np.ndarray
+    amplitude: np.ndarray
+    foundation_force: np.ndarray
+    stable: np.ndarray
+    message: tuple[str, ...]
+
+
+class Tiers(NamedTuple):
+    """Two tiers over the mass of one load: `mass` (n,) kg (its mean, where loads differ), `leading` and `exact` the answers."""
+
+    mass: np.ndarray
+    leading: Tier
+    exact: Tier
+
+    def plot(self) -> Figure:
+        """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable."""
+        differences = {
+            "load speed": np.abs(self.leading.omega / self.exact.omega - 1.0),
+            "amplitude": np.max(np.abs(self.leading.amplitude / self.exact.amplitude - 1.0), axis=1),
+            "foundation force": np.abs(self.leading.foundation_force / self.exact.foundation_force - 1.0),
+        }
+        from jaxvib.draw.comparison import tiers_chart  # slow to import: only who draws pays
+
+        return tiers_chart(self.mass, differences, self.exact.stable)
+
+
+def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:
+    """A jam mode by the leading order and exactly, for loads heavier and lighter than the scene's by the given factors.
+
+    Drag grows with the square of the mass, which leaves the leading-order balance n(Omega) as it is, but for the loads'
+    share in the mass of their platform. Dry friction grows as the mass does, as in a machine: with it the balance moves too.
+
+    **Arguments**: `factors` on the mass (and inertia) of the loads; `mode` a jam mode, see `jam_modes`.
+
+    **Returns** `Tiers`. **Raises** `InputError` for a mode there can never be.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> tiers = compare_tiers(form.scene(), (0.1, 1.0, 10.0), mode=3)
+    >>> [f"{abs(a / b - 1):.0e}" for a, b in zip(tiers.leading.omega, tiers.exact.omega)]
+    ['1e-06', '1e-05', '1e-04']
+
+    Source: the leading order is the antiphase paper's, see `jam_modes`; the comparison is ours.
+    """
+    loads = jammed_loads(scene)
+    answers: list[tuple[Jam, Orbit]] = []
+    for factor in factors:
+        heavier = eqx.tree_at(
+            lambda x: (x.mass, x.drag, x.inertia),
+            loads,
+            (loads.mass * factor, loads.drag * factor**2, None if loads.inertia is None else loads.inertia * factor),
+            is_leaf=lambda x: x is None,
+        )
+        now = eqx.tree_at(lambda s: s.loads, scene, heavier)
+        answers.append((jam_modes(now).select(mode, throw=False), jam_orbit(now, mode=mode, throw=False)))
+
+    def tier(which: int) -> Tier:
+        jams = [answer[which] for answer in answers]
+        numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in Tier._fields[:-1])
+        return Tier(*numbers, message=tuple(jam.message for jam in jams))
+
+    return Tiers(float(jnp.mean(loads.mass)) * np.asarray(factors, dtype=float), tier(0), tier(1))

@@ -1,0 +1,388 @@
+"""What accuracy costs in time: one quantity of a scene, computed in every way there is."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.dynamics import State
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.distance import distance, scales, turned
+from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.run import Run
+from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.start import initial_state
+from jaxvib.steady.jams.jam import JamStatus, jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
+from jaxvib.units import Number, count, number
+
+__all__ = ["QUANTITIES", "SOLVERS", "accuracy"]
+
+Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
+QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
+
+SOLVERS: dict[str, Any] = {"default": None, "Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
+"""Methods of time integration by name; the default is what `simulate` takes unless told otherwise."""
+
+_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
+_POINTS = (8, 16)
+_AVERAGED = (1e-3, 1e-6)
+
+_SINGLE = 2e-6
+"""The smallest tolerance that single precision is asked for."""
+
+_GRADIENT_TOLERANCE = 1e-8
+
+_MOST_NOTED = 2**17
+"""Steps that a run may take whose derivatives are asked for: the end of each is noted."""
+
+_SLOW_PERIODS, _MOST_PERIODS = 20.0, 2000.0
+"""The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
+
+
+def accuracy(
+    scene: Scene,
+    quantity: Quantity = "amplitude",
+    *,
+    mode: int | None = None,
+    until: Number | None = None,
+    tolerances: Sequence[float] = _TOLERANCES,
+    solvers: Sequence[str] = tuple(SOLVERS),
+    repeats: int = 3,
+) -> Cost:
+    """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
+
+    - "amplitude", "foundation_force": of a jam mode, where the scene has jams that can be computed exactly; tiers leading
+      order, exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the
+      exact orbit with 32 points, its own error the difference to 24. Else (run-ups, imbalance, loads at different stations)
+      as measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error
+      the difference to 1e-11.
+    - "final_state": of the full equations at `until`, from rest; every solver, in double and in single precision. The
+      reference is a run to a tolerance of 1e-13, its own error estimated as every run's.
+    - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
+      order and exact orbit, forward and reverse mode and finite differences through the full integration.
+
+    Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer
+    is left out, and the result says why.
+
+    **Arguments**
+
+    - `quantity`: one of `QUANTITIES`
+    - `mode`: a jam mode; unless said otherwise the second highest there is with a rising slope, for in the highest the loads
+      turn with the rotor but for a small slip; where there is one only, that one
+    - `until`: s or text; unless said otherwise 20 slow periods, and for a jam besides as long as its slowest Floquet multiplier
+      needs to forget the start to the tolerance of the run
+    - `tolerances` of time integration, one at least; `solvers`: its methods, names from `SOLVERS`
+    - `repeats`: how often each is timed (less often where it takes seconds), the fastest counts
+
+    **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
+    gradient of a scene without an exact jam; as `jam_modes`, `simulate` besides.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> cost = jv.accuracy(scene, "amplitude", mode=1, tolerances=(1e-6,), solvers=["default"], repeats=1)
+    >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
+    ('exact orbit', True)
+
+    Source: ours; the tiers have theirs, see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
+    """
+    if quantity not in QUANTITIES:
+        raise InputError("quantity", f"is {quantity!r}; it must be one of {', '.join(QUANTITIES)}")
+    unknown = [name for name in solvers if name not in SOLVERS]
+    if unknown or not solvers:
+        raise InputError("solvers", f"are {list(solvers)!r}; name some of {', '.join(SOLVERS)}")
+    if not tolerances:
+        raise InputError("tolerances", f"are {tuple(tolerances)!r}; name one at least, such as 1e-6")
+    count(repeats, "repeats")
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if scene.drive.speed.dtype.itemsize < 8:
+        problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
+        raise InputError("scene", problem)
+    end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
+    ask = _Ask(scene, tuple(tolerances), tuple(solvers), repeats)
+    if quantity == "final_state":
+        return _final_state(ask, end)
+    if quantity == "gradient":
+        return _gradient(scene, _exact_jam(scene, mode), end, repeats)
+    try:
+        jam = _exact_jam(scene, mode)
+    except InputError as problem:
+        if mode is not None:
+            raise
+        return _at_the_end(ask, quantity, end, f"leading order, exact orbit: {problem}")
+    return _steady(ask, quantity, jam, end)
+
+
+_Way = tuple[str, str, str, Callable[..., Any]]
+"""Tier, method and setting in words, and the gradient at stiffnesses."""
+
+
+class _Ask(NamedTuple):
+    scene: Scene
+    tolerances: tuple[float, ...]
+    solvers: tuple[str, ...]
+    repeats: int
+
+
+class _Jam(NamedTuple):
+    """A jam mode exactly, with many points and fewer."""
+
+    mode: int
+    fine: Orbit
+    coarse: Orbit
+
+    def length(self, scene: Scene, tolerance: float) -> float:
+        """How long a run takes to forget its start to the tolerance, s, the measuring window after that; of a stable jam."""
+        rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
+        window = _slow_period(scene) * _SLOW_PERIODS
+        return min(window + np.log(1.0 / tolerance) / rate, _slow_period(scene) * _MOST_PERIODS)
+
+
+def _exact_jam(scene: Scene, mode: int | None) -> _Jam:
+    if not isinstance(scene.drive, ConstantSpeed):
+        raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
+    modes = jam_modes(scene)
+    if mode is None:
+        rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
+        if not rising:
+            raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
+        mode = rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
+    return _Jam(mode, *(jam_orbit(scene, mode=mode, points=_whole(scene, points)) for points in (32, 24)))
+
+
+def _whole(scene: Scene, points: int) -> int:
+    """So many points on half a period, or as close together on a whole one where that is needed."""
+    return points if has_half_turn(scene) else 2 * points + 1
+
+
+def _slow_period(scene: Scene) -> float:
+    frequencies = natural_frequencies(scene)
+    return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
+
+
+def _single(tree: Any) -> Any:
+    """A scene, or more, in single precision; goes with `jax.enable_x64(False)`."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
+
+
+def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
+    scene, mode = ask.scene, jam.mode
+
+    def read(found: Any) -> Any:
+        return getattr(found, quantity)
+
+    reference = np.ravel(np.asarray(read(jam.fine), float))
+
+    def error(value: Any) -> float:
+        return relative(value, reference)
+
+    def leading(scene: Scene, dtype: str) -> CostRow:
+        call = _compiled(lambda s: read(jam_modes(s).select(mode)), scene)
+        return row_of("leading order", "", "", call, error, ask.repeats, dtype)
+
+    rows, left_out = [], []
+    light = jam_modes(scene).select(mode, throw=False)
+    if bool(light.status == JamStatus.found):
+        start = initial_state(scene, "jam", mode=mode)
+        rows.append(leading(scene, "float64"))
+        with jax.enable_x64(False):
+            rows.append(leading(_single(scene), "float32"))
+    else:
+        start = State(*jam.fine.at(jnp.zeros(())))
+        left_out.append(f"leading order: {JamStatus[light.status]}; runs start on the exact motion in its place")  # pyright: ignore
+    for few in _POINTS:
+        points = _whole(scene, few)
+        call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
+        rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
+    if not bool(jam.fine.stable):
+        left_out.append(_unstable("envelope, full", jam))
+    else:
+
+        def length(tolerance: float) -> float:
+            return jam.length(scene, tolerance) if end is None else end
+
+        integrated, reasons = _integrated(ask, read, error, start, length)
+        rows, left_out = rows + integrated, left_out + reasons
+    return Cost(quantity, reference.tolist(), relative(read(jam.coarse), reference), rows, tuple(left_out))
+
+
+def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
+    """Of a motion that is no jam: as measured at the end of a run from rest."""
+    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+
+    def read(found: Any) -> Any:
+        return getattr(found, quantity)
+
+    start = initial_state(ask.scene)
+
+    @functools.cache
+    def reference(tolerance: float = 1e-13) -> np.ndarray:
+        """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
+        return np.ravel(np.asarray(read(simulate(ask.scene, end, save="window", tolerance=tolerance, estimate=False)), float))
+
+    rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
+    return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
+
+
+def _integrated(
+    ask: _Ask,
+    read: Callable[[Any], Any],
+    error: Callable[[Any], float],
+    start: State,
+    length: Callable[[float], float],
+) -> tuple[list[CostRow], list[str]]:
+    """What comes out at the end of averaged and full runs, of a `length` for each tolerance."""
+    full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
+    for tolerance in _AVERAGED:
+        end = length(tolerance)
+
+        def averaged(end: float = end, tolerance: float = tolerance) -> Any:
+            return read(envelope(ask.scene, end, start=start, save="window", tolerance=tolerance, throw=False))
+
+        try:
+            rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, ask.repeats))
+        except InputError as problem:
+            left_out.append(f"envelope: {problem}")
+            break
+    return rows + full, left_out
+
+
+def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
+    """Full runs by every solver to every tolerance, in double and (the default method) in single precision."""
+    ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
+    steps = enough_steps(ask.scene, jnp.asarray(max(ends.values())))  # one for all: it is a part of the program
+
+    def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
+        solver = None if SOLVERS[name] is None else SOLVERS[name]()
+
+        def run(tolerance: float) -> Run:
+            asked = dict(save="window", tolerance=tolerance, solver=solver, estimate=False, max_steps=steps, throw=False)
+            return simulate(scene, ends[tolerance], start=start, **asked)  # pyright: ignore[reportArgumentType]
+
+        return [
+            row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
+            for tolerance in ask.tolerances
+            if tolerance >= least
+        ]
+
+    found = [row for name in ask.solvers for row in rows(ask.scene, start, name, "float64")]
+    if "default" in ask.solvers:
+        with jax.enable_x64(False):
+            found += rows(_single(ask.scene), _single(start), "default", "float32", _SINGLE)
+    return found
+
+
+def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], Any]:
+    jitted = eqx.filter_jit(function)
+    return lambda: jitted(scene)
+
+
+def _final_state(ask: _Ask, end: float | None) -> Cost:
+    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+    best = functools.cache(lambda: simulate(ask.scene, end, save="window", tolerance=1e-13))
+
+    @functools.cache
+    def scale() -> State:
+        return scales(best().window.state, natural_units(ask.scene))
+
+    def error(run: Run) -> float:
+        last, exact = _last(run), _last(best())
+        single = run.error.dtype.itemsize < 8  # of its angles whole turns are not known
+        value = float(distance(turned(last, exact) if single else last, exact, scale()))
+        return value if np.isfinite(value) else np.inf
+
+    rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)
+    reason = "leading order, exact orbit, envelope: they know no phase, which is a part of the final state"
+    parts = jax.tree.leaves(jax.tree.map(lambda x, unit: np.ravel(x / unit), _last(best()), scale()))
+    return Cost("final_state", np.concatenate(parts).tolist(), float(best().error), rows, (reason,))
+
+
+def _last(run: Run) -> State:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[-1], float), run.window.state)
+
+
+def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
+    mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
+    stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
+    few, more, most = (_whole(scene, points) for points in (16, 24, 32))
+
+    def at(k: Any) -> Scene:
+        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
+
+    def exact(k: Any, points: int = few) -> Any:
+        return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
+
+    def leading(k: Any) -> Any:
+        return jnp.max(jam_modes(at(k)).select(mode).amplitude)
+
+    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
+    ways: list[_Way] = [
+        ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
+        ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
+    ]
+    left_out: list[str] = []
+    light = jam_modes(scene).select(mode, throw=False).status
+    if not bool(light == JamStatus.found):
+        left_out = [f"leading order, full, which starts from it: {JamStatus[light]}"]  # pyright: ignore
+    else:
+        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
+        if not bool(jam.fine.stable):
+            left_out = [_unstable("full", jam)]
+        else:
+            ways += _by_runs(scene, at, jam, end)
+    rows = [
+        row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
+        for tier, method, setting, f in ways
+    ]
+    return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
+
+
+def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: _Jam, end: float | None) -> list[_Way]:
+    """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
+    until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
+    max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
+
+    def full(k: Any, adjoint: Any = None) -> Any:
+        asked = dict(save="window", tolerance=_GRADIENT_TOLERANCE, max_steps=max_steps, throw=False)
+        run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
+        return jnp.max(run.amplitude)
+
+    value = eqx.filter_jit(full)
+    ways: list[tuple[str, Callable[..., Any]]] = [
+        ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
+        ("reverse", jax.jit(jax.grad(full))),
+        ("finite differences", lambda k: _differences(value, k)),
+    ]
+    return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
+
+
+def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
+    """Central differences, each number moved by 1e-5 of itself; 0 for those that are 0."""
+    steps = 1e-5 * np.asarray(at)
+    whole = np.zeros(len(steps))
+    for k in np.flatnonzero(steps):
+        move = np.eye(len(steps))[k] * steps[k]
+        whole[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
+    return whole
+
+
+def _unstable(tiers: str, jam: _Jam) -> str:
+    multiplier = float(jam.fine.multiplier)
+    return f"{tiers}: jam mode {jam.mode} is unstable (largest Floquet multiplier {multiplier:.4g}), a run leaves it"

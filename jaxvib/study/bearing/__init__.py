@@ -1,0 +1,1 @@
+"""Friction of a pendulum bearing from its swings."""

@@ -1,0 +1,108 @@
+"""Measurement files: a record of a swing, the pendulum that swung, and what is asked about its bearing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import called, closest
+from jaxvib.study.bearing.record import Record, read_record
+from jaxvib.study.bearing.swing import BearingPendulum
+from jaxvib.units import number
+
+__all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
+
+
+_FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
+"""What a record's fields are called in a file, where `from` is no word of Python's, and here."""
+
+
+class Measurement(NamedTuple):
+    """What `identify` is called with: `pendulum`, `record`, `dry`, `instrument`."""
+
+    pendulum: BearingPendulum
+    record: Record
+    dry: bool
+    instrument: float
+
+
+def measurement_from_tables(tables: Mapping[str, Any], folder: Path) -> Measurement:
+    """A measurement from the tables [record], [pendulum], [identify] of a file in `folder`, see `TEMPLATE`.
+
+    **Arguments**: `tables` as TOML reads them; `folder` in which the record's file is looked for.
+
+    **Returns** `Measurement`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are
+    not allowed.
+
+    >>> import pathlib
+    >>> rod = {"mass": 0.3, "length": "25 cm"}
+    >>> measurement_from_tables({"record": {"file": "swing.csv", "form": 1.0}, "pendulum": rod}, pathlib.Path())
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: record.form is no field here; did you mean 'from'? allowed: file, columns, angle_unit, from, until
+    """
+    names = ["record", "pendulum", "identify"]
+    for name, table in tables.items():
+        if name not in names:
+            raise InputError(name, f"is no table of a measurement file; {closest(name, names)}")
+        if not isinstance(table, Mapping):
+            raise InputError(name, f"is {table!r}; it must be a table, write [{name}]")
+    pendulum = called(BearingPendulum, tables.get("pendulum", {}), "pendulum")
+    asked = called(_asked, tables.get("identify", {}), "identify")
+    part = tables.get("record", {})
+    for name in part:
+        if name not in _FIELDS:
+            raise InputError(f"record.{name}", f"is no field here; {closest(name, list(_FIELDS))}")
+    record = called(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
+    return Measurement(pendulum, record, *asked)
+
+
+def _record(file: Any, columns: Any = None, angle_unit: Any = None, from_: Any = None, until: Any = None) -> Any:
+    if not isinstance(file, str):
+        raise InputError("record.file", f"is {file!r}; write the path of a CSV file")
+    if angle_unit is not None and not isinstance(angle_unit, str):
+        raise InputError("record.angle_unit", f"is {angle_unit!r}; write 'deg', 'rad' or another unit of an angle")
+    if columns is not None and (
+        not isinstance(columns, (list, tuple)) or len(columns) != 2 or not all(isinstance(name, str) for name in columns)
+    ):
+        raise InputError("record.columns", f"is {columns!r}; write the names of two columns, time first, such as ['t', 'phi']")
+
+    def read(folder: Path) -> Record:
+        record = read_record(folder / file, columns=columns, angle_unit=angle_unit)
+        if from_ is None and until is None:
+            return record
+        start = -math.inf if from_ is None else float(number(from_, "s", "record.from"))
+        return record.between(start, math.inf if until is None else float(number(until, "s", "record.until")))
+
+    return read
+
+
+def _asked(dry: Any = False, instrument: Any = 0.0) -> tuple[bool, float]:
+    if not isinstance(dry, bool):
+        raise InputError("identify.dry", f"is {dry!r}; write true or false")
+    return dry, float(number(instrument, "", "identify.instrument", low=0.0))
+
+
+TEMPLATE = """# A pendulum was let go on a bearing that stands still; its angle was recorded while it swung down.
+[record]
+file = "swing.csv"          # two columns, for example: time (s), angle (deg); path from here
+# columns = ["t", "phi"]    # their names, where they are not called time and angle
+# angle_unit = "deg"        # where the header does not say it
+# from = "1 s"              # leave out what was before, such as the hand that let go
+# until = "60 s"
+
+[pendulum]
+mass = "300 g"
+length = "250 mm"           # from the bearing's axis to the mass centre
+inertia = 0.00625           # kg m^2 about the mass centre: a rod of length L has m L^2/12
+bearing = "20 mm"           # diameter, where dry friction acts
+# g = 9.81                  # m/s^2
+
+[identify]
+dry = true                  # find mu2 as well as mu1
+instrument = 0.03           # relative uncertainty of the moment of inertia, from ruler and scales
+"""
+"""A commented measurement file."""

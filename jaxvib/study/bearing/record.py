@@ -1,0 +1,180 @@
+"""Records of a swing: time and angle as a camera or a sensor wrote them down."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.units import to_float
+
+__all__ = ["Record", "read_record"]
+
+_LEAST = 16
+"""Samples a record needs: fewer hold no swing."""
+
+_NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi", "theta", "f", "winkel", "угол")}
+_HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[]\s*(?P<unit>[^)\]]*?)\s*[)\]]|/\s*(?P<per>\S+)|_(?P<tail>s|ms|rad|mrad|deg))?$")
+
+
+class Record:
+    """A swing as it was recorded.
+
+    **Arguments**: `time` (n,) s, ascending, steps need not be equal; `angle` (n,) rad, from any zero; `name` for messages.
+
+    **Raises** `InputError` for lengths that differ, fewer than 16 samples, times that do not ascend, values that are not
+    finite, and angles that no swing has, which are probably degrees.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> t = np.arange(0.0, 10.0, 0.04)
+    >>> jv.Record(t, 0.1 * np.cos(6.0 * t)).samples
+    250
+    """
+
+    time: np.ndarray
+    angle: np.ndarray
+    name: str
+
+    def __init__(self, time: Any, angle: Any, name: str = "record"):
+        try:
+            self.time, self.angle = (np.asarray(x, dtype=float) for x in (time, angle))
+        except (TypeError, ValueError) as error:
+            raise InputError(name, "has entries that are no numbers; give the time in s and the angle in rad") from error
+        self.name = name
+        if self.time.ndim != 1 or self.time.shape != self.angle.shape:
+            shapes = f"time {self.time.shape}, angle {self.angle.shape}"
+            raise InputError(name, f"has shapes {shapes}; two lists of one length are needed")
+        if self.time.size < _LEAST:
+            raise InputError(name, f"has {self.time.size} samples; a swing needs at least {_LEAST}")
+        for what, values in (("time", self.time), ("angle", self.angle)):
+            wrong = np.flatnonzero(~np.isfinite(values))
+            if wrong.size:
+                raise InputError(name, f"has {what} {values[wrong[0]]} at sample {wrong[0] + 1}; finite numbers are needed")
+        wrong = np.flatnonzero(np.diff(self.time) <= 0.0)
+        if wrong.size:
+            k = wrong[0]
+            pair = f"{self.time[k + 1]:g} s after {self.time[k]:g} s"
+            raise InputError(name, f"has the time {pair} at sample {k + 2}; times must ascend")
+        if np.ptp(self.angle) > 2.0 * np.pi:
+            size = f"{np.ptp(self.angle):.3g} rad from end to end"
+            raise InputError(
+                name, f"swings {size}, more than a full turn; if these are degrees, say so in the header or the unit"
+            )
+
+    @property
+    def samples(self) -> int:
+        """How many there are."""
+        return self.time.size
+
+    def between(self, start: float, stop: float) -> Record:
+        """The part of the record from `start` to `stop`, s. **Raises** `InputError` where too little is left."""
+        kept = (self.time >= start) & (self.time <= stop)
+        if np.count_nonzero(kept) < _LEAST:
+            span = f"{self.time[0]:g} s to {self.time[-1]:g} s"
+            raise InputError(
+                self.name, f"has {np.count_nonzero(kept)} samples from {start:g} s to {stop:g} s; it goes from {span}"
+            )
+        return Record(self.time[kept], self.angle[kept], self.name)
+
+
+def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle_unit: str | None = None) -> Record:
+    """Reads a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
+
+    Lines that begin with # and empty lines are passed over. A first line of names may carry units, `time (s), angle (deg)`,
+    `t [ms]`, `angle_deg`, or the line below it may; without units times are s and angles rad. Between semicolons, tabs or
+    blanks numbers may have a decimal comma.
+
+    **Arguments**: `columns`: names of the columns of time and angle, where they are not called time and angle; `angle_unit`:
+    "deg" or any unit of an angle, in place of the header's.
+
+    **Returns** `Record`. **Raises** `InputError` that says which line is wrong.
+
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "swing.csv"
+    >>> _ = path.write_text("# camera 2\\ntime (s), angle (deg)\\n" + "".join(f"{k / 10}, {10 - k % 3}\\n" for k in range(20)))
+    >>> round(float(read_record(path).angle[0]), 6)
+    0.174533
+    """
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except OSError as error:
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a CSV file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "is not UTF-8 text; save the table as CSV in UTF-8") from error
+    rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    if not rows:
+        raise InputError(str(path), "holds no lines of numbers; it needs two columns, time and angle")
+    mark = next((m for m in (";", "\t", ",") if m in rows[0][1]), None)
+    cells = [(k, [cell.strip().strip('"') for cell in line.split(mark)]) for k, line in rows]
+
+    heads: list[list[str]] = []
+    while cells and len(heads) < 2 and not any(_is_number(cell, mark) for cell in cells[0][1]):
+        heads.append(cells.pop(0)[1])
+    if not cells:
+        raise InputError(str(path), "holds no lines of numbers below its header")
+    places, units = _columns(heads, len(cells[0][1]), columns, path)
+    if angle_unit is not None:
+        units[1] = angle_unit
+    factors = [_factor(unit, si, f"{path}: unit of {what}") for unit, si, what in zip(units, ("s", "rad"), _NAMES, strict=True)]
+
+    width = len(heads[0]) if heads else len(cells[0][1])
+    values = np.empty((len(cells), 2))
+    for n, (k, row) in enumerate(cells):
+        where = f"{path} line {k}"
+        if len(row) != width:
+            raise InputError(where, f"has {len(row)} columns; the lines above have {width}")
+        for m, (place, what) in enumerate(zip(places, _NAMES, strict=True)):
+            if not _is_number(row[place], mark):
+                raise InputError(where, f"has {row[place]!r} where the {what} should be; a finite number is needed")
+            values[n, m] = float(row[place].replace(",", ".")) * factors[m]
+        if n and values[n, 0] <= values[n - 1, 0]:
+            raise InputError(where, f"has the time {values[n, 0]:g} s after {values[n - 1, 0]:g} s; times must ascend")
+    return Record(values[:, 0], values[:, 1], str(path))
+
+
+def _is_number(cell: str, mark: str | None) -> bool:
+    try:
+        return bool(np.isfinite(float(cell if mark == "," else cell.replace(",", "."))))
+    except ValueError:
+        return False
+
+
+def _columns(
+    heads: list[list[str]], width: int, wanted: Sequence[str] | None, path: Path
+) -> tuple[list[int], list[str | None]]:
+    """Which columns hold time and angle, and their units."""
+    if width < 2:
+        raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")
+    if not heads:
+        if wanted is not None or width > 2:
+            raise InputError(
+                str(path), f"has {width} columns and no line of names; write one, for example time (s), angle (deg)"
+            )
+        return [0, 1], [None, None]
+    parts = [_HEAD.match(head) for head in heads[0]]
+    names = [part["name"].strip() if part else head for part, head in zip(parts, heads[0], strict=True)]
+    units = [part and (part["unit"] or part["per"] or part["tail"]) for part in parts]
+    if len(heads) == 2:
+        if len(heads[1]) != len(names):
+            raise InputError(str(path), f"has {len(names)} names but {len(heads[1])} units below them")
+        units = [below.strip("()[] ") or unit for below, unit in zip(heads[1], units, strict=True)]
+    places = []
+    for k, (what, known) in enumerate(_NAMES.items()):
+        choice = (wanted[k],) if wanted is not None else known
+        found = [i for i, name in enumerate(names) if name.lower() in [c.lower() for c in choice]]
+        if not found and wanted is None and len(names) == 2:
+            found = [k]
+        if len(found) != 1:
+            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {choice[0]!r} for the {what}"
+            raise InputError(str(path), f"{problem}; its columns are {', '.join(names)}: name those of time and angle")
+        places.append(found[0])
+    return places, [units[i] for i in places]
+
+
+def _factor(unit: str | None, si: str, field: str) -> float:
+    return 1.0 if not unit else float(to_float(f"1 {unit.replace('°', 'deg')}", si, field))

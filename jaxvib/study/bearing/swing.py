@@ -1,0 +1,267 @@
+"""A pendulum that swings down on a bearing that stands still: how bearing friction shows without a machine around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import Array
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.effects.friction import dry_lever
+from jaxvib.units import Number, count, number, numbers, traced
+
+__all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
+
+
+class BearingPendulum(eqx.Module):
+    """A pendulum on a bearing that stands still, its angle f counted from hanging.
+
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f'),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
+
+    mu1 and mu2 are the bearing's viscous and dry friction; N is its radial load, along the rod.
+
+    **Arguments**: `mass` m kg; `length` l m, from the bearing's axis to the mass centre; `inertia` J_C kg m^2 about the mass
+    centre (0: a point mass; a rod of length L has m L^2/12); `bearing` its diameter d m, needed for dry friction only;
+    `g` m/s^2.
+
+    **Raises** `InputError` for wrong units and values that are not positive.
+
+    >>> import jaxvib as jv
+    >>> rod = jv.BearingPendulum(mass="300 g", length="25 cm", inertia=0.3 * 0.5**2 / 12)
+    >>> round(float(rod.total_inertia), 6), round(float(rod.frequency), 4)
+    (0.025, 5.4249)
+
+    Source: Artyunin, Sumenkov 2019, figure 2, with the swing not small and with dry friction.
+    """
+
+    mass: Array
+    length: Array
+    inertia: Array
+    bearing: Array | None
+    g: Array
+
+    def __init__(self, mass: Number, length: Number, inertia: Number = 0.0, bearing: Number | None = None, g: Number = 9.81):
+        self.mass = number(mass, "kg", "pendulum.mass", low=0.0, open_low=True)
+        self.length = number(length, "m", "pendulum.length", low=0.0, open_low=True)
+        self.inertia = number(inertia, "kg m^2", "pendulum.inertia", low=0.0)
+        self.bearing = None if bearing is None else number(bearing, "m", "pendulum.bearing", low=0.0, open_low=True)
+        self.g = number(g, "m/s^2", "pendulum.g", low=0.0, open_low=True)
+
+    @property
+    def total_inertia(self) -> Array:
+        """J = m l^2 + J_C, kg m^2, about the bearing."""
+        return self.mass * self.length**2 + self.inertia
+
+    @property
+    def frequency(self) -> Array:
+        """sqrt(m g l/J), rad/s, of small swings without friction."""
+        return jnp.sqrt(self.mass * self.g * self.length / self.total_inertia)
+
+    def radial_load(self, angle: Array, rate: Array) -> Array:
+        """N = m (l f'^2 + g cos f), N: what the bearing bears along the rod."""
+        return self.mass * (self.length * rate**2 + self.g * jnp.cos(angle))
+
+    def dead_zone(self, dry: Array) -> Array:
+        """The angle, rad, up to which dry friction mu2 holds the pendulum at rest: tan f = mu2 d/(2 l)."""
+        return jnp.arctan(dry * _diameter(self) / (2.0 * self.length))
+
+
+class SwingStatus(eqx.Enumeration):
+    """How a swing ended; the members are the sentences a user reads."""
+
+    swinging = "the pendulum still swings at the last time"
+    stopped = "dry friction brought the pendulum to a stop and holds it"
+    max_steps_reached = "the swing did not reach its last time in the steps it was allowed"
+    no_start = "the swing does not exist: a number of it is not finite, or the pendulum would not hang"
+
+
+class Swing(eqx.Module):
+    """A decaying swing.
+
+    **Attributes**: `status` a `SwingStatus`; `time` (n,) s; `angle` (n,) rad from hanging and `rate` (n,) rad/s; `stopped_at`
+    s, NaN where it still swings; `width` rad/s that dry friction was smoothed with, NaN without; `steps` taken.
+    """
+
+    status: SwingStatus
+    time: Array
+    angle: Array
+    rate: Array
+    stopped_at: Array
+    width: Array
+    steps: Array
+
+
+def swing(
+    pendulum: BearingPendulum,
+    time: Number | Sequence[Number],
+    *,
+    angle: Number,
+    rate: Number = 0.0,
+    viscous: Number,
+    dry: Number | None = None,
+    width: Number | None = None,
+    tolerance: float | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 2**17,
+    throw: bool = True,
+) -> Swing:
+    """The pendulum's motion at the times `time`, from `angle` and `rate` at the first of them.
+
+        J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
+
+    Where the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it: it stays there for good.
+
+    **Arguments**
+
+    - `time` (n,) s, ascending; `angle` rad from hanging, `rate` rad/s at time[0]
+    - `viscous` mu1, N m s; `dry` mu2, no unit (about 0.0015 for ball bearings); left out, there is no dry friction
+    - `width` rad/s of the passage through 0 of the sign of sliding; unless said otherwise a twentieth of the dead zone's
+      angle times the natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less
+    - `tolerance` of a step, relative, and in rad, 1e-9 unless said otherwise, in single precision 1e-5; `solver`, `adjoint`
+      diffrax's; `max_steps`
+    - `throw`: raise where the steps do not suffice; otherwise, and under a JAX transformation, the status says so
+
+    **Returns** `Swing`; gradients, forward (with `adjoint=diffrax.ForwardMode()`) and reverse, `jit` and `vmap` go through it.
+
+    **Raises** `InputError` for wrong values, dry friction without the bearing's diameter; `ComputationError`.
+
+    >>> import numpy as np, jaxvib as jv
+    >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)
+    >>> run = jv.swing(rod, np.linspace(0.0, 200.0, 5), angle="10 deg", viscous=2e-4, dry=0.02)
+    >>> bool(run.status == jv.SwingStatus.stopped), round(float(run.stopped_at), 1)
+    (True, 56.2)
+
+    Source: Artyunin, Sumenkov 2019, equations (1)-(3).
+    """
+    if not isinstance(pendulum, BearingPendulum):
+        raise InputError("pendulum", f"is {pendulum!r}; it must be a BearingPendulum(mass=..., length=...)")
+    times = numbers(time, "s", "time", None)
+    if times.ndim != 1:
+        raise InputError("time", "is one number; a list of times is needed")
+    if not traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
+        raise InputError("time", "must ascend, each time later than the one before")
+    friction = number(dry, "", "dry", low=0.0) if dry is not None else None
+    if friction is not None:
+        _diameter(pendulum)
+    run = eqx.filter_jit(swing_states)(
+        pendulum,
+        times,
+        number(angle, "rad", "angle"),
+        number(rate, "rad/s", "rate"),
+        number(viscous, "N m s", "viscous", low=0.0),
+        friction,
+        None if width is None else number(width, "rad/s", "width", low=0.0, open_low=True),
+        (1e-9 if times.dtype.itemsize >= 8 else 1e-5) if tolerance is None else tolerance,
+        diffrax.Tsit5() if solver is None else solver,
+        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        count(max_steps, "max_steps"),
+    )
+    if throw and not traced(run.steps) and bool(run.status == SwingStatus.max_steps_reached):
+        raise ComputationError("max_steps_reached", f"{SwingStatus[run.status]} ({max_steps}); give a larger max_steps")
+    return run
+
+
+def _diameter(pendulum: BearingPendulum) -> Array:
+    if pendulum.bearing is None:
+        raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
+    return pendulum.bearing
+
+
+def swing_states(
+    pendulum: BearingPendulum,
+    times: Array,
+    angle: Array,
+    rate: Array,
+    viscous: Array,
+    dry: Array | None,
+    width: Array | None,
+    tolerance: float,
+    solver: diffrax.AbstractSolver,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int,
+) -> Swing:
+    """`swing` without a look at its arguments; `dry` may be negative here, as a fit to noise may want it."""
+    given = (pendulum.frequency, angle, rate, viscous) if dry is None else (pendulum.frequency, angle, rate, viscous, dry)
+    exists = jnp.all(jnp.isfinite(jnp.stack(jnp.broadcast_arrays(*given))))
+    # A swing that does not exist (a fit's step into nothing in one lane of a batch) must not fail the others' search for stops.
+    angle, rate, viscous = (jnp.where(exists, value, 0.0) for value in (angle, rate, viscous))
+    dry = None if dry is None else jnp.where(exists, dry, 0.0)
+    pendulum = eqx.tree_at(lambda p: p.g, pendulum, jnp.where(exists, pendulum.g, 1.0))
+    frequency = pendulum.frequency
+    if dry is not None and width is None:
+        zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
+        width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
+
+    def moving(t: Any, y: tuple[Array, Array], args: None, **_: Any) -> Array:
+        """Changes its sign to minus where the pendulum is slow within the dead zone: there the smooth sign lets it creep."""
+        assert dry is not None and width is not None
+        f, slip = y
+        slow = jnp.abs(slip) - 3.0 * width
+        return jnp.maximum(slow, frequency * (jnp.abs(jnp.tan(f)) - jnp.tan(pendulum.dead_zone(dry))))
+
+    # A start that is held already changes no sign.
+    free = None if dry is None else moving(times[0], (angle, rate), None) > 0.0
+
+    def term(t: Any, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
+        f, slip = y
+        torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
+        if free is None:
+            return slip, torque / pendulum.total_inertia
+        assert dry is not None and width is not None
+        torque = torque - dry_lever(dry, _diameter(pendulum), slip, width) * jnp.abs(pendulum.radial_load(f, slip))
+        return jnp.where(free, slip, 0.0), jnp.where(free, torque / pendulum.total_inertia, 0.0)
+
+    scale = jax.lax.stop_gradient(frequency)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(term),
+        solver,
+        t0=times[0],
+        t1=times[-1],
+        dt0=0.02 / scale,
+        y0=(angle, rate),
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times), diffrax.SubSaveAt(t1=True)]),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4),
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+        # `moving` falls through 0. That is said, for where the last step ends a rounding short of it the search would not find
+        # two signs at its ends.
+        event=None if dry is None else diffrax.Event(moving, root_finder=optx.Bisection(1e-12, 1e-12, flip=True)),
+    )
+    assert solution.ts is not None and solution.ys is not None
+    (f, slip), ((end,), (end_slip,)) = solution.ys
+    stopped = solution.result == diffrax.RESULTS.event_occurred
+    last = solution.ts[1][0]
+    if free is not None:
+        assert dry is not None
+        last, stopped = jnp.where(free, last, times[0]), stopped | ~free
+        # The last bit of the way by the sharp sign: harmonic, about the end of the dead zone that it moves away from.
+        way = jnp.where(end_slip < 0.0, -1.0, 1.0)
+        middle = -way * pendulum.dead_zone(dry)
+        reach = jnp.hypot(end - middle, end_slip / frequency)
+        last = last + jnp.arctan2(jnp.abs(end_slip) / frequency, jnp.abs(end - middle)) / frequency
+        phase = frequency * jnp.maximum(last - times, 0.0)
+        after = stopped & ~jnp.isfinite(f)
+        f = jnp.where(after, middle + way * reach * jnp.cos(phase), f)
+        slip = jnp.where(after, way * reach * frequency * jnp.sin(phase), slip)
+    finished = stopped | (solution.result == diffrax.RESULTS.successful)
+    status = SwingStatus.where(stopped, SwingStatus.stopped, SwingStatus.swinging)
+    status = SwingStatus.where(finished, status, SwingStatus.max_steps_reached)
+    good = exists & finished
+    return Swing(
+        status=SwingStatus.where(exists, status, SwingStatus.no_start),
+        time=times,
+        angle=jnp.where(good, f, jnp.nan),
+        rate=jnp.where(good, slip, jnp.nan),
+        stopped_at=jax.lax.stop_gradient(jnp.where(stopped, last, jnp.nan)),
+        width=jnp.full_like(frequency, jnp.nan) if width is None else width,
+        steps=solution.stats["num_steps"],
+    )

@@ -1,0 +1,1 @@
+"""Maps over a scene's parameters."""

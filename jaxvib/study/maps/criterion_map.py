@@ -1,0 +1,142 @@
+"""Where the criterion of auto-balancing is right: against exact stability over rotor speed, load mass and drag."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.linear import circular_loads
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.balance.criterion import criterion
+from jaxvib.steady.balance.states import balanced_growth, stability_changes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CriterionMap", "criterion_map"]
+
+
+class CriterionMap(eqx.Module):
+    """The criterion against exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
+
+    **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
+
+    - `speeds` (S,) rad/s; `mass_factor` (M,), `drag_factor` (D,): times the scene's own
+    - `predicted` (M, S): the criterion calls auto-balancing stable (it knows nothing of the drag)
+    - `growth` (D, M, S) 1/s: exact growth rate, stable where negative
+    - `right` (D, M): share of the speeds where both say the same
+    - `boundary` (M, B) rad/s: the criterion's boundaries, ascending, NaN where there is none
+    - `shift` (D, M, B): (exact - predicted)/predicted, exact being the end of the exact interval that shares most with
+      the criterion's; NaN where there is none in the range of speeds
+    """
+
+    speeds: np.ndarray
+    mass_factor: np.ndarray
+    drag_factor: np.ndarray
+    predicted: np.ndarray
+    growth: np.ndarray
+    right: np.ndarray
+    boundary: np.ndarray
+    shift: np.ndarray
+
+    def summary(self) -> str:
+        """A table a person can read: share of speeds judged right, mean size of the boundaries' shift."""
+        lines = ["share of rotor speeds judged right (mean shift of the boundaries it has)"]
+        lines.append("drag x \\ mass x " + "".join(f"{m:>16.3g}" for m in self.mass_factor))
+        for d, factor in enumerate(self.drag_factor):
+            cells = []
+            for m in range(self.mass_factor.size):
+                shift = np.abs(self.shift[d, m][~np.isnan(self.shift[d, m])])
+                cells.append(f"{self.right[d, m]:.3f} ({np.mean(shift):.2%})" if shift.size else f"{self.right[d, m]:.3f}")
+            lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """One panel a drag: rotor speed against load mass, where the criterion is right and where not."""
+        import matplotlib.pyplot as plt
+
+        from jaxvib.draw.criterion import agreement_map
+
+        figure, axes = plt.subplots(1, self.drag_factor.size, sharey=True, squeeze=False, layout="constrained")
+        figure.set_size_inches(3.2 * self.drag_factor.size + 0.8, 3.4)
+        entries = []
+        for d, ax in enumerate(axes[0]):
+            entries = agreement_map(ax, self.speeds, self.mass_factor, self.predicted, self.growth[d] < 0.0)
+            ax.set_title(f"drag x {self.drag_factor[d]:.3g}")
+        axes[0, 0].set_ylabel("load mass, times the scene's")
+        figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize="small")
+        return figure
+
+
+def criterion_map(
+    scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int = 48
+) -> CriterionMap:
+    """Compares `criterion` with `balanced_growth` over rotor speed, load mass and drag.
+
+    **Arguments**: `speeds` rad/s, ascending; `mass`, `drag` factors greater than 0, times the mass and the drag of
+    the scene's loads; `steps` as `balanced_stability`. The loads are in the first arrangement of `balanced_states`.
+
+    **Returns** `CriterionMap`. **Raises** `InputError` for values that are not positive or not ascending, and as
+    `balanced_stability`.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
+    >>> found = jv.criterion_map(scene, speeds=[20.0, 26.0, 29.5, 40.0], mass=[0.1, 2.0], drag=[1.0], steps=24)
+    >>> found.right.tolist()
+    [[1.0, 0.75]]
+
+    Source: the limits of the criterion are named in Filimonikhin et al. 2022, section 6, without numbers.
+    """
+    axes = {"speeds": speeds, "mass": mass, "drag": drag}
+    values = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in axes.items()}
+    for name, value in values.items():
+        if value.ndim != 1 or not np.all(np.isfinite(value)) or np.any(value <= 0.0) or np.any(np.diff(value) <= 0.0):
+            raise InputError(name, "must be a list of numbers greater than 0, ascending")
+    grid, mass_factor, drag_factor = values.values()
+
+    given = circular_loads(scene)
+
+    def loaded(m: jax.Array, d: float = 1.0) -> Scene:
+        loads = eqx.tree_at(lambda x: (x.mass, x.drag), given, (given.mass * m, given.drag * d))
+        return eqx.tree_at(lambda s: s.loads, scene, loads)
+
+    results = [criterion(loaded(jnp.asarray(m))) for m in mass_factor]
+    predicted = np.stack([np.asarray(result.balances(jnp.asarray(grid))) for result in results])
+    boundary = np.stack([np.sort([*r.speeds.damped_resonances, *r.speeds.damped_additional]) for r in results])
+    growth = np.zeros((drag_factor.size, mass_factor.size, grid.size))
+    shift = np.full((drag_factor.size, *boundary.shape), np.nan)
+    for d, drag_times in enumerate(drag_factor):
+        for m, mass_times in enumerate(mass_factor):
+            one = loaded(jnp.asarray(mass_times), drag_times)
+            growth[d, m] = balanced_growth(one, grid, steps=steps)
+            stable = growth[d, m] < 0.0
+            changes = stability_changes(one, grid, stable, close=1e-5, steps=steps)
+            ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
+            shift[d, m] = _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
+    right = np.mean((growth < 0.0) == predicted[None], axis=-1)
+    return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, right, boundary, shift)
+
+
+def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:
+    """How far the ends of each interval of the criterion are from those of the exact one that it shares most with.
+
+    The longest, because a sliver of stability can stay at a resonance when the interval itself has moved away from it.
+    """
+    shifts = np.full(boundary.shape, np.nan)
+    low, high = np.nan_to_num(exact[:, 0], nan=grid[0]), np.nan_to_num(exact[:, 1], nan=grid[-1])
+    for k in range(0, boundary.size, 2):
+        start, end = boundary[k], boundary[k + 1] if k + 1 < boundary.size else np.inf
+        shared = np.minimum(high, np.inf if np.isnan(end) else end) - np.maximum(low, start)
+        if shared.size and np.max(shared) > 0.0:
+            found = exact[np.argmax(shared)]
+            shifts[k] = found[0] / start - 1.0
+            if np.isfinite(end):
+                shifts[k + 1] = found[1] / end - 1.0
+    return shifts

@@ -1,0 +1,189 @@
+"""Many run-ups of one scene: where its loads end, over their drag and over the angles they start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.draw.regimes import regime_chart
+from jaxvib.errors import InputError
+from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.regime import REGIMES, Regime, RegimeName
+from jaxvib.motion.run import RunStatus
+from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.start import initial_state
+from jaxvib.units import Number, count, number, numbers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["RunUps", "run_ups"]
+
+_FAILED = "failed"
+"""The word for a run that did not reach its end: it has no kind of motion."""
+
+_TOLERANCE = 1e-7
+"""Error of a step in double precision: enough to name a motion."""
+
+_FEWEST = 2**20
+"""Steps that a run may take at least, so that run-ups of any usual length share one program."""
+
+
+class RunUps(NamedTuple):
+    """What became of run-ups over nd drags and ns starts.
+
+    **Attributes**: `drag` (nd,) b_W N s/m; `angle` (ns, count) rad, where the loads started; `regime` a `Regime` whose arrays
+    have the leading axes (nd, ns); `kind` (nd, ns) the regime's word, or "failed" where the run did not reach its end; `omega`
+    (nd, ns) mean speed of the loads, rad/s, NaN where it failed; `finished` (nd, ns) whether it reached its end.
+    """
+
+    drag: np.ndarray
+    angle: np.ndarray
+    regime: Regime
+    kind: np.ndarray
+    omega: np.ndarray
+    finished: np.ndarray
+
+    def fraction(self, kind: str) -> np.ndarray:
+        """Share of the starts (nd,) that came to a `kind` of motion, or whose runs "failed".
+
+        **Raises** `InputError` for another word.
+        """
+        if kind not in (*REGIMES, _FAILED):
+            raise InputError("kind", f"is {kind!r}; allowed: {', '.join((*REGIMES, _FAILED))}")
+        return np.mean(self.kind == kind, axis=1)
+
+    def summary(self) -> str:
+        """A line for each drag: shares of the kinds of motion that its starts came to, where they jammed, and what failed."""
+        lines = [f"of {len(self.angle)} starts at each drag"]
+        for k, drag in enumerate(self.drag):
+            said = []
+            for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
+                speeds = self.omega[k][self.kind[k] == kind]
+                at = f" at {_span(speeds)} rad/s" if kind == "jammed" else ""
+                said.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
+            lines.append(f"drag {drag:.4g} N s/m: {', '.join(said)}")
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Shares of the kinds of motion, and the speeds of the loads, over drag. **Returns** a matplotlib figure."""
+        shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
+        rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
+        return regime_chart(self.drag, shares, self.omega, float(rotor))
+
+
+def _span(values: np.ndarray) -> str:
+    """One number where all are the same to a thousandth, else the smallest and the largest."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
+
+
+def run_ups(
+    scene: Scene,
+    until: Number,
+    *,
+    drag: Sequence[float] | Number | None = None,
+    starts: int | None = None,
+    seed: int = 0,
+    angles: Sequence[Sequence[float]] | None = None,
+    tolerance: float | None = None,
+    batch: int = 16,
+    max_steps: int | None = None,
+) -> RunUps:
+    """Runs the scene up from rest, at each drag from each of many initial angles of its loads, and names what comes out.
+
+    **Arguments**
+
+    - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`)
+    - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
+    - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
+      rad. Without either all loads start together at the bottom
+    - `tolerance`: error of a step, as `simulate`; 1e-7 unless said otherwise, in single precision what `simulate` takes
+    - `batch`: so many runs go side by side
+    - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
+
+    **Returns** `RunUps`, whose `fraction` says how many of the starts came to a kind of motion. From few starts a share is
+    known to 1 / sqrt(starts) only. A run that fails raises nothing: it is counted as "failed".
+
+    **Raises** `InputError` for values that are not allowed.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
+    ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.SpinUp(60.0, duration=1.0))
+    >>> found = jv.run_ups(scene, 4.0, drag=[0.05, 5.0], starts=6, tolerance=1e-5)
+    >>> found.kind.shape, found.fraction("jammed").tolist()
+    ((2, 6), [0.0, 1.0])
+    >>> print(found.summary())
+    of 6 starts at each drag
+    drag 0.05 N s/m: 100 % unsettled
+    drag 5 N s/m: 100 % jammed at 41... rad/s
+
+    Source: Artyunin 2013, section V, where one set of angles stands for all.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if not isinstance(scene.loads, CircularLoads):
+        raise InputError("loads.kind", f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle")
+    given = scene.loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
+    if drag is None and given.ndim:
+        raise InputError("loads.drag", "differs from load to load; name the values of `drag` to run up with")
+    drags = jnp.atleast_1d(given)
+    n = scene.loads.count
+    if starts is not None and angles is not None:
+        raise InputError("starts", "goes without angles: either random angles or those that are named")
+    if angles is not None:
+        sets = np.asarray(angles, dtype=float)
+        if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
+            raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
+    elif starts is not None:
+        sets = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
+    else:
+        sets = np.asarray(initial_state(scene).angle[0])[None]
+    count(batch, "batch")
+
+    grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))
+    shape = (len(drags), len(sets))
+    size = min(batch, shape[0] * shape[1])
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    if tolerance is None and end.dtype.itemsize >= 8:
+        tolerance = _TOLERANCE
+    if max_steps is None:
+        max_steps = max(_FEWEST, enough_steps(scene, end))
+    named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
+    code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
+    kind = np.where(np.asarray(finished), np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)], _FAILED)
+
+    def folded(leaf: Array) -> Array:
+        return leaf.reshape(shape + leaf.shape[1:])
+
+    return RunUps(
+        drag=np.asarray(drags),
+        angle=sets,
+        regime=jax.tree.map(folded, named),
+        kind=kind.reshape(shape),
+        omega=np.asarray(folded(omega)),
+        finished=np.asarray(folded(finished)),
+    )
+
+
+@eqx.filter_jit
+def _all(
+    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, tolerance: float | None, max_steps: int
+) -> tuple[Regime, Array, Array]:
+    def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
+        drag, angle = lane
+        this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
+        start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
+        run = simulate(this, until, start=start, save="window", tolerance=tolerance, max_steps=max_steps, throw=False)
+        finished = run.status == RunStatus.done
+        return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
+
+    return jax.lax.map(one, lanes, batch_size=batch)

@@ -1,0 +1,111 @@
+"""Stability over a design number: where jams are stable, and from which value on a bifurcation is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxvib.draw.comparison import stability_chart
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["StabilityMap", "onset", "stability_map"]
+
+
+class StabilityMap(NamedTuple):
+    """Exact jams over a design number x: `value` (n,) x; `omega` (n, P) load speeds rad/s, `stable` (n, P) whether every load
+    keeps to the jam there; `special` (n,) the special points of each diagram."""
+
+    value: np.ndarray
+    omega: np.ndarray
+    stable: np.ndarray
+    special: tuple[tuple[SpecialPoint, ...], ...]
+
+    def plot(self, *, label: str = "x") -> Figure:
+        """Stable jams shaded over the load speed and x, special points as marks by kind; `label` names x on its axis."""
+        marks: dict[str, list[tuple[float, float]]] = {}
+        for x, points in zip(self.value, self.special, strict=True):
+            for point in points:
+                marks.setdefault(point.kind.replace("_", " "), []).append((point.omega, float(x)))
+        return stability_chart(self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label)
+
+
+def stability_map(
+    make: Callable[[float], Scene], values: Sequence[float], *, omega: tuple[float, float], points: int = 300
+) -> StabilityMap:
+    """Where exact jams are stable as a design number grows, such as the mass of the loads.
+
+    **Arguments**: `make` the scene at x; `values` of x, ascending; `omega` the range of load speeds, rad/s; `points` of each
+    diagram.
+
+    **Returns** `StabilityMap`. **Raises** `InputError` for no values, or values that do not ascend.
+
+    >>> import jaxvib as jv
+    >>> def machine(eps):
+    ...     return jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                             rho=1.0, eps=eps, beta=1.0, speed=2.0).scene()
+    >>> chart = stability_map(machine, [0.01, 0.05], omega=(0.36, 0.5), points=60)
+    >>> [[p.kind for p in points] for points in chart.special]
+    [['fold'], ['fold', 'torus']]
+
+    Source: ours, on the diagrams of `exact_branches`.
+    """
+    x = np.asarray(values, dtype=float)
+    if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
+        raise InputError("values", f"are {values!r}; give numbers in ascending order")
+    diagrams = [exact_branches(make(float(v)), points=points, least=omega[0], most=omega[1]) for v in x]
+    return StabilityMap(
+        x,
+        np.stack([np.asarray(d.omega) for d in diagrams]),
+        np.stack([np.asarray(d.stable) for d in diagrams]),
+        tuple(d.special for d in diagrams),
+    )
+
+
+def onset(
+    make: Callable[[float], Scene],
+    kind: str,
+    between: tuple[float, float],
+    *,
+    omega: tuple[float, float],
+    points: int = 300,
+    accuracy: float = 1e-3,
+) -> float:
+    """The smallest value x at which the exact diagram of `make(x)` has a special point of the kind, by halving in log x.
+
+    "Odd jam modes are stable on their whole range" is true of light loads; this finds the load mass from which on a torus
+    bifurcation replaces a fold, or the half-turn symmetry breaks.
+
+    **Arguments**: `make` the scene at x; `kind` as in `SpecialPoint`; `between` two positive values, without such a point and
+    with one; `omega` the range of load speeds that it is looked for in, rad/s; `points` of each diagram; `accuracy` of x,
+    relative.
+
+    **Returns** x, too large by `accuracy` at most. **Raises** `InputError` where the ends do not differ.
+
+    >>> import jaxvib as jv
+    >>> def machine(eps):
+    ...     return jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                             rho=1.0, eps=eps, beta=1.0, speed=2.0).scene()
+    >>> round(onset(machine, "torus", (0.02, 0.05), omega=(0.36, 0.5), points=60, accuracy=0.5), 4)
+    0.0398
+
+    Source: ours, on the diagrams of `exact_branches`.
+    """
+
+    def there(x: float) -> bool:
+        diagram = exact_branches(make(x), points=points, least=omega[0], most=omega[1])
+        return any(point.kind == kind for point in diagram.special)
+
+    low, high = between
+    if not 0.0 < low < high or there(low) or not there(high):
+        raise InputError("between", f"is {between!r}; there must be no {kind} at the lower value and one at the upper value")
+    while high / low > 1.0 + accuracy:
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if there(middle) else (middle, high)
+    return high

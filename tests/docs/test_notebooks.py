@@ -1,0 +1,40 @@
+"""Notebooks run from top to bottom, and what they print is what they show."""
+
+import pathlib
+import re
+
+import nbclient
+import nbformat
+import pytest
+
+FOLDER = pathlib.Path(__file__).parents[2] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
+
+
+def printed(notebook):
+    texts = [o.text for c in notebook.cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream"]
+    return "".join(texts)
+
+
+def figures(notebook):
+    outputs = [o for c in notebook.cells if c.cell_type == "code" for o in c.outputs]
+    return sum("image/png" in o.get("data", {}) for o in outputs)
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_runs_and_shows_what_it_showed(path):
+    kept = nbformat.read(path, as_version=4)
+    fresh = nbformat.read(path, as_version=4)
+    nbclient.NotebookClient(fresh, timeout=900, kernel_name="python3").execute()
+    assert figures(fresh) == figures(kept) > 0
+    # Words must be the same; numbers may differ in the digits that another processor rounds otherwise.
+    assert NUMBER.sub("#", printed(fresh)) == NUMBER.sub("#", printed(kept))
+    settled = [float(x) for x in NUMBER.findall(re.search(r"  after:.*?N/m\n.*?N/m", printed(fresh), re.S)[0])]
+    before = [float(x) for x in NUMBER.findall(re.search(r"  after:.*?N/m\n.*?N/m", printed(kept), re.S)[0])]
+    assert settled == pytest.approx(before, rel=1e-3)

@@ -1,0 +1,36 @@
+"""The README's examples run as they stand."""
+
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+README = ROOT / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.S)
+
+
+def test_readme_has_examples():
+    assert BLOCKS
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
+def test_readme_example_runs(block, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    if "prepare_cpu" in block:
+        run_alone(block)
+    else:
+        exec(compile(block, str(README), "exec"), {})
+
+
+def run_alone(block):
+    """In a process of its own, where JAX has not begun to compute; as strict as `conftest.py` is."""
+    clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    clean |= {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"), "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    words = [sys.executable, "-W", "error", "-c", block]
+    done = subprocess.run(words, env=clean, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr

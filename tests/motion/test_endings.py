@@ -1,0 +1,116 @@
+"""How runs end: what did not exist, did not finish or grew beyond all bounds, and what is known of the error."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, scene
+
+import jaxvib as jv
+from jaxvib.ode.control import Tolerance
+from jaxvib.ode.dopri8 import WrittenOut
+
+
+def test_a_run_that_does_not_finish_says_so():
+    with pytest.raises(jv.ComputationError, match="did not reach its end in the steps it was allowed") as error:
+        jv.simulate(published().scene(), 20.0, max_steps=16)
+    assert error.value.status == "max_steps_reached"
+    run = jv.simulate(published().scene(), 20.0, max_steps=16, throw=False)
+    assert bool(run.status == jv.RunStatus.max_steps_reached)
+
+
+def test_a_lane_whose_start_does_not_exist_says_so():
+    s = published(eps=1e-3).scene()
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def lanes(speed):
+        there = eqx.tree_at(lambda x: x.drive.speed, s, speed)
+        run = jv.simulate(there, 20.0, start="jam", mode=4, save="window", max_steps=4096)
+        return run.status == jv.RunStatus.no_start, run.omega, run.steps
+
+    missing, omega, steps = lanes(jnp.array([1.2, 3.0]))
+    assert missing.tolist() == [True, False]
+    assert jnp.isnan(omega).tolist() == [True, False]
+    assert int(steps[0]) < 4096
+
+
+def test_without_raising_a_missing_mode_says_no_start_and_shows_no_motion():
+    s = published(eps=1e-3, speed=1.2).scene()
+    with pytest.raises(jv.ComputationError, match="does not exist"):
+        jv.simulate(s, 5.0, start="jam", mode=4)
+    for run in (
+        jv.simulate(s, 5.0, start="jam", mode=4, throw=False),
+        jv.envelope(s, 5.0, start="jam", mode=4, throw=False),
+    ):
+        assert run.message == "the state to start from does not exist or is not finite"
+        for leaf in jax.tree.leaves((run.window, run.trajectory, run.amplitude)):
+            assert np.all(np.isnan(leaf))
+
+
+def test_a_lane_that_is_not_finite_does_not_keep_the_others_waiting():
+    """Each of its steps is refused and made smaller, until a smaller one is none."""
+    s = published(eps=1e-3).scene()
+
+    def one(scale):
+        there = eqx.tree_at(lambda x: x.machine.link_stiffness, s, s.machine.link_stiffness * scale)
+        run = jv.simulate(there, 20.0, save="window")
+        return run.status == jv.RunStatus.not_finite, run.steps, run.omega
+
+    bad, steps, omega = jax.jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan, 1.1]))
+    assert bad.tolist() == [False, True, False] and np.isfinite(omega).tolist() == [True, False, True]
+    assert int(jnp.max(steps)) < 2000
+    with pytest.raises(jv.InputError, match=r"scene\.machine\.link_stiffness is not a number"):
+        jv.simulate(eqx.tree_at(lambda x: x.machine.link_stiffness, s, s.machine.link_stiffness * jnp.nan), 1.0)
+
+
+def test_a_motion_without_bound_ends_where_it_has_none():
+    """y' = y^2 from 1 has no bound at t = 1."""
+    one = jnp.asarray(1.0)
+    controller = Tolerance(tolerance=jnp.asarray(1e-8), unit=(one,), relative=(one,))
+    found = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: (y[0] ** 2,)),
+        WrittenOut(),
+        t0=0.0,
+        t1=2.0,
+        dt0=0.01,
+        y0=(one,),
+        saveat=diffrax.SaveAt(steps=True),
+        stepsize_controller=controller,
+        max_steps=4096,
+        throw=False,
+    )
+    assert found.result == diffrax.RESULTS.dt_min_reached
+    times = np.asarray(found.ts)
+    np.testing.assert_allclose(times[np.isfinite(times)][-1], 1.0, atol=1e-7)
+
+
+def test_where_a_run_stopped_is_said():
+    soft = scene("one_mass", "rollers", speed=60.0, effects=(jv.CubicSupport(-4e9),))
+    start = jv.State(jnp.asarray([0.01]), jnp.zeros(1), (jnp.zeros(1),), (jnp.zeros(1),))
+    with pytest.raises(jv.ComputationError, match=r"after t = 0\.0\d+ s"):
+        jv.simulate(soft, 5.0, start=start, max_steps=2000)
+
+
+def test_an_error_that_cannot_be_told_is_infinite():
+    s = published(eps=1e-3).scene()
+    assert float(jv.simulate(s, 0.1, steps=1).error) == np.inf
+    loose, looser = (jv.simulate(s, 20.0, tolerance=t) for t in (0.1, 0.5))
+    assert 0.0 < float(loose.error) < np.inf and 0.0 < float(looser.error) < np.inf
+    failed = jv.simulate(s, 20.0, tolerance=1e-8, max_steps=10, throw=False)
+    assert float(failed.error) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (dict(estimate=True, controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)), "estimate is True together with a contr"),
+        (dict(estimate=False, accuracy=1e-4), "estimate is False together with accuracy"),
+        (dict(tolerance=np.float32(1e-6)), "a number of Python's own such as 1e-6"),
+    ],
+)
+def test_estimates_that_nobody_can_make_are_refused(change, says):
+    with pytest.raises(jv.InputError, match=says):
+        jv.simulate(published().scene(), 1.0, **change)

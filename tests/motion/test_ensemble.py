@@ -1,0 +1,141 @@
+"""Many runs at once: errors of each alone, steps that are taken, single precision, and programs that are not made again."""
+
+import logging
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scenes import published
+
+import jaxvib as jv
+from jaxvib.motion.analysis.distance import distance, scales
+from jaxvib.motion.integrate import natural_units
+
+
+def make(value):
+    """The run that nearly all tests are about: a rotor speed, how far platforms are displaced, how much goes round at all."""
+    scene = published(eps=0.05).scene()
+    scene = eqx.tree_at(lambda s: (s.drive.speed, s.loads.drag), scene, (value["speed"], value["moving"] * scene.loads.drag))
+    displacement = value["displaced"] * jnp.array([-1.0, 1.0])
+    return scene, jv.State(displacement, jnp.zeros(2), (jnp.zeros(1),), (value["moving"][None],))
+
+
+def values(speed=(2.0, 2.5, 3.0), displaced=(1.0, 0.9, 1.1), moving=(1.0, 0.9, 0.8)):
+    """No number that is shared: so all tests have one program."""
+    return {"speed": jnp.array(speed), "displaced": jnp.array(displaced), "moving": jnp.array(moving)}
+
+
+def nth(tree, k):
+    return jax.tree.map(lambda x: x[k], tree)
+
+
+def error_of(given, k, found, exact):
+    """What `Ensemble.error` is about, of run k."""
+    a, b = nth(found.state, k), nth(exact.state, k)
+    return float(distance(a, b, scales(b, natural_units(make(nth(given, k))[0]))))
+
+
+def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():
+    whole = jv.ensemble(make, values(), 5.0, steps=200)
+    broken = jv.ensemble(make, values(displaced=(1.0, jnp.nan, 1.1)), 5.0, steps=200)
+    assert broken.finite.tolist() == [True, False, True]
+    np.testing.assert_array_equal(broken.error[::2], whole.error[::2])
+    assert 0.0 < float(whole.error.max()) < 1e-2 and np.isnan(broken.error[1])
+
+
+def test_a_quiet_run_beside_loud_ones_has_the_error_it_has_without_them():
+    """One stands still beside them: nothing is not divided by nothing."""
+    quiet = values(displaced=(0.1, 0.0, 1.1), moving=(0.0, 0.0, 0.8))
+    loud = values(displaced=(0.1, 0.0, 1e2), moving=(0.0, 0.0, 0.8))
+    quietly, beside = (jv.ensemble(make, given, 5.0, steps=24) for given in (quiet, loud))
+    np.testing.assert_array_equal(beside.error[:2], quietly.error[:2])
+    assert float(beside.error[1]) == 0.0
+    exact = jv.ensemble(make, loud, 5.0, steps=4000, estimate=False)
+    for k in (0, 2):
+        assert 0.0 < error_of(loud, k, beside, exact) <= float(beside.error[k])
+
+
+def test_steps_are_those_that_are_taken():
+    found = {n: jv.ensemble(make, values(), 5.0, steps=n) for n in (86, 88, 44, 12, 8)}
+    assert {n: int(many.steps) for n, many in found.items()} == {86: 88, 88: 88, 44: 44, 12: 12, 8: 8}
+    # Beside 12 steps there are 8, not half as many.
+    for fine, coarse in ((88, 44), (12, 8)):
+        apart = error_of(values(), 0, found[coarse], found[fine])
+        np.testing.assert_allclose(found[fine].error[0], apart * (coarse / fine) ** 3, rtol=1e-6)
+
+
+def test_a_run_is_not_compared_with_itself():
+    few = jv.ensemble(make, values(), 0.5, steps=3)
+    assert int(few.steps) == 4 and np.all(np.isinf(few.error)) and np.all(few.finite)
+    assert np.all(np.isnan(jv.ensemble(make, values(), 0.5, steps=3, estimate=False).error))
+
+
+def test_runs_that_are_all_the_same():
+    same = jv.ensemble(make, values((2.0,) * 3, (1.0,) * 3, (1.0,) * 3), 5.0, steps=100)
+    first = jv.ensemble(make, values(), 5.0, steps=100)
+    np.testing.assert_allclose(same.state.angle[0], np.tile(first.state.angle[0][0], (3, 1)), rtol=1e-10)
+
+
+def test_other_values_need_no_new_program(caplog):
+    """Neither with the number of steps that is chosen for them."""
+
+    def compiled(first, last, **given):
+        caplog.clear()
+        with jax.log_compiles(), caplog.at_level(logging.WARNING):
+            jv.ensemble(
+                make, values(jnp.linspace(first, last, 4), *np.random.default_rng(0).uniform(0.5, 1.0, (2, 4))), 5.0, **given
+            )
+        return [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
+
+    assert compiled(2.0, 3.0)
+    assert compiled(2.1, 4.0) == []
+    assert compiled(2.2, 3.5, steps=64) == []
+
+
+def test_seconds_are_those_of_the_whole_call(monkeypatch):
+    """The clock is read first and last."""
+    calls, ticks = [], iter(range(100))
+    monkeypatch.setattr("jaxvib.motion.ensemble._made", lambda make, values: calls.append(clock()) or jax.vmap(make)(values))
+
+    def clock():
+        return float(next(ticks))
+
+    monkeypatch.setattr("jaxvib.motion.ensemble.time.perf_counter", clock)
+    found = jv.ensemble(make, values(), 5.0, steps=64)
+    assert calls == [1.0] and float(found.seconds) == 2.0
+
+
+def test_single_precision_keeps_its_phase():
+    """A load that turns with its rotor for 5000 turns; each step would round an angle of 3e4 rad by 1e-3."""
+
+    def off(many):
+        return np.abs(np.angle(np.exp(1j * (np.asarray(many.state.angle[0][:, 0], float) - reference))))
+
+    def freely(n):
+        scene = eqx.tree_at(lambda s: s.drive.speed, free(), n)
+        return scene, jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (n[None],))
+
+    def free():
+        machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+        return jv.Scene(machine, jv.pendulums(count=1, mass=1e-6, radius=0.1, drag=1e-4), jv.ConstantSpeed(100.0))
+
+    speeds, end = [90.0, 100.0], 314.15926
+    double = jv.ensemble(freely, jnp.array(speeds), end)
+    with jax.enable_x64(False):
+        single = jv.ensemble(freely, jnp.array(speeds), end)
+        assert single.state.angle[0].dtype == jnp.float32 and int(single.steps) > 100_000
+        runs = [
+            jv.simulate(scene, end, start=start, save="window", estimate=False)
+            for scene, start in (freely(jnp.asarray(n)) for n in speeds)
+        ]
+        ends = [np.asarray(run.window.state.angle[0][-1, 0], float) for run in runs]
+        last = float(jnp.asarray(end))
+    # Time itself is rounded to single precision: so far the load has turned by then.
+    reference = np.asarray(double.state.angle[0][:, 0]) + np.array(speeds) * (last - end)
+    simulated = np.abs(np.angle(np.exp(1j * (np.array(ends) - reference))))
+    assert np.all(off(single) < 2e-3) and np.all(off(single) < 10.0 * np.maximum(simulated, 1e-4))
+    assert np.all(np.abs(single.state.angle[0]) <= 3.15)
+    np.testing.assert_allclose(single.load_speed[:, 0], speeds, rtol=1e-5)
+    np.testing.assert_allclose(single.load_speed, double.load_speed, rtol=1e-5)
+    assert np.all(single.error < 1e-3)

@@ -1,0 +1,127 @@
+"""The step as a loop over its stages, and its forward derivatives in all directions at once."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvib.ode.batching import in_all_directions
+from jaxvib.ode.dopri8_loop import Looped
+
+POINT = jnp.asarray([0.7, 1.3, 0.2, 0.4, -0.3, 1.9, 0.05, 0.6, 2.5])
+
+
+def on_numbers(t, y, args):
+    force, stiffness, damping = args
+    return y[1], force * jnp.cos(1.7 * t) - damping * y[1] - stiffness * jnp.sin(y[0])
+
+
+def on_arrays(t, y, args):
+    force, stiffness, damping = args
+    turned = y["x"] @ jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])
+    return {"x": damping * turned - stiffness * y["x"] ** 3, "scale": force * jnp.cos(t) * y["scale"] * y["x"][0, 1]}
+
+
+def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.ForwardMode()):  # noqa: B008
+    """States in the middle of a run and at its end; the point moves the equations, the start and the end."""
+    y0 = {"x": point[3:7].reshape(2, 2), "scale": point[7]} if arrays else (point[3], point[4])
+    end = point[8]
+    control = diffrax.PIDController(rtol=1e-6, atol=1e-6) if adaptive else diffrax.ConstantStepSize()
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(on_arrays if arrays else on_numbers),
+        Looped(slopes=slopes),
+        jnp.zeros(()),
+        end,
+        0.1 if adaptive else end / 12.0,
+        y0,
+        (point[0], point[1], point[2]),
+        saveat=diffrax.SaveAt(ts=jnp.stack([0.31 * end, 0.77 * end, end])),
+        stepsize_controller=control,
+        adjoint=adjoint,
+    )
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(solution.ys)])
+
+
+@pytest.mark.parametrize(("arrays", "adaptive"), [(True, True), (False, False)])
+def test_derivatives_in_all_directions_are_those_in_each(arrays, adaptive):
+    """Nine directions, more than a vector holds; they move the length of the steps too."""
+    ours, plain = (
+        jax.jit(jax.jacfwd(lambda p, s=slopes: motion(p, arrays=arrays, slopes=s, adaptive=adaptive)))(POINT)
+        for slopes in (True, False)
+    )
+    assert np.max(np.abs(plain)) > 0.1
+    np.testing.assert_allclose(ours, plain, rtol=1e-11, atol=1e-12)
+
+
+def test_derivatives_are_finite_differences():
+    """Equal steps: a smooth function of the point. Central differences of 1e-5: their own error is about 1e-9."""
+    ours = jax.jacfwd(lambda p: motion(p, adaptive=False))(POINT)
+    moves = 1e-5 * jnp.eye(9)
+    differences = [(motion(POINT + m, adaptive=False) - motion(POINT - m, adaptive=False)) / 2e-5 for m in moves]
+    np.testing.assert_allclose(ours, jnp.stack(differences, axis=-1), atol=1e-8)
+
+
+def test_batches_inside_and_outside():
+    points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1)])
+    single = jnp.stack([jax.jacfwd(motion)(p) for p in points])
+    of_each = jax.jit(jax.vmap(jax.jacfwd(motion)))(points)
+    np.testing.assert_allclose(of_each, single, rtol=1e-9, atol=1e-10)
+    of_all = jax.jit(jax.jacfwd(jax.vmap(motion)))(points)
+    np.testing.assert_allclose(jnp.stack([of_all[i, :, i] for i in range(3)]), single, rtol=1e-9, atol=1e-10)
+    assert np.all(np.asarray(of_all[0, :, 1]) == 0.0)
+
+
+@pytest.mark.parametrize(("arrays", "slopes"), [(False, False), (True, False), (True, True)])
+def test_a_batch_in_lanes_is_its_runs_one_by_one(arrays, slopes):
+    """All of the point in lanes; the field's numbers alone, the start and the end common; a batch of batches."""
+
+    def run(p):
+        return motion(p, arrays=arrays, slopes=slopes)
+
+    points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1, 0.2)])
+    alone = jax.jit(run)
+    each = jnp.stack([alone(p) for p in points])
+    assert np.max(np.abs(each - each[:1])) > 1e-2
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(points), each, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.vmap(run)))(points.reshape(2, 2, 9)).reshape(4, -1), each, rtol=1e-11)
+    with_force = lambda force: run(POINT.at[0].set(force))  # noqa: E731
+    forces = jnp.asarray([0.7, 0.9])
+    np.testing.assert_allclose(jax.vmap(with_force)(forces), jnp.stack([with_force(f) for f in forces]), rtol=1e-11)
+
+
+def test_reverse_derivatives_of_a_batch_are_those_of_its_runs():
+    def size(p):
+        return jnp.sum(motion(p, slopes=False, adaptive=False, adjoint=diffrax.RecursiveCheckpointAdjoint()) ** 2)
+
+    points = jnp.stack([POINT, POINT + 0.1])
+    ours = jax.jit(jax.vmap(jax.grad(size)))(points)
+    forward = jax.jit(jax.jacfwd(lambda p: jnp.sum(motion(p, adaptive=False) ** 2)))
+    np.testing.assert_allclose(ours, jnp.stack([forward(p) for p in points]), rtol=1e-9)
+
+
+def test_second_derivatives():
+    ours, plain = (
+        jax.jit(jax.jacfwd(jax.jacfwd(lambda p, s=slopes: motion(p, slopes=s, adaptive=False)[-1])))(POINT)
+        for slopes in (True, False)
+    )
+    np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-10)
+
+
+def test_one_direction_alone_and_values_alone():
+    value, slope = jax.jvp(motion, (POINT,), (jnp.ones(9),))
+    np.testing.assert_allclose(slope, jnp.sum(jax.jacfwd(motion)(POINT), axis=1), rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(value, motion(POINT, slopes=False), rtol=1e-13)
+
+
+def test_directions_lie_along_the_last_axis_and_fill_vectors():
+    shapes = []
+
+    def beside(x, slope):
+        shapes.append(slope.shape)
+        return jnp.sin(x), jnp.cos(x)[:, None] * slope
+
+    x = jnp.arange(5.0)
+    found = jax.jacfwd(in_all_directions(jnp.sin, beside))(x)
+    np.testing.assert_allclose(found, np.diag(np.cos(np.arange(5.0))))
+    assert shapes[-1] == (5, 8)

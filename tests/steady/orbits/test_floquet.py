@@ -1,0 +1,131 @@
+"""Floquet multipliers and special points against the full equations."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from periodic import monodromy, ordered
+from scenes import machines, published
+from scipy.integrate import solve_ivp
+
+import jaxvib as jv
+from jaxvib.study.maps.stability_onset import onset
+
+
+def gravity():
+    loads = jv.balls(count=2, mass=0.8, radius=0.12, drag=1.5)
+    return jv.Scene(machines()["two_mass"], loads, jv.ConstantSpeed(150.0), jv.Gravity())
+
+
+@pytest.mark.parametrize("make, omega", [(lambda: published(eps=0.05, count=3).scene(), 0.97), (gravity, 60.0)])
+def test_multipliers_are_those_of_the_full_equations(make, omega):
+    scene = make()
+    orbit = jv.jam_orbit(scene, omega=omega)
+    scene = eqx.tree_at(lambda s: s.drive.speed, scene, orbit.rotor_speed)
+    # The trivial multiplier is taken out; loads that part from each other have theirs count - 1 times.
+    expected = [*orbit.multipliers[:-2], *np.tile(orbit.multipliers[-2:], scene.loads.count - 1), 1.0]
+    np.testing.assert_allclose(ordered(monodromy(scene, orbit)), ordered(expected), atol=1e-7)
+    np.testing.assert_allclose(orbit.trivial, 1.0, atol=1e-8)
+    np.testing.assert_allclose(orbit.multiplier, np.max(np.abs(orbit.multipliers)), rtol=1e-12)
+
+
+@functools.cache
+def diagram(eps):
+    return jv.branches(published(eps=eps).scene(), exact=True, points=400, least=0.25, most=2.0)
+
+
+def test_special_points_of_light_loads_are_the_published_folds():
+    special = diagram(1e-3).special
+    assert [p.kind for p in special] == ["fold"] * 4
+    np.testing.assert_allclose([p.omega for p in special], [0.3339, 0.3806, 1.0015, 1.2154], atol=5e-5)
+    np.testing.assert_allclose([p.rotor_speed for p in special], [0.7978, 0.4141, 5.1829, 1.3932], rtol=2e-4)
+
+
+def test_heavy_loads_lose_stability_at_a_torus_and_by_symmetry():
+    found = diagram(0.3)
+    kinds = [(p.kind, round(p.omega, 3)) for p in found.special]
+    assert [kind for kind, _ in kinds] == ["fold", "fold", "torus", "symmetry", "symmetry", "fold", "fold", "torus"]
+    # Stability in the diagram changes at special points only, and a fold is where dn/dOmega changes sign.
+    at = np.array([p.omega for p in found.special])
+    change = np.nonzero(found.stable[1:] != found.stable[:-1])[0]
+    for k in change:
+        assert np.any((at >= found.omega[k]) & (at <= found.omega[k + 1]))
+    folds = [p.omega for p in found.special if p.kind == "fold"]
+    turns = np.nonzero(found.slope[1:] * found.slope[:-1] < 0.0)[0]
+    assert np.all((found.omega[turns] < folds) & (folds < found.omega[turns + 1]))
+    assert np.max(found.residual) < 1e-12 and np.max(found.error) < 1e-8
+
+
+def grows(omega, eps):
+    """Whether a disturbance of 1e-6 grows in 300 periods of the paper's equations, symmetric motions or not."""
+    orbit = jv.jam_orbit(published(eps=eps).scene(), omega=omega)
+    form, n = published(eps=eps), float(orbit.rotor_speed)
+    q, velocity, (phi,), (rate,) = orbit.at(0.0)
+    v, w = np.asarray(q / form.lengths), np.asarray(velocity / form.lengths)
+    start = np.array([v[0], w[0], v[1], w[1], phi[0], rate[0]])
+
+    def paper(t, y):
+        v1, w1, v2, w2, phi, rate = y
+        link = 0.02 * (w1 - w2) + 4 / 9 * (v1 - v2)
+        c, s = np.cos(phi), np.sin(phi)
+        right, pull = -0.02 * w2 - v2 / 9 + link + s * rate**2, eps * (n - rate)
+        a2 = (right - c * pull) / (1.0 - eps * c * c)
+        return [w1, -0.02 * w1 - v1 / 9 - link, w2, a2, rate, pull - eps * c * a2]
+
+    times = 2.0 * np.pi / omega * np.arange(301)
+    end = start + 1e-6 * np.array([1.0, 0.5, -0.7, 0.3, 0.4, 0.2])
+    run = solve_ivp(paper, (0.0, times[-1]), end, "DOP853", times, rtol=1e-10, atol=1e-12).y.T
+    # A shift in time is no growth: the rate when the loads pass the same angle is compared, not the phase.
+    distance = np.abs(run[:, :4] - start[:4]).max(1)
+    return bool(orbit.stable), distance[-1] > 1e-4, float(orbit.multiplier)
+
+
+@pytest.mark.parametrize(
+    "kind, which, apart",
+    [("torus", 0, 2e-2), ("torus", 1, 2e-2), ("symmetry", 0, 4e-3)],
+    ids=["torus on mode 3", "torus on mode 5", "symmetry on mode 3"],
+)
+def test_time_integration_on_both_sides_of_a_special_point(kind, which, apart):
+    point = [p for p in diagram(0.3).special if p.kind == kind][which]
+    sides = [grows(point.omega * (1.0 + side), 0.3) for side in (-apart, apart)]
+    assert sides[0][0] != sides[1][0]
+    for stable, grown, multiplier in sides:
+        assert stable == (not grown) == (multiplier < 1.0)
+
+
+def test_figure_of_stability_over_the_load_mass():
+    found = jv.stability_map(lambda x: published(eps=x).scene(), [0.02, 0.05], omega=(0.36, 0.5), points=100)
+    assert [[p.kind for p in points] for points in found.special] == [["fold"], ["fold", "torus"]]
+    assert found.plot(label="eps").axes[0].get_ylabel() == "eps"
+    with pytest.raises(jv.InputError, match="ascending"):
+        jv.stability_map(lambda x: published(eps=x).scene(), [0.05, 0.02], omega=(0.36, 0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, between, omega, eps",
+    [
+        ("torus", (0.02, 0.05), (0.34, 0.9), 0.0336),
+        ("torus", (0.05, 0.15), (1.1, 2.0), 0.0928),
+        ("symmetry", (0.2, 0.3), (0.9, 1.01), 0.273),
+    ],
+)
+def test_load_mass_from_which_on_odd_modes_are_not_stable_everywhere(kind, between, omega, eps):
+    """eps = m/(kappa M2S): self-pins, confirmed by the time integrations above on both sides at eps = 0.3."""
+    found = onset(lambda x: published(eps=x).scene(), kind, between, omega=omega)
+    np.testing.assert_allclose(found, eps, rtol=4e-3)
+
+
+@pytest.mark.slow
+def test_gradient_of_the_largest_multiplier():
+    flat, restore = ravel_pytree(gravity())
+    f = jax.jit(lambda x: jv.jam_orbit(restore(x), omega=60.0, points=33).multiplier)
+    direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))
+    forward, reverse = jax.jvp(f, (flat,), (direction,))[1], jax.grad(f)(flat)
+    h = 1e-4
+    np.testing.assert_allclose((f(flat + h * direction) - f(flat - h * direction)) / (2.0 * h), forward, rtol=1e-5)
+    np.testing.assert_allclose(jnp.vdot(reverse, direction), forward, rtol=1e-9)

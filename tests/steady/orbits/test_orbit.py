@@ -1,0 +1,299 @@
+"""Exact jams against the full equations, solved by other means."""
+
+import functools
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from periodic import integrate
+from scenes import machines, published
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
+
+import jaxvib as jv
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.orbits.collocation import along, periodic_motion
+
+
+class Shaker(jv.Machine):
+    """One platform that moves across and up, on unequal supports, the two directions coupled: a port of two directions."""
+
+    stiffness: jax.Array
+    kind: str = eqx.field(static=True)
+
+    def carrier(self):
+        k, zero = self.stiffness, jnp.zeros((2, 2))
+        damping = jnp.diag(jnp.asarray([30.0, 20.0]))
+        return jv.Carrier(40.0 * jnp.eye(2), damping, k, None, jnp.eye(2), k, zero + damping, (0, 1), ("x", "y"))
+
+
+def shaker():
+    machine = Shaker(stiffness=jnp.asarray([[6e4, 5e3], [5e3, 4e4]]), kind="shaker")
+    return jv.Scene(machine, jv.rollers(count=2, mass=2.0, radius=0.1, drag=0.9), jv.ConstantSpeed(60.0))
+
+
+def heavy():
+    loads = jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5)
+    return jv.Scene(machines()["two_mass"], loads, jv.ConstantSpeed(150.0), jv.Gravity())
+
+
+def two_sizes():
+    """Loads of different mass that obey the same equation, so that they stay together."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+    return jv.Scene(machine, jv.balls(count=2, mass=[0.6, 1.2], radius=0.1, drag=[0.7, 1.4]), jv.ConstantSpeed(50.0))
+
+
+SCENES = {
+    "loads of two sizes": (two_sizes, {"omega": 27.0}),
+    "published": (lambda: published(eps=0.05).scene(), {"mode": 3}),
+    "gravity": (heavy, {"omega": 60.0}),
+    "two directions": (shaker, {"omega": 29.0}),
+    "three masses": (
+        lambda: jv.Scene(
+            machines()["three_mass"], jv.pendulums(count=2, mass=2.0, radius=0.1, drag=2.0), jv.ConstantSpeed(40.0)
+        ),
+        {"near": 25.0},
+    ),
+}
+
+
+@functools.cache
+def solved(name):
+    make, question = SCENES[name]
+    orbit = jv.jam_orbit(make(), **question)
+    scene = eqx.tree_at(lambda s: s.drive.speed, make(), orbit.rotor_speed)
+    return scene, orbit
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_orbit_is_a_motion_of_the_full_equations(name):
+    scene, orbit = solved(name)
+    assert bool(orbit.status == jv.OrbitStatus.found)
+    assert float(orbit.residual) < 1e-12
+    # Whatever the period starts with, rounding included, has grown by the largest multiplier at its end.
+    assert np.max(np.abs(integrate(scene, orbit, 1)[-1])) < 1e-8 * max(1.0, float(orbit.multiplier))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_amplitudes_force_and_power_are_those_of_the_motion(name):
+    scene, orbit = solved(name)
+    theta = jnp.linspace(0.0, 2.0 * jnp.pi, 4001)
+    q, velocity, _, (rate,) = jax.vmap(orbit.at)(theta)
+    carrier = scene.machine.carrier()
+    np.testing.assert_allclose(orbit.amplitude, (q.max(0) - q.min(0)) / 2.0, rtol=2e-6)
+    assert np.all(np.asarray(orbit.amplitude) >= np.asarray(q.max(0) - q.min(0)) / 2.0 * (1.0 - 1e-12))
+    force = q @ carrier.bed_stiffness.T + velocity @ carrier.bed_damping.T
+    np.testing.assert_allclose(orbit.foundation_force, np.linalg.norm((force.max(0) - force.min(0)) / 2.0), rtol=2e-6)
+
+    # What the rotor gives is what the drag on the loads and the dampers take.
+    slip = float(orbit.rotor_speed) - rate[:-1]
+    drag = jnp.broadcast_to(scene.loads.drag * scene.loads.radius**2, slip.shape[1:])
+    dampers = jnp.einsum("ti,ij,tj->t", velocity[:-1], carrier.damping, velocity[:-1])
+    np.testing.assert_allclose(orbit.power, np.mean(slip**2 @ drag + dampers), rtol=1e-9)
+
+
+def paper(t, y, n, eps):
+    """The antiphase paper's equation (2), one load, by hand: v1, v1', v2, v2', phi, phi'."""
+    v1, w1, v2, w2, phi, rate = y
+    h, n2, n12 = 0.01, 1 / 9, 4 / 9
+    link = 2 * h * (w1 - w2) + n12 * (v1 - v2)
+    own1, own2 = -2 * h * w1 - n2 * v1 - link, -2 * h * w2 - n2 * v2 + link
+    c, s = np.cos(phi), np.sin(phi)
+    # v2'' + cos phi phi'' = own2 + sin phi phi'^2,  eps cos phi v2'' + phi'' = eps (n - phi')
+    right, pull = own2 + s * rate**2, eps * (n - rate)
+    a2 = (right - c * pull) / (1.0 - eps * c * c)
+    return [w1, own1, w2, a2, rate, pull - eps * c * a2]
+
+
+@pytest.mark.parametrize("omega, eps", [(0.97, 0.05), (0.34, 0.05), (1.03, 0.3)])
+def test_shooting_on_the_papers_equations_agrees(omega, eps):
+    form = published(eps=eps)
+    orbit = jv.jam_orbit(form.scene(), omega=omega)
+    q, velocity, _, (rate,) = orbit.at(0.0)
+    period = 2.0 * np.pi / omega
+    phi0 = float(orbit.at(0.0)[2][0][0])
+
+    def miss(x):
+        start = [x[0], x[1], x[2], x[3], phi0, x[4]]
+        end = solve_ivp(paper, (0.0, period), start, "DOP853", args=(x[5], eps), rtol=1e-12, atol=1e-12).y[:, -1]
+        return (end - start - [0, 0, 0, 0, 2.0 * np.pi, 0])[[0, 1, 2, 3, 4, 5]]
+
+    v, w = np.asarray(q / form.lengths), np.asarray(velocity / form.lengths)
+    near = np.array([v[0], w[0], v[1], w[1], rate[0], orbit.rotor_speed]) * (1.0 + 1e-4 * np.array([1, -1, 1, -1, 0.1, 1]))
+    root = fsolve(miss, near, xtol=1e-13)
+    np.testing.assert_allclose(root[5], orbit.rotor_speed, rtol=1e-8)
+    np.testing.assert_allclose(root[[0, 2]], v, rtol=1e-6, atol=1e-8 * np.abs(v).max())
+
+
+def test_stable_motion_stays_and_unstable_one_leaves():
+    scene, orbit = solved("published")
+    assert bool(orbit.stable)
+    assert np.max(np.abs(integrate(scene, orbit, 100))) < 1e-8
+    away = jv.jam_orbit(published(eps=0.05).scene(), mode=4)
+    assert not bool(away.stable)
+    assert np.max(np.abs(integrate(scene, away, 60))) > 0.1
+
+
+@eqx.filter_jit
+def many(scene, omega, points):
+    def one(w):
+        motion = periodic_motion(scene, grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
+        return motion.rotor_speed, motion.residual, along(scene, grid_of(points, True), motion).speed_error
+
+    return jax.vmap(one)(omega)
+
+
+def test_every_point_of_the_published_diagram_for_light_and_heavy_loads():
+    omega = jnp.linspace(0.15, 2.0, 2000)
+    for eps in (1e-6, 1e-3, 0.05, 0.3):
+        _, residual, error = many(published(eps=eps).scene(), omega, 24)
+        assert float(jnp.max(residual)) < 1e-12
+        assert float(jnp.max(error)) < 1e-8
+
+
+def test_error_falls_exponentially_and_is_known():
+    scene, omega = published(eps=0.05).scene(), jnp.linspace(0.15, 2.0, 2000)
+    best = many(scene, omega, 24)[0]
+    errors = []
+    for points in (4, 8):
+        speed, _, known = many(scene, omega, points)
+        errors.append(float(jnp.max(jnp.abs(speed / best - 1.0))))
+        assert 0.3 < float(jnp.max(known)) / errors[-1] < 3.0
+    assert errors[1] < 1e-8 < 1e-4 * errors[0]
+
+
+def test_figure_of_convergence():
+    found = jv.harmonic_convergence(published(eps=0.05).scene(), [0.34, 0.97], points=(4, 8))
+    assert found.harmonics.tolist() == [3, 7] and np.all(found.error[1] < 1e-4 * found.error[0])
+    assert [line.get_label() for line in found.plot().axes[0].lines[::2]] == ["0.34 rad/s", "0.97 rad/s", "estimate"]
+    with pytest.raises(jv.InputError, match="ascending"):
+        jv.harmonic_convergence(published().scene(), [0.9], points=(8, 4))
+
+
+def test_light_loads_jam_at_leading_order():
+    scene = published(eps=1e-6).scene()
+    orbit, jam = jv.jam_orbit(scene, mode=3), jv.jam_modes(scene).select(3)
+    np.testing.assert_allclose([orbit.omega, orbit.slope], [jam.omega, jam.slope], rtol=1e-4)
+    np.testing.assert_allclose(orbit.amplitude, jam.amplitude, rtol=1e-4)
+    np.testing.assert_allclose(orbit.foundation_force, jam.foundation_force, rtol=1e-4)
+
+
+def numbers_of(orbit):
+    parts = (orbit.omega, orbit.slope, orbit.amplitude, orbit.foundation_force, orbit.power)
+    parts += (orbit.lag_harmonics[0, 1:3].real, orbit.displacement_harmonics[:, 0].imag)
+    return jnp.concatenate([jnp.ravel(part) for part in parts])
+
+
+def test_gradients_forward_reverse_and_by_differences():
+    """Central differences of relative step 1e-4: truncation and rounding leave a noise floor below 1e-6."""
+    flat, restore = ravel_pytree(published(eps=0.05).scene())
+    f = jax.jit(lambda x: numbers_of(jv.jam_orbit(restore(x), near=0.97, points=16)))
+    values = f(flat)
+    rng = np.random.default_rng(0)
+    along_x = jnp.asarray(flat * rng.normal(size=flat.shape))
+    weights = jnp.asarray(rng.normal(size=values.shape)) / jnp.abs(values)
+    forward = jax.jvp(f, (flat,), (along_x,))[1]
+    assert np.all(np.isfinite(forward))
+    h = 1e-4
+    two = [(f(flat + s * h * along_x) - f(flat - s * h * along_x)) / (2.0 * s * h) for s in (1.0, 2.0)]
+    differences = (4.0 * two[0] - two[1]) / 3.0
+    np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-6 * float(jnp.max(jnp.abs(forward))))
+    reverse = jax.grad(lambda x: jnp.vdot(weights, f(x)))(flat)
+    np.testing.assert_allclose(jnp.vdot(reverse, along_x), jnp.vdot(weights, forward), rtol=1e-9)
+
+
+def test_beyond_a_fold_the_status_says_so():
+    scene = published(eps=0.05, speed=5.3).scene()
+    with pytest.raises(jv.ComputationError, match="not_converged"):
+        jv.jam_orbit(scene, near=1.002)
+    orbit = jv.jam_orbit(scene, near=1.002, throw=False)
+    assert bool(orbit.status == jv.OrbitStatus.not_converged)
+    assert np.isnan(orbit.omega) and not bool(orbit.stable)
+
+
+@pytest.mark.parametrize(
+    "form, omega",
+    [
+        (published(eps=1e-3, damping=1e-6), 0.95),
+        (published(eps=1e-6), 1.0),
+        (published(eps=1e-3), 0.333333333333),
+        (published(eps=1e-3, count=100), 0.9),
+        (published(eps=1e-3, damping=1e-6), 0.333333333333),
+    ],
+    ids=["light damping", "at a resonance", "at a resonance to 12 digits", "100 loads", "undamped at a resonance"],
+)
+def test_limits_converge_or_say_why(form, omega):
+    orbit = jv.jam_orbit(form.scene(), omega=omega, throw=False)
+    if bool(orbit.status == jv.OrbitStatus.found):
+        assert float(orbit.residual) < 1e-12
+        scene = eqx.tree_at(lambda s: s.drive.speed, form.scene(), orbit.rotor_speed)
+        assert np.max(np.abs(integrate(scene, orbit, 1)[-1])) < 1e-8 * max(1.0, float(orbit.multiplier))
+    else:
+        assert bool(orbit.status == jv.OrbitStatus.not_converged) or bool(orbit.status == jv.OrbitStatus.coarse)
+
+
+def test_at_a_fold_the_status_says_so():
+    omega, rotor_speed = 1.0022684475770662, 5.202824715161476  # as branches(exact=True) finds it
+    scene = published(eps=0.05, speed=rotor_speed * (1.0 - 1e-13)).scene()
+    orbit = jv.jam_orbit(scene, near=omega)
+    assert bool(orbit.status == jv.OrbitStatus.at_fold)
+    np.testing.assert_allclose(orbit.omega, omega, rtol=1e-6)
+    # A gradient there is huge, not infinite.
+    slope = jax.grad(lambda n: jv.jam_orbit(eqx.tree_at(lambda s: s.drive.speed, scene, n), near=omega, points=16).omega)
+    assert np.isfinite(slope(scene.drive.speed))
+
+
+def test_modes_that_the_leading_order_lacks_or_has_in_vain():
+    """The exact fold of mode 3 is at a rotor speed of 5.2028 for eps = 0.05, at 5.0975 for 0.3; in leading order at 5.1829."""
+    beyond = published(eps=0.05, speed=5.2028).scene()
+    assert jv.jam_modes(beyond).mode_numbers() == [5]
+    modes = [jv.jam_orbit(beyond, mode=k) for k in (3, 4, 5)]
+    assert [bool(m.status == jv.OrbitStatus.found) for m in modes] == [True] * 3
+    assert [float(m.slope) > 0.0 for m in modes] == [True, False, True]
+    np.testing.assert_allclose([m.omega for m in modes], [1.00219515, 1.00234177, 5.09332167], rtol=1e-8)
+    within = published(eps=0.3, speed=5.15).scene()
+    assert jv.jam_modes(within).mode_numbers() == [3, 4, 5]
+    for k in (3, 4):
+        with pytest.raises(jv.ComputationError, match="absent"):
+            jv.jam_orbit(within, mode=k)
+
+
+def test_single_precision_answers_as_well_as_it_can():
+    """In a process of its own: the tests' one counts in double precision."""
+    ask = "import jaxvib as jv; print(jv.jam_orbit(jv.Dimensionless('antiphase', **{}).scene(), mode=3).omega.item())"
+    form = dict(natural=(1 / 3, 1 / 3), damping=(0.01, 0.01), link_natural=2 / 3, link_damping=0.01)
+    form |= dict(rho=1.0, beta=1.0, eps=0.05, speed=1.5)
+    done = subprocess.run([sys.executable, "-c", ask.format(form)], capture_output=True, text=True, check=True)
+    exact = float(jv.jam_orbit(jv.Dimensionless("antiphase", **form).scene(), mode=3).omega)
+    assert abs(float(done.stdout) / exact - 1.0) < 1e-6 and float(done.stdout) != exact
+
+
+def test_wrong_questions_are_refused():
+    scene = published().scene()
+    with pytest.raises(jv.InputError, match="jam_orbit was asked with none"):
+        jv.jam_orbit(scene)
+    with pytest.raises(jv.InputError, match="mode and omega"):
+        jv.jam_orbit(scene, mode=3, omega=0.9)
+    with pytest.raises(jv.InputError, match="accuracy"):
+        jv.jam_orbit(scene, mode=3, accuracy=1e-15)
+    with pytest.raises(jv.ComputationError, match="absent"):
+        jv.jam_orbit(scene, mode=1)
+    with pytest.raises(jv.InputError, match=r"loads\.drag"):
+        jv.jam_orbit(eqx.tree_at(lambda s: s.loads.drag, scene, 0.0), omega=0.9)
+
+
+def test_tiers_differ_in_proportion_to_the_loads_mass():
+    """Leading order means just that; where a tier has no answer it says why."""
+    found = jv.compare_tiers(published().scene(), (0.1, 1.0, 1e3), mode=3)
+    apart = np.abs(found.leading.omega / found.exact.omega - 1.0)
+    np.testing.assert_allclose(apart[1] / apart[0], 10.0, rtol=0.05)
+    for tier, word in ((found.leading, "mode"), (found.exact, "periodic motion")):
+        assert word in tier.message[0] and "does not exist" in tier.message[2]
+        assert np.isfinite(tier.amplitude[:2]).all() and np.isnan(tier.amplitude[2]).all()
+    assert found.plot().axes[0].get_xlabel() == "mass of a load, kg"

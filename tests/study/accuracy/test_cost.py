@@ -1,0 +1,129 @@
+"""What accuracy costs: every way of computing a quantity is set against one reference."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published
+
+import jaxvib as jv
+from jaxvib.cli.app import run
+from jaxvib.study.accuracy.cost import Cost, CostRow
+
+
+def test_ways_agree_where_they_should(tmp_path, capsys):
+    """The leading order errs by its eps, the exact orbit by rounding; the command prints the same as JSON, with its figure."""
+    jv.save_scene(published(speed=1.5, eps=1e-3, damping=0.05).scene(), tmp_path / "machine.toml")
+    asked = ["cost", str(tmp_path / "machine.toml"), "--mode", "3", "--until", "40s", "--repeats", "1", "--json"]
+    assert run([*asked, "--solver", "default", "--out", str(tmp_path / "out")]) == 0
+    told = json.loads(capsys.readouterr().out)
+    by_tier = {}
+    for row in told["rows"]:
+        by_tier.setdefault(row["tier"], []).append(row["error"])
+    assert set(by_tier) == {"leading order", "exact orbit", "envelope", "full"} and told["left_out"] == []
+    assert {row["dtype"] for row in told["rows"] if row["tier"] in ("leading order", "full")} == {"float64", "float32"}
+    assert 1e-7 < by_tier["leading order"][0] < 1e-2 and min(by_tier["exact orbit"]) < 1e-9
+    assert told["reference_error"] < 1e-9 and told["cheapest"]["1e-06"]["tier"] == "exact orbit"
+    assert (tmp_path / "out" / "cost.png").stat().st_size > 10_000
+
+
+def light():
+    """One platform, one ball."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    return jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+
+
+@pytest.mark.slow
+def test_runs_are_long_enough_to_forget_their_start():
+    """Had they half the time, the square root of the tolerance would be left of the start."""
+    cost = jv.accuracy(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["Tsit5"], repeats=1)
+    error = {row.setting: row.error for row in cost.rows if row.tier == "full"}
+    assert error.keys() == {"1e-04", "1e-08"} and error["1e-04"] < 3e-4 and error["1e-08"] < 3e-8
+
+
+def test_a_run_does_not_stay_in_an_unstable_jam():
+    cost = jv.accuracy(light(), mode=2, repeats=1)
+    assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
+    (reason,) = cost.left_out
+    assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
+
+
+@pytest.mark.slow
+def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
+    """Nor is it asked how long a run would need to forget its start: less than no time."""
+    scene = jv.Scene(light().machine, light().loads, jv.ConstantSpeed("40 rad/s"))
+    cost = jv.accuracy(scene, "gradient", mode=2, repeats=1)
+    assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
+    (reason,) = cost.left_out
+    assert reason.startswith("full: jam mode 2 is unstable (largest Floquet multiplier 1.597")
+
+
+@pytest.mark.slow
+def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
+    """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
+    scene = published(speed=5.19, eps=0.05).scene()
+    cost = jv.accuracy(scene, mode=3, until=30.0, tolerances=(1e-6,), solvers=["Tsit5"], repeats=1)
+    by_tier = {row.tier: row.error for row in cost.rows}
+    assert by_tier.keys() == {"exact orbit", "envelope", "full"} and by_tier["full"] < 1e-4 < by_tier["envelope"]
+    (reason,) = cost.left_out
+    assert reason.startswith("leading order: this mode does not exist at this rotor speed; runs start on the exact motion")
+
+
+def test_a_run_up_is_measured_at_its_end():
+    machine = jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0)
+    loads = jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5)
+    scene = jv.Scene(machine, loads, jv.RunUp(60.0, 60.0), (jv.StaticImbalance("1 g m"),))
+    cost = jv.accuracy(scene, until=2.0, tolerances=(1e-4, 1e-7), solvers=["Tsit5"], repeats=1)
+    assert [row.setting for row in cost.rows] == ["1e-04", "1e-07"] and {row.method for row in cost.rows} == {"Tsit5"}
+    assert cost.reference_error < 1e-9 and cost.rows[1].error < 1e-6 < cost.rows[0].error
+    run = jv.simulate(scene, 2.0, tolerance=1e-10, estimate=False)
+    np.testing.assert_allclose(cost.reference, run.amplitude, rtol=1e-7)
+    exact, averaged = cost.left_out
+    assert exact == "leading order, exact orbit: drive.kind is 'run_up'; a jam is one at a constant speed"
+    assert averaged.startswith("envelope: effects.static_imbalance is not averaged")
+    with pytest.raises(jv.InputError, match=r"drive\.kind is 'run_up'; a jam is one at a constant speed"):
+        jv.accuracy(scene, mode=1)
+
+
+def test_a_final_state_is_told_apart_but_for_whole_turns_in_single_precision():
+    cost = jv.accuracy(light(), "final_state", until=20.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
+    error = {row.dtype: row.error for row in cost.rows}
+    assert error.keys() == {"float64", "float32"} and 0.0 < error["float64"] < 1e-3 and error["float32"] < 0.1
+    assert cost.reference_error < 1e-8 and len(cost.reference) == 4
+
+
+def row(error, seconds):
+    return CostRow("full", "", "float64", "", error, seconds, 0.0)
+
+
+def test_the_cheapest_is_the_fastest_that_is_exact_enough():
+    cost = Cost("amplitude", [1.0], 1e-9, [row(1e-2, 1.0), row(1e-5, 3.0), row(1e-6, 2.0), row(np.inf, 0.1)])
+    assert cost.cheapest(0.1) == row(1e-2, 1.0) and cost.cheapest(1e-4) == row(1e-6, 2.0)
+    assert cost.cheapest(1e-7) is None and cost.cheapest(1e-10) is None
+    assert cost.plot().axes[0].get_ylabel() == "relative error of amplitude"
+    three = jv.cost_figure({"a": cost, "b": cost, "c": Cost("amplitude", [1.0], 1.0, [row(np.inf, 0.1)])})
+    assert [axes.get_title() for axes in three.axes] == ["a", "b", "c", ""]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (dict(quantity="mass"), "quantity is 'mass'; it must be one of amplitude"),
+        (dict(solvers=["Euler"]), r"solvers are \['Euler'\]; name some of default, Tsit5, Dopri8"),
+        (dict(solvers=[]), r"solvers are \[\]; name some of default"),
+        (dict(until=-1.0), "until is -1"),
+        (dict(tolerances=()), r"tolerances are \(\); name one at least, such as 1e-6"),
+        (dict(repeats=0), "repeats is 0; it must be a whole number, at least 1"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(asked, message):
+    with pytest.raises(jv.InputError, match=message):
+        jv.accuracy(published().scene(), **asked)
+
+
+def test_single_precision_has_nothing_to_be_measured_against():
+    scene = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), light())
+    with pytest.raises(jv.InputError, match="scene is in single precision; errors are measured against double"):
+        jv.accuracy(scene)

@@ -1,0 +1,135 @@
+"""The layout of the code: imports go down only, without circles; folders and files stay small."""
+
+import ast
+import collections
+import pathlib
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+FLOORS = (
+    ("jaxvib.cli",),
+    ("jaxvib.study", "optimize"),
+    ("jaxvib.motion",),
+    ("jaxvib.steady",),
+    ("jaxvib.equations",),
+    ("jaxvib.machine",),
+    ("jaxvib.ode", "jaxvib.draw", "jaxvib.runtime", "jaxvib.units"),
+    ("jaxvib.numerics", "jaxvib.errors"),
+)
+"""From the top down; a module may import from its own package and from floors below its own."""
+
+MOST_FILES, MOST_LINES = 12, 400
+
+
+def sources():
+    """Every module of the two packages by its dotted name."""
+    files = [path for package in ("jaxvib", "optimize") for path in sorted((ROOT / package).rglob("*.py"))]
+    return {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path.read_text() for path in files
+    }
+
+
+def imports(modules):
+    """(module, imported module) for every import statement, those inside functions too."""
+    found = set()
+    for module, text in modules.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                # `from package import module` imports the module, `from module import name` the module of the name.
+                for alias in node.names:
+                    inner = f"{node.module}.{alias.name}"
+                    found.add((module, inner if inner in modules else node.module))
+            elif isinstance(node, ast.Import):
+                found |= {(module, alias.name) for alias in node.names}
+    return {(module, other) for module, other in found if other.split(".")[0] in ("jaxvib", "optimize")}
+
+
+def floor_of(module):
+    """(floor counted from below, package); the package `jaxvib` itself, the list of public names, has none."""
+    for height, packages in enumerate(reversed(FLOORS)):
+        for package in packages:
+            if module == package or module.startswith(package + "."):
+                return height, package
+    return None, None
+
+
+def upward(modules):
+    """Imports that do not go down: to a floor above, or to another package of the same floor."""
+    found = []
+    for module, other in sorted(imports(modules)):
+        (here, mine), (there, theirs) = floor_of(module), floor_of(other)
+        public = mine in ("jaxvib.cli", "optimize") and other == "jaxvib"  # the face may use the public names
+        if module == "jaxvib" or public:
+            continue
+        if here is None or there is None or (mine != theirs and there >= here):
+            found.append(f"{module} imports {other}")
+    return found
+
+
+def circles(modules):
+    """Modules that import each other, directly or through others, in groups."""
+    below = collections.defaultdict(set)
+    for module, other in imports(modules):
+        if other != "jaxvib":
+            below[module].add(other)
+
+    def reached(start):
+        seen, todo = set(), [start]
+        while todo:
+            for other in below[todo.pop()]:
+                if other not in seen:
+                    seen.add(other)
+                    todo.append(other)
+        return seen
+
+    every = {module: reached(module) for module in list(below)}
+    return sorted(
+        {tuple(sorted(m for m in every[module] if module in every.get(m, ()))) for module in every if module in every[module]}
+    )
+
+
+def test_imports_go_down():
+    assert upward(sources()) == []
+
+
+def test_modules_do_not_import_each_other():
+    assert circles(sources()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "says"),
+    [
+        (
+            "jaxvib.equations.linear",
+            "from jaxvib.motion.simulate import simulate",
+            "equations.linear imports jaxvib.motion.simulate",
+        ),
+        ("jaxvib.ode.control", "    from jaxvib.machine.scene import Scene", "ode.control imports jaxvib.machine.scene"),
+        ("jaxvib.machine.scene", "import jaxvib", "machine.scene imports jaxvib"),
+        ("optimize.space", "from jaxvib.study.maps import run_ups", "optimize.space imports jaxvib.study.maps.run_ups"),
+    ],
+)
+def test_an_import_turned_round_is_seen(module, line, says):
+    modules = sources()
+    body = f"def f():\n{line}\n" if line.startswith(" ") else line + "\n"
+    assert any(says in found for found in upward({**modules, module: modules[module] + "\n\n" + body}))
+
+
+def test_a_circle_is_seen():
+    modules = sources()
+    turned = modules["jaxvib.machine.carrier"] + "\n\nfrom jaxvib.machine.scene import Scene\n"
+    assert any("jaxvib.machine.scene" in group for group in circles({**modules, "jaxvib.machine.carrier": turned}))
+
+
+def test_folders_and_files_are_small():
+    folders, long = collections.Counter(), []
+    for part in ("jaxvib", "optimize", "tests", "benchmarks"):
+        for path in (ROOT / part).rglob("*.py"):
+            folders[path.parent.relative_to(ROOT)] += path.name != "__init__.py"
+            lines = len(path.read_text().splitlines())
+            if lines > MOST_LINES:
+                long.append(f"{path.relative_to(ROOT)}: {lines} lines")
+    assert {str(folder): count for folder, count in folders.items() if count > MOST_FILES} == {}
+    assert long == []
