@@ -22,7 +22,7 @@ import numpy as np
 from common import best_in_turn, first, published, say
 
 import jaxvib as jv
-from jaxvib.ode.dopri8 import WrittenOut
+from jaxvib.ode.dopri8 import UnrolledDopri8
 
 BLOCKS, SAMPLES = 64, 2**17
 ALLOWED = 1e-2
@@ -83,7 +83,7 @@ def compare(name: str, scene: jv.Scene, until: float, rounds: int) -> None:
     add("envelope", lambda s: jv.envelope(s, until, tolerance=tolerance, save="window"), off, note)
     for title, solver in (
         ("full, as simulate does it under jit", None),
-        ("full, the step written out", WrittenOut()),
+        ("full, the step written out", UnrolledDopri8()),
         ("full, Tsit5", diffrax.Tsit5()),
         ("full, Dopri8", diffrax.Dopri8()),
     ):

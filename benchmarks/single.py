@@ -20,8 +20,8 @@ import numpy as np
 from common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
 
 import jaxvib as jv
-from jaxvib.motion.system import Motion
-from jaxvib.ode.control import Tolerance
+from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.control import PIController
 
 
 def integrator(scene: jv.Scene, start: jv.State, controller: str = "equal steps") -> Callable[..., Any]:
@@ -29,19 +29,19 @@ def integrator(scene: jv.Scene, start: jv.State, controller: str = "equal steps"
 
     @jax.jit
     def run(scene: jv.Scene, end: jax.Array, setting: jax.Array) -> Any:
-        motion = Motion(jv.vector_field(scene), start)
+        motion = PackedSystem(jv.vector_field(scene), start)
         control: Any = diffrax.ConstantStepSize()
         if controller == "adaptive":
             one = jax.tree.map(jnp.ones_like, start)
             relative = jv.State(one.displacement, one.velocity, (jnp.zeros_like(one.angle[0]),), one.rate)
-            control = Tolerance(setting, motion.held(one), motion.held(relative))
+            control = PIController(setting, motion.pack(one), motion.pack(relative))
         solution = diffrax.diffeqsolve(
             motion.term,
             motion.method(),
             t0=0.0,
             t1=end,
             dt0=end / setting if controller == "equal steps" else 0.01,
-            y0=motion.held(start),
+            y0=motion.pack(start),
             args=motion.args,
             stepsize_controller=control,
             adjoint=diffrax.ForwardMode(),

@@ -8,7 +8,7 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
-from jaxvib.machine.effects.base import Effect, Friction, Gravity, MomentImbalance, StaticImbalance, Throw
+from jaxvib.machine.effects.base import Effect, Friction, Gravity, Imbalance, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.supports import CubicSupport, Stop
@@ -51,14 +51,14 @@ from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
 from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence, harmonic_convergence
 from jaxvib.study.accuracy.tiers import Tiers, compare_tiers
-from jaxvib.study.accuracy.work_precision import accuracy
+from jaxvib.study.accuracy.work_precision import work_precision
 from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 from jaxvib.study.maps.criterion_map import CriterionMap, criterion_map
 from jaxvib.study.maps.run_ups import RunUps, run_ups
-from jaxvib.study.maps.stability_onset import StabilityMap, onset, stability_map
+from jaxvib.study.maps.stability_onset import StabilityMap, stability_map, stability_onset
 
 __all__ = [
     "Amplitudes",
@@ -100,6 +100,7 @@ __all__ = [
     "IdealDrive",
     "Identified",
     "IdentifyStatus",
+    "Imbalance",
     "InductionMotor",
     "InputError",
     "Jam",
@@ -137,12 +138,10 @@ __all__ = [
     "Stop",
     "Swing",
     "SwingStatus",
-    "Throw",
     "Tiers",
     "Trajectory",
     "TurningPoints",
     "Whirl",
-    "accuracy",
     "averaged_field",
     "balanced_growth",
     "balanced_intervals",
@@ -172,7 +171,6 @@ __all__ = [
     "natural_frequencies",
     "network",
     "one_mass",
-    "onset",
     "pendulums",
     "phase_branch",
     "phase_jam",
@@ -194,6 +192,7 @@ __all__ = [
     "settle",
     "simulate",
     "stability_map",
+    "stability_onset",
     "steady_displacement",
     "swing",
     "ten_periods",
@@ -202,4 +201,5 @@ __all__ = [
     "two_mass",
     "vector_field",
     "whirl",
+    "work_precision",
 ]

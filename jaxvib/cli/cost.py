@@ -36,7 +36,7 @@ def cost(
 ) -> None:
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
     chosen = solvers or tuple(SOLVERS)
-    found = jv.accuracy(jv.load_scene(scene), quantity, mode=mode, until=until, solvers=chosen, repeats=repeats)
+    found = jv.work_precision(jv.load_scene(scene), quantity, mode=mode, until=until, solvers=chosen, repeats=repeats)
     picture = output.file("cost.png")
     if picture is not None:
         found.plot().savefig(picture)

@@ -91,7 +91,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
 
 def _left_out(scene: jv.Scene) -> list[str]:
     """What a table of light loads' jams does not hold, in a line; none where nothing is out of balance."""
-    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if effect.throws)
+    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if effect.has_imbalance)
     return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 
 

@@ -51,7 +51,7 @@ def bodies(scene: Scene) -> Bodies:
     """The collected loads of the scene as bodies. **Raises** `InputError` for a rotor out of balance."""
     loads = jammed_loads(scene)
     for effect in scene.effects:
-        if effect.throws:
+        if effect.has_imbalance:
             raise InputError(
                 f"effects.{effect.kind}", "shakes the machine at the rotor's own speed, so that no motion repeats; leave it out"
             )

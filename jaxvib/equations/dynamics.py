@@ -67,7 +67,7 @@ class Dynamics(eqx.Module):
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `push` M^-1 P^T (nd, nP): acceleration per force at the port; `mobility` P M^-1 P^T (nP, nP); `port` P (nP, nd)
-    - `stations` of the loads and `seat` of the rotor, see `Carrier`; `supports` that are not linear
+    - `stations` of the loads and `cg_offset` of the rotor, see `Carrier`; `supports` that are not linear
     """
 
     stiffness: Array
@@ -77,7 +77,7 @@ class Dynamics(eqx.Module):
     mobility: Array
     port: Array
     stations: Array | None
-    seat: Array | None
+    cg_offset: Array | None
     supports: tuple[_Support, ...]
     loads: Loads
     drive: Drive
@@ -186,19 +186,19 @@ class Dynamics(eqx.Module):
 
     def _throw(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
         """With d(theta) (nP,) what is out of balance: d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2."""
-        if not any(effect.throws for effect in self.effects):
+        if not any(effect.has_imbalance for effect in self.effects):
             return None
         turn, rate = rotor_angle(self.drive, t, state), rotor_speed(self.drive, t, state)
 
         def thrown(angle: Array) -> tuple[Array, ...]:
-            found = [throw for throw in (effect.throw(angle) for effect in self.effects) if throw is not None]
-            static = tuple(_sum(throw.static[axis] for throw in found) for axis in self.axes)
+            found = [imbalance for imbalance in (effect.imbalance(angle) for effect in self.effects) if imbalance is not None]
+            static = tuple(_sum(imbalance.static[axis] for imbalance in found) for axis in self.axes)
             if self.stations is None:
                 return static
-            lean = tuple(_sum(throw.lean[axis] for throw in found) for axis in self.axes)
-            if self.seat is not None:
-                lean = tuple(x + self.seat * y for x, y in zip(lean, static, strict=True))
-            return (*static, *lean)
+            moment = tuple(_sum(imbalance.moment[axis] for imbalance in found) for axis in self.axes)
+            if self.cg_offset is not None:
+                moment = tuple(x + self.cg_offset * y for x, y in zip(moment, static, strict=True))
+            return (*static, *moment)
 
         def slope(angle: Array) -> tuple[Array, ...]:
             return jax.jvp(thrown, (angle,), (jnp.ones_like(angle),))[1]
@@ -263,7 +263,7 @@ def vector_field(scene: Scene) -> Dynamics:
     """
     carrier, effects = scene.machine.carrier(), scene.effects
     stations, port = carrier.stations, carrier.port
-    if carrier.tilt is not None and (stations is not None or any(effect.throws for effect in effects)):
+    if carrier.tilt is not None and (stations is not None or any(effect.has_imbalance for effect in effects)):
         port = jnp.concatenate([port, carrier.tilt])
         stations = jnp.zeros_like(carrier.mass[0, 0]) if stations is None else stations
     places = [(effect, effect.place(carrier)) for effect in effects]
@@ -281,7 +281,7 @@ def vector_field(scene: Scene) -> Dynamics:
         mobility=port @ push,
         port=port,
         stations=stations,
-        seat=carrier.seat,
+        cg_offset=carrier.cg_offset,
         supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
         loads=scene.loads,
         drive=scene.drive,

@@ -117,13 +117,13 @@ def _at_loads(carrier: Carrier, rate: Array) -> dict[int, Array]:
 def _throw_rate(scene: Scene, turn: Array) -> Array:
     """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
     carrier = scene.machine.carrier()
-    static, lean = carrier.port_at(0.0 if carrier.seat is None else carrier.seat), carrier.tilt
+    static, moment = carrier.port_at(0.0 if carrier.cg_offset is None else carrier.cg_offset), carrier.tilt
     row = jnp.zeros_like(carrier.mass[0])
     for effect in scene.effects:
-        rate = jax.jvp(effect.throw, (turn,), (jnp.ones_like(turn),))[1]
+        rate = jax.jvp(effect.imbalance, (turn,), (jnp.ones_like(turn),))[1]
         if rate is None:
             continue
         row = row + jnp.stack([rate.static[axis] for axis in carrier.axes]) @ static
-        if lean is not None:
-            row = row + jnp.stack([rate.lean[axis] for axis in carrier.axes]) @ lean
+        if moment is not None:
+            row = row + jnp.stack([rate.moment[axis] for axis in carrier.axes]) @ moment
     return row

@@ -32,7 +32,7 @@ class Carrier(eqx.Module):
     - `tilt` T (np, nd), 1/m times the unit of a displacement: how the structure's axis turns with q; None where it cannot.
       A point at the distance s along the axis from the port moves by (B + s T) q
     - `stations` s_j (count,) m: where along the axis, counted from the port, each load runs; None where all run at the port
-    - `seat` m: where along the axis, counted from the port, the rotor's own mass centre lies; None where it is the port
+    - `cg_offset` m: where along the axis, counted from the port, the rotor's own mass centre lies; None where it is the port
 
     Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for stations
     Artyunin 2013, equation (1).
@@ -49,7 +49,7 @@ class Carrier(eqx.Module):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     tilt: Array | None = None
     stations: Array | None = None
-    seat: Array | None = None
+    cg_offset: Array | None = None
 
     @property
     def units(self) -> tuple[str, ...]:

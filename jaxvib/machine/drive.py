@@ -39,7 +39,7 @@ class IdealDrive(Drive):
     def acceleration_at(self, t: Array) -> Array:
         """The rotor's angular acceleration at time t, rad/s^2."""
 
-    def kinks(self) -> tuple[Array, ...]:
+    def jump_ts(self) -> tuple[Array, ...]:
         """Times at which the acceleration jumps, on which an integrator has to put a step."""
         return ()
 
@@ -178,7 +178,7 @@ class RunUp(IdealDrive):
         """The acceleration before the kink, 0 after it."""
         return jnp.where(t < self._end(), self.acceleration, 0.0)
 
-    def kinks(self) -> tuple[Array, ...]:
+    def jump_ts(self) -> tuple[Array, ...]:
         """Where the working speed is reached."""
         return (self._end(),)
 

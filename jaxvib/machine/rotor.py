@@ -82,7 +82,7 @@ class Rotor(Machine):
             coordinates=("y", "z", "theta", "psi"),
             tilt=tilt,
             stations=None if shared else self.stations,
-            seat=-self.stations if shared else None,
+            cg_offset=-self.stations if shared else None,
         )
 
 

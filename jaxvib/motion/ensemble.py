@@ -19,10 +19,10 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.distance import distance, scales
-from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wraps
+from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
+from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
 from jaxvib.motion.start import initial_state
-from jaxvib.motion.system import Motion
+from jaxvib.motion.system import PackedSystem
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["Ensemble", "ensemble"]
@@ -190,8 +190,8 @@ def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, 
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
     there, whether it stayed finite, the steps it took.
     """
-    single, together = wraps(scene, state.displacement.dtype)
-    motion = Motion(vector_field(scene), state, wrapped=single, together=together)
+    single, together = wrap_angles(scene, state.displacement.dtype)
+    motion = PackedSystem(vector_field(scene), state, wrapped=single, together=together)
     length = end / _PARTS
 
     def part(held: Any, begin: Array, step: Array) -> tuple[Any, Any]:
@@ -214,15 +214,15 @@ def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, 
 
     def whole(steps: Array) -> tuple[Any, Array]:
         times = length * jnp.arange(_PARTS)
-        _, (helds, taken) = jax.lax.scan(lambda held, begin: part(held, begin, length / steps), motion.held(state), times)
+        _, (helds, taken) = jax.lax.scan(lambda held, begin: part(held, begin, length / steps), motion.pack(state), times)
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)
     # Wrapped angles are counted from the first of the states that are asked for together.
-    ends = motion.states(jax.tree.map(lambda leaf: leaf[:, -1], helds))
-    angle = motion.states(jax.tree.map(lambda leaf: leaf[0], helds)).angle[0]
+    ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
+    angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).angle[0]
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
-    finite, apart = is_finite(last), distance(last, other, scales(last, natural_units(scene)))
+    finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
     # A run whose coarser one did not stay finite has an error that nobody knows.
     apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
     return last, (angle[1] - angle[0]) / length, apart, finite, taken[0]

@@ -17,11 +17,11 @@ from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.system import Motion
-from jaxvib.ode.control import Tolerance
+from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.control import PIController
 from jaxvib.ode.progress import ProgressBar
 from jaxvib.ode.replay import solve
-from jaxvib.runtime.programs import kept
+from jaxvib.runtime.programs import cached
 
 __all__ = ["PER_TURN", "WINDOW", "StepControl", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
 
@@ -39,7 +39,7 @@ class StepControl(eqx.Module):
     steps: Array | None = None
 
 
-@kept
+@cached
 def natural_units(scene: Scene) -> State:
     """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
     carrier, loads = scene.machine.carrier(), scene.loads
@@ -51,7 +51,7 @@ def natural_units(scene: Scene) -> State:
     return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
 
 
-def _controller(scene: Scene, motion: Motion, state: State, control: StepControl) -> diffrax.AbstractStepSizeController:
+def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepControl) -> diffrax.AbstractStepSizeController:
     if control.steps is not None:
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
@@ -67,21 +67,21 @@ def _controller(scene: Scene, motion: Motion, state: State, control: StepControl
         return jax.tree.map(lambda value, leaf: jnp.full(leaf.shape, value, dtype), tree, state)
 
     tolerance = jnp.asarray(control.tolerance, dtype)
-    units = motion.held(spread(unit))
+    units = motion.pack(spread(unit))
     if motion.wrapped:  # the count of turns has no error, and any unit
         units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
-    return Tolerance(tolerance=tolerance, unit=units, relative=motion.held(spread(relative)))  # pyright: ignore[reportCallIssue]
+    return PIController(tolerance=tolerance, unit=units, relative=motion.pack(spread(relative)))  # pyright: ignore[reportCallIssue]
 
 
-def on_kinks(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
+def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
     """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
-    kinks = scene.drive.kinks() if isinstance(scene.drive, IdealDrive) else ()
-    if not kinks or isinstance(controller, diffrax.ConstantStepSize):
+    jump_ts = scene.drive.jump_ts() if isinstance(scene.drive, IdealDrive) else ()
+    if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
-    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(kinks)))
+    return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
 
 
-@kept
+@cached
 def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count."""
     scene = jax.lax.stop_gradient(scene)
@@ -89,12 +89,12 @@ def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     return jnp.maximum(speed, jnp.max(frequencies)), jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
-def wraps(scene: Scene, dtype: Any) -> tuple[bool, bool]:
+def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     """Whether angles are kept within a turn, and all loads' by the same turns: single precision, loads that touch."""
     return jnp.dtype(dtype).itemsize < 8, any(isinstance(effect, LoadContact) for effect in scene.effects)
 
 
-@kept
+@cached
 def integrate(
     scene: Scene,
     end: Array,
@@ -117,8 +117,8 @@ def integrate(
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
-    single, together = wraps(scene, state.displacement.dtype)
-    motion = Motion(vector_field(scene), state, wrapped=single and solver is None, together=together)
+    single, together = wrap_angles(scene, state.displacement.dtype)
+    motion = PackedSystem(vector_field(scene), state, wrapped=single and solver is None, together=together)
     if solver is None:
         solver = motion.method()
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
@@ -134,18 +134,18 @@ def integrate(
         solver,
         end=end,
         first_step=first,
-        y0=motion.held(state),
+        y0=motion.pack(state),
         args=motion.args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=on_kinks(scene, controller),
+        controller=on_jumps(scene, controller),
         adjoint=adjoint,
         max_steps=max_steps,
         progress=ProgressBar() if progress else None,
     )
     assert solution.ts is not None and solution.ys is not None
-    times, states = solution.ts[0], motion.states(solution.ys[0])
+    times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
-    whole = trajectory(scene, solution.ts[1], motion.states(solution.ys[1])) if samples else None
+    whole = trajectory(scene, solution.ts[1], motion.unpack(solution.ys[1])) if samples else None
     seen = (measure(scene, motion.rates, times, states), window, whole)
     measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     steps = solution.stats["num_steps"]

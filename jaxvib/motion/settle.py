@@ -10,7 +10,7 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest, wraps
+from jaxvib.motion.integrate import fastest_and_slowest, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
@@ -94,7 +94,7 @@ def _parted(scene: Scene, start: Start) -> list[float] | None:
     n = scene.loads.count
     if start != "jam" or n == 1:
         return None
-    _, touching = wraps(scene, float)
+    _, touching = wrap_angles(scene, float)
     beside = scene.loads.offsets() if touching else jnp.zeros(n)  # pyright: ignore[reportAttributeAccessIssue]
     return [float(beside[k]) + _APART * (2.0 * k / (n - 1) - 1.0) for k in range(n)]
 

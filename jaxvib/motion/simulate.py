@@ -19,11 +19,11 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.distance import distance, scales, turned
-from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wraps
+from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
+from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
-from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -83,7 +83,7 @@ def simulate(
       transformation
     - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
       reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
-      `WrittenOut`, or where that takes too long to compile (large scenes, JAX transformations) as `Looped`.
+      `UnrolledDopri8`, or where that takes too long to compile (large scenes, JAX transformations) as `LoopDopri8`.
       For forward derivatives give `diffrax.ForwardMode()`: up to about ten parameters they take less time than reverse ones
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
       transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
@@ -105,7 +105,7 @@ def simulate(
     >>> bool(run.settled), round(float(run.omega), 2)      # caught just below the resonance at 28.1 rad/s
     (True, 27.41)
 
-    Source: the antiphase paper, section 5.3; for the method `WrittenOut`.
+    Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
@@ -124,7 +124,7 @@ def simulate(
     known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if solver is None and not known and end.dtype.itemsize >= 8:
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
-        solver = Looped(slopes=isinstance(adjoint, diffrax.ForwardMode))
+        solver = LoopDopri8(slopes=isinstance(adjoint, diffrax.ForwardMode))
 
     def run(control: StepControl) -> Run:
         chosen = control if controller is None else controller
@@ -206,8 +206,8 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
     if control.steps is not None:
         known = known & (control.steps != coarser.steps)
     ours, theirs = fine.window.state, coarse.window.state
-    theirs = turned(theirs, ours) if wraps(scene, fine.error.dtype)[0] else theirs
-    error = distance(ours, theirs, scales(ours, natural_units(scene))) * _shrink(control, coarser)
+    theirs = turned(theirs, ours) if wrap_angles(scene, fine.error.dtype)[0] else theirs
+    error = scaled_error(ours, theirs, error_scale(ours, natural_units(scene))) * _shrink(control, coarser)
     error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
     return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
@@ -292,7 +292,7 @@ def whole_turns(scene: Scene, stretch: float) -> float:
 def last_state(scene: Scene, run: Run) -> State:
     """Where a run under a constant speed ended, as a state to go on from: angles within a turn keep their digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), run.window.state)
-    _, together = wraps(scene, last.displacement.dtype)
+    _, together = wrap_angles(scene, last.displacement.dtype)
     first = np.ravel(last.angle[0])[0]
     inside = tuple(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi)) for x in last.angle)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))

@@ -1,4 +1,4 @@
-"""A vector field and a state in the form in which they are integrated fastest: as single numbers, where there are few."""
+"""A vector field and a state in the form in which they are integrated fastest: as single numbers, where it is small."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from jax import Array
 from jax.extend import core
 
 from jaxvib.equations.dynamics import Dynamics, State
-from jaxvib.ode.dopri8 import WrittenOut
-from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
 
-__all__ = ["Motion"]
+__all__ = ["PackedSystem"]
 
 _TURN = 2.0 * math.pi
 
@@ -26,7 +26,7 @@ _MOST_WRITTEN = 8
 """With more numbers in a state, the method's stages written out one after another take too long to compile as well."""
 
 
-class Motion(eqx.Module):
+class PackedSystem(eqx.Module):
     """Translates between a `State` and what the integrator holds: a tuple of numbers, or the state itself where it is large.
 
     Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
@@ -55,13 +55,13 @@ class Motion(eqx.Module):
         self.args, self.program = field, None
         if self.size <= MOST_NUMBERS:
             self.program = program_on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
-        if self.few:
+        if self.is_scalarized:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
             self.args = numbers_of(field)
 
     @property
-    def few(self) -> bool:
-        """Whether numbers are held."""
+    def is_scalarized(self) -> bool:
+        """Whether the state is held as single numbers."""
         return self.program is not None
 
     @property
@@ -71,20 +71,20 @@ class Motion(eqx.Module):
 
     def rates(self, t: Array, state: State) -> State:
         """The equations of motion on a state, by what the integrator holds: under `vmap` many times faster than the field."""
-        y = tuple(numbers_of(state)) if self.few else state
+        y = tuple(numbers_of(state)) if self.is_scalarized else state
         return self._state(self._plain_rates(t, y, self.args))
 
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
         wrap = self._wrap if self.wrapped else None
-        return WrittenOut(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else Looped(wrap=wrap)
+        return UnrolledDopri8(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else LoopDopri8(wrap=wrap)
 
-    def held(self, state: State) -> Any:
+    def pack(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""
-        y = tuple(numbers_of(state)) if self.few else state
+        y = tuple(numbers_of(state)) if self.is_scalarized else state
         return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
-    def states(self, held: Any) -> State:
+    def unpack(self, held: Any) -> State:
         """States along a leading axis, from what the integrator held then; wrapped angles count from the first one's turn."""
         if not self.wrapped:
             return self._state(held)
@@ -113,7 +113,7 @@ class Motion(eqx.Module):
             self.like, [range(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
         )
         leaves = jax.tree.unflatten(self.like, range(len(self.shapes)))
-        chosen = numbered if self.few else jax.tree.map(lambda k: [k], leaves)
+        chosen = numbered if self.is_scalarized else jax.tree.map(lambda k: [k], leaves)
         rotor = [] if chosen.rotor is None else [chosen.rotor[0]]
         return [place for places in (*chosen.angle, *rotor) for place in places]
 
@@ -131,7 +131,7 @@ class Motion(eqx.Module):
         return jax.tree.unflatten(rest, leaves)
 
     def _state(self, y: Any) -> State:
-        if not self.few:
+        if not self.is_scalarized:
             return y
         rows = iter(y)
         parts = []

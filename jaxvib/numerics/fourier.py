@@ -17,18 +17,18 @@ class Grid(NamedTuple):
     has even harmonics only and the point e of the loads odd ones.
 
     **Attributes** (M points): `symmetric` whether it is half a period; `theta` (M,); `first`, `second` (M, M) d/dtheta and
-    d^2/dtheta^2 of psi; `lag_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `lag_weights` (J,): psi has the
-    harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times cos
-    and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis` (M, K)
-    and `synthesis` (K, M) complex: e_k = sum_l e_l analysis_lk, e_l = Re sum_k e_k synthesis_kl.
+    d^2/dtheta^2 of psi; `deviation_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `deviation_weights` (J,): psi
+    has the harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times
+    cos and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis`
+    (M, K) and `synthesis` (K, M) complex: e_k = sum_l e_l analysis_lk, e_l = Re sum_k e_k synthesis_kl.
     """
 
     symmetric: bool
     theta: np.ndarray
     first: np.ndarray
     second: np.ndarray
-    lag_orders: np.ndarray
-    lag_weights: np.ndarray
+    deviation_orders: np.ndarray
+    deviation_weights: np.ndarray
     orders: np.ndarray
     cosine: np.ndarray
     sine: np.ndarray
@@ -47,19 +47,19 @@ def grid_of(points: int, symmetric: bool) -> Grid:
     turn = np.pi if symmetric else 2.0 * np.pi
     theta = turn * np.arange(m) / m
     if symmetric:
-        lag_orders, orders = np.arange(0, m + 1, 2), np.arange(1, m, 2)
-        weights = np.where((lag_orders == 0) | (lag_orders == m), 1.0, 2.0)
+        deviation_orders, orders = np.arange(0, m + 1, 2), np.arange(1, m, 2)
+        weights = np.where((deviation_orders == 0) | (deviation_orders == m), 1.0, 2.0)
     else:
-        lag_orders, orders = np.arange(0, (m + 1) // 2), np.arange(1, (m + 1) // 2)
-        weights = np.where(lag_orders == 0, 1.0, 2.0)
+        deviation_orders, orders = np.arange(0, (m + 1) // 2), np.arange(1, (m + 1) // 2)
+        weights = np.where(deviation_orders == 0, 1.0, 2.0)
     apart = theta[:, None] - theta[None, :]
-    phase = lag_orders[:, None, None] * apart
-    first = np.tensordot(weights * -lag_orders, np.sin(phase), 1) / m
-    second = np.tensordot(weights * -(lag_orders**2), np.cos(phase), 1) / m
+    phase = deviation_orders[:, None, None] * apart
+    first = np.tensordot(weights * -deviation_orders, np.sin(phase), 1) / m
+    second = np.tensordot(weights * -(deviation_orders**2), np.cos(phase), 1) / m
     distance = orders * (turn / m * np.arange(1 - m, m))[:, None]
     index = np.arange(m)
     return Grid(
-        symmetric, theta, first, second, lag_orders, weights, orders,
+        symmetric, theta, first, second, deviation_orders, weights, orders,
         2.0 / m * np.cos(distance), 2.0 / m * np.sin(distance), index[:, None] - index[None, :] + m - 1,
         2.0 / m * np.exp(-1j * orders * theta[:, None]), np.exp(1j * orders[:, None] * theta),
     )  # fmt: skip

@@ -10,26 +10,26 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["VECTOR", "flat_slopes", "in_all_directions", "in_lanes"]
+__all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
 
 VECTOR = 8
 """Directions are filled up to a multiple of this: what a processor works on at a time."""
 
-Slopes = Any
+Tangents = Any
 """A tree like that of values, its arrays with a last axis over directions; None where a slope is 0 in all of them."""
 
 
-def in_all_directions(function: Callable[[Any], Any], beside: Callable[[Any, Slopes], Any]) -> Callable[[Any], Any]:
+def multi_tangent_jvp(function: Callable[[Any], Any], beside: Callable[[Any, Tangents], Any]) -> Callable[[Any], Any]:
     """`function` with forward derivatives by `beside`, and no reverse ones.
 
     Under `jacfwd` JAX maps the derivative in one direction over all of them, and puts the axis of the directions before all
     others. Here `beside` is called once for all directions instead, which lie along a last axis: every number of the program
     becomes a vector of directions, contiguous in memory.
 
-    **Arguments**: `beside(x, slopes)`: `function(x)` and its slopes, `slopes` and the slopes as `Slopes`.
+    **Arguments**: `beside(x, slopes)`: `function(x)` and its slopes, `slopes` and the slopes as `Tangents`.
 
     >>> import jax, jax.numpy as jnp
-    >>> square = in_all_directions(lambda x: x**2, lambda x, slope: (x**2, 2.0 * x[:, None] * slope))
+    >>> square = multi_tangent_jvp(lambda x: x**2, lambda x, slope: (x**2, 2.0 * x[:, None] * slope))
     >>> jax.jacfwd(square)(jnp.asarray([1.0, 3.0])).tolist()
     [[2.0, 0.0], [0.0, 6.0]]
     """
@@ -41,7 +41,7 @@ def in_all_directions(function: Callable[[Any], Any], beside: Callable[[Any, Slo
     @call.def_jvp
     def _(primals: Any, tangents: Any) -> Any:
         leaves, rest = jax.tree.flatten(primals[0])
-        slopes = flat_slopes(tangents[0], primals[0])
+        slopes = flat_tangents(tangents[0], primals[0])
         arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
         places = [k for k, slope in enumerate(slopes) if slope is not None]
 
@@ -57,7 +57,7 @@ def in_all_directions(function: Callable[[Any], Any], beside: Callable[[Any, Slo
     return call
 
 
-def in_lanes(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+def batch_last(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
     """`function`, mapped over a batch by `beside`; with derivatives of every kind, in which it is mapped as JAX does it.
 
     JAX puts the batch before all other axes of what a loop carries. `beside` may keep it as the last one, where every number of
@@ -67,7 +67,7 @@ def in_lanes(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]) 
     that are True in the tree `mapped`, and of all arrays of the result.
 
     >>> import jax, jax.numpy as jnp
-    >>> total = in_lanes(jnp.sum, lambda x, mapped: jnp.sum(x, axis=0))
+    >>> total = batch_last(jnp.sum, lambda x, mapped: jnp.sum(x, axis=0))
     >>> jax.vmap(total)(jnp.asarray([[1.0, 2.0], [3.0, 4.0]])).tolist()
     [3.0, 7.0]
     """
@@ -99,8 +99,8 @@ def in_lanes(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]) 
     return call
 
 
-def flat_slopes(slopes: Slopes, like: Any) -> list[Array | None]:
-    """Slopes of the leaves of `like`, in order."""
+def flat_tangents(slopes: Tangents, like: Any) -> list[Array | None]:
+    """Tangents of the leaves of `like`, in order."""
     return jax.tree.structure(like).flatten_up_to(slopes)  # pyright: ignore[reportAttributeAccessIssue]
 
 

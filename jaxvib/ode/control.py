@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import optimistix
 from jax import Array
 
-__all__ = ["Around", "Tolerance"]
+__all__ = ["PIController", "WrappedController"]
 
 
-class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
+class PIController(diffrax.AbstractAdaptiveStepSizeController):
     """Chooses steps whose error, in each part of the state's own unit, stays below a tolerance.
 
         e = max |error| / (tolerance (unit + relative |y|)),    next step = 0.9 e_before^(1/16) / e^(3/32) times this one
@@ -45,7 +45,7 @@ class Tolerance(diffrax.AbstractAdaptiveStepSizeController):
         """As `rtol`."""
         return optimistix.rms_norm
 
-    def wrap(self, direction: Any) -> Tolerance:
+    def wrap(self, direction: Any) -> PIController:
         """Time runs forward only."""
         return self
 
@@ -84,7 +84,7 @@ def moved_on(keep: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
     return diffrax.RESULTS.where(keep | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 
 
-class Around(diffrax.AbstractAdaptiveStepSizeController):
+class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
     """A controller around another one, whose tolerances it has for implicit methods."""
 
     controller: eqx.AbstractVar[Any]

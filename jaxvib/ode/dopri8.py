@@ -12,7 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["ERROR", "NODES", "ROWS", "Between", "Prince8", "WrittenOut", "heard", "mixed", "packed", "unpacked"]
+__all__ = [
+    "ERROR",
+    "NODES",
+    "ROWS",
+    "AbstractDopri8",
+    "Dopri8Interpolation",
+    "UnrolledDopri8",
+    "dense_stages",
+    "linear_combination",
+    "ravel",
+    "unravel",
+]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _COEFFICIENTS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
@@ -29,13 +40,13 @@ ERROR = np.asarray(_TABLEAU.b_error)
 """With what weights stages make the error of the step."""
 
 
-def packed(tree: Any, directions: int = 0) -> Array:
+def ravel(tree: Any, directions: int = 0) -> Array:
     """The numbers of a tree as a vector (n,), or (n, directions) where there is that last axis."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 
-def unpacked(flat: Array, like: Any) -> Any:
-    """The inverse of `packed`; `like` tells structure and shapes."""
+def unravel(flat: Array, like: Any) -> Any:
+    """The inverse of `ravel`; `like` tells structure and shapes."""
     leaves, rest = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
@@ -45,12 +56,12 @@ def unpacked(flat: Array, like: Any) -> Any:
     return jax.tree.unflatten(rest, parts)
 
 
-def heard(stages: Array) -> Array:
+def dense_stages(stages: Array) -> Array:
     """Those stages that states within a step are made of, (10, ...): the first, and from the sixth on all."""
     return jnp.concatenate([stages[:1], stages[_LATE:]])
 
 
-def mixed(weights: Array, stages: Array) -> Array:
+def linear_combination(weights: Array, stages: Array) -> Array:
     """sum_j weights_j stages_j; weights (..., stages), stages (stages, ...).
 
     As a product XLA computes it once, and in vectors; a sum that is written out it computes anew for each number that is taken
@@ -59,10 +70,10 @@ def mixed(weights: Array, stages: Array) -> Array:
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
 
-class Between(diffrax.AbstractLocalInterpolation):
+class Dopri8Interpolation(diffrax.AbstractLocalInterpolation):
     """The motion within a step: y0 + (t - t0) sum_j w_j(s) k_j, s the share of the step that is done, k_j the stages' rates.
 
-    The polynomials w_j are diffrax's; `stages` is (10, n), see `heard` and `packed`.
+    The polynomials w_j are diffrax's; `stages` is (10, n), see `dense_stages` and `ravel`.
     """
 
     t0: Any
@@ -83,10 +94,10 @@ class Between(diffrax.AbstractLocalInterpolation):
 
     def moved(self, weights: Array) -> Any:
         """y0 + sum_j weights_j k_j."""
-        return jax.tree.map(lambda y, change: y + change, self.y0, unpacked(mixed(weights, self.stages), self.y0))
+        return jax.tree.map(lambda y, change: y + change, self.y0, unravel(linear_combination(weights, self.stages), self.y0))
 
 
-class Prince8(diffrax.AbstractAdaptiveSolver):
+class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
     """What the forms of Dormand and Prince's pair share: all but the step, and what finds states within one."""
 
     wrap: Callable[[Any], Any] | None = None
@@ -106,14 +117,14 @@ class Prince8(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
 
-class WrittenOut(Prince8):
+class UnrolledDopri8(AbstractDopri8):
     """Dormand and Prince's pair of order 8(7), its 13 stages written out one after another.
 
     The same numbers as `diffrax.Dopri8`, in another form: no loop over stages, no arrays of stages, so that a small time loop
     compiles into one piece of code; and a fence after each stage, without which XLA's fusion computes each stage anew for
     each use of it (a step of 900 multiplications becomes one of 4500).
 
-    Compiling takes longer than for `Looped`, several times as long where derivatives are taken.
+    Compiling takes longer than for `LoopDopri8`, several times as long where derivatives are taken.
 
     **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them; the fence is then
     a division by a 1 that the compiler cannot know, otherwise a detour through memory that costs less for single numbers;
@@ -121,7 +132,7 @@ class WrittenOut(Prince8):
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
-    >>> solution = diffrax.diffeqsolve(diffrax.ODETerm(lambda t, y, args: (y[1], -y[0])), WrittenOut(), 0.0, 10.0, 0.1,
+    >>> solution = diffrax.diffeqsolve(diffrax.ODETerm(lambda t, y, args: (y[1], -y[0])), UnrolledDopri8(), 0.0, 10.0, 0.1,
     ...                                (jnp.asarray(1.0), jnp.asarray(0.0)))
     >>> bool(abs(solution.ys[0][0] - jnp.cos(10.0)) < 1e-11)
     True
@@ -130,7 +141,7 @@ class WrittenOut(Prince8):
     """
 
     lanes: bool = eqx.field(static=True, default=False)
-    interpolation_cls: ClassVar[Callable[..., Any]] = Between
+    interpolation_cls: ClassVar[Callable[..., Any]] = Dopri8Interpolation
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
@@ -143,11 +154,11 @@ class WrittenOut(Prince8):
         stages = [first]
         y = y0
         for row, c in zip(ROWS, NODES, strict=True):
-            y = fence(_moved(y0, dt, row[: len(stages)], stages))
+            y = fence(_stage_state(y0, dt, row[: len(stages)], stages))
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
         end = y if self.wrap is None else self.wrap(y)
-        inside = dict(y0=y0, stages=heard(jnp.stack([packed(k) for k in stages])))
+        inside = dict(y0=y0, stages=dense_stages(jnp.stack([ravel(k) for k in stages])))
         return end, error, inside, stages[-1], diffrax.RESULTS.successful
 
 
@@ -160,7 +171,7 @@ def _weighted(weights: Any, values: Any) -> Array:
     return total
 
 
-def _moved(y0: Any, dt: Array, weights: Any, stages: list[Any]) -> Any:
+def _stage_state(y0: Any, dt: Array, weights: Any, stages: list[Any]) -> Any:
     return jax.tree.map(lambda y, *k: y + dt * _weighted(weights, k), y0, *stages)
 
 

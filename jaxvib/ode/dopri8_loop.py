@@ -14,28 +14,38 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxvib.ode.batching import flat_slopes, in_all_directions, in_lanes
-from jaxvib.ode.dopri8 import ERROR, NODES, ROWS, Between, Prince8, heard, mixed, packed, unpacked
+from jaxvib.ode.batching import batch_last, flat_tangents, multi_tangent_jvp
+from jaxvib.ode.dopri8 import (
+    ERROR,
+    NODES,
+    ROWS,
+    AbstractDopri8,
+    Dopri8Interpolation,
+    dense_stages,
+    linear_combination,
+    ravel,
+    unravel,
+)
 
-__all__ = ["Looped"]
+__all__ = ["LoopDopri8"]
 
 
-class Looped(Prince8):
-    """The same method as `WrittenOut` with a loop over its stages: compiled in a fraction of the time, also with derivatives.
+class LoopDopri8(AbstractDopri8):
+    """The same method as `UnrolledDopri8` with a loop over its stages, which compiles in a fraction of the time.
 
     **Arguments**: `slopes` whether forward derivatives are taken (and reverse ones never): those of a step are then computed
-    beside it in all directions at once, eight of them for not much more than one costs; `wrap` as in `WrittenOut`.
+    beside it in all directions at once, eight of them for not much more than one costs; `wrap` as in `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
     >>> def end(rate):
     ...     term = diffrax.ODETerm(lambda t, y, rate: -rate * y)
-    ...     return diffrax.diffeqsolve(term, Looped(slopes=True), 0.0, 2.0, 0.1, jnp.asarray(1.0), rate,
+    ...     return diffrax.diffeqsolve(term, LoopDopri8(slopes=True), 0.0, 2.0, 0.1, jnp.asarray(1.0), rate,
     ...                                adjoint=diffrax.ForwardMode()).ys[0]
     >>> bool(abs(jax.jacfwd(end)(0.5) + 2.0 * jnp.exp(-1.0)) < 1e-12)
     True
 
-    Source: as `WrittenOut`.
+    Source: as `UnrolledDopri8`.
     """
 
     slopes: bool = eqx.field(static=True, default=False)
@@ -43,47 +53,50 @@ class Looped(Prince8):
     @property
     def interpolation_cls(self) -> Callable[..., Any]:  # pyright: ignore
         """What finds states within a step."""
-        return _BESIDE if self.slopes else _ALONE
+        return _WITH_TANGENTS if self.slopes else _WITHOUT_TANGENTS
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
-        """As `WrittenOut.step`."""
+        """As `UnrolledDopri8.step`."""
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        advance = in_all_directions(_advanced, _advance_beside) if self.slopes else _advanced
+        advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.slopes else _advanced
         end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
         end = end if self.wrap is None else self.wrap(end)
-        return end, error, dict(y0=y0, stages=heard(stages)), last, diffrax.RESULTS.successful
+        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
 
 
-def _mixed(inputs: tuple[Array, Array]) -> Array:
-    return mixed(*inputs)
+def _linear_combination(inputs: tuple[Array, Array]) -> Array:
+    return linear_combination(*inputs)
 
 
-def _mixed_beside(inputs: tuple[Array, Array], slopes: Any) -> tuple[Array, Array]:
+def _linear_combination_jvp(inputs: tuple[Array, Array], slopes: Any) -> tuple[Array, Array]:
     (weights, stages), (moved, bent) = inputs, slopes
-    parts = [] if moved is None else [mixed(moved.T, stages).T]
-    parts += [] if bent is None else [mixed(weights, bent)]
-    return mixed(weights, stages), sum(parts[1:], parts[0])
+    parts = [] if moved is None else [linear_combination(moved.T, stages).T]
+    parts += [] if bent is None else [linear_combination(weights, bent)]
+    return linear_combination(weights, stages), sum(parts[1:], parts[0])
 
 
-def _mixed_in_lanes(inputs: tuple[Array, Array], mapped: tuple[bool, bool]) -> Array:
+def _linear_combination_batched(inputs: tuple[Array, Array], mapped: tuple[bool, bool]) -> Array:
     weights, stages = (x if along else x[..., None] for x, along in zip(inputs, mapped, strict=True))
     return functools.reduce(operator.add, (w * k for w, k in zip(weights[:, None, :], stages, strict=True)))
 
 
-class _Inside(Between):
-    """As `Between`, with derivatives and batches of its own kind."""
+class _BatchedInterpolation(Dopri8Interpolation):
+    """As `Dopri8Interpolation`, with derivatives and batches of its own kind."""
 
     mix: Callable[[tuple[Array, Any]], Array] = eqx.field(static=True)
 
     def moved(self, weights: Array) -> Any:
-        """As `Between.moved`."""
-        return jax.tree.map(lambda y, more: y + more, self.y0, unpacked(self.mix((weights, self.stages)), self.y0))
+        """As `Dopri8Interpolation.moved`."""
+        return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.mix((weights, self.stages)), self.y0))
 
 
-_ALONE = functools.partial(_Inside, mix=in_lanes(_mixed, _mixed_in_lanes))
-_BESIDE = functools.partial(_Inside, mix=in_all_directions(in_lanes(_mixed, _mixed_in_lanes), _mixed_beside))
+_WITHOUT_TANGENTS = functools.partial(_BatchedInterpolation, mix=batch_last(_linear_combination, _linear_combination_batched))
+_WITH_TANGENTS = functools.partial(
+    _BatchedInterpolation,
+    mix=multi_tangent_jvp(batch_last(_linear_combination, _linear_combination_batched), _linear_combination_jvp),
+)
 
 
 def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
@@ -91,25 +104,25 @@ def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
     t0, dt, y0, first, args, terms = inputs
 
     def rates(share: Array, y: Array) -> Array:
-        return packed(terms.vf(t0 + share * dt, unpacked(y, y0), args))
+        return ravel(terms.vf(t0 + share * dt, unravel(y, y0), args))
 
-    end, stages, error = _stages(packed(y0), packed(first), rates, lambda total: dt * total, dt)
-    return _told(end, stages, error, y0)
+    end, stages, error = _stages(ravel(y0), ravel(first), rates, lambda total: dt * total, dt)
+    return _unpack_result(end, stages, error, y0)
 
 
-def _advance_in_lanes(inputs: Any, mapped: Any) -> Any:
+def _advance_batched(inputs: Any, mapped: Any) -> Any:
     """`_advance` for a batch along a last axis."""
     t0, dt, y0, first, args, terms = inputs
     t0_too, dt_too, y0_too, first_too, *others_too = mapped
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
-    flags = flat_slopes((t0_too, dt_too, *others_too), (t0, dt, args, terms))
+    flags = flat_tangents((t0_too, dt_too, *others_too), (t0, dt, args, terms))
     places = [k for k, along in enumerate(flags) if along]
     like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_too)
     size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, mapped)), strict=True) if along)
 
     def whole(tree: Any, along: Any) -> Array:
         spread = lambda leaf, here: leaf if here else jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))  # noqa: E731
-        return packed(jax.tree.map(spread, tree, along), 1)
+        return ravel(jax.tree.map(spread, tree, along), 1)
 
     def rates(share: Array, y: Array) -> Array:
         def rate(y: Any, moving: list[Array]) -> Any:
@@ -117,23 +130,23 @@ def _advance_in_lanes(inputs: Any, mapped: Any) -> Any:
             t0, dt, args, terms = jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
             return terms.vf(t0 + share * dt, y, args)
 
-        found = jax.vmap(rate, in_axes=-1, out_axes=-1)(unpacked(y, like), [leaves[k] for k in places])
-        return packed(found, 1)
+        found = jax.vmap(rate, in_axes=-1, out_axes=-1)(unravel(y, like), [leaves[k] for k in places])
+        return ravel(found, 1)
 
     dt = dt[None, :] if dt_too else dt
     end, stages, error = _stages(whole(y0, y0_too), whole(first, first_too), rates, lambda total: dt * total, dt)
-    return _told(end, stages, error, like)
+    return _unpack_result(end, stages, error, like)
 
 
-_advanced = in_lanes(_advance, _advance_in_lanes)
+_advanced = batch_last(_advance, _advance_batched)
 
 
-def _advance_beside(inputs: Any, slopes: Any) -> tuple[Any, Any]:
+def _advance_jvp(inputs: Any, slopes: Any) -> tuple[Any, Any]:
     """`_advance` and the slopes of all that."""
     t0, dt, y0, first, args, terms = inputs
     dt0, ddt, dy0, dfirst, *others = slopes
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
-    moves = flat_slopes((dt0, ddt, *others), (t0, dt, args, terms))
+    moves = flat_tangents((dt0, ddt, *others), (t0, dt, args, terms))
     places = [k for k, move in enumerate(moves) if move is not None]
 
     def field(share: Array, y: Any, moving: list[Array]) -> Any:
@@ -142,14 +155,14 @@ def _advance_beside(inputs: Any, slopes: Any) -> tuple[Any, Any]:
         return terms.vf(t0 + share * dt, y, args)
 
     def rates(share: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
-        here = unpacked(pair[0], y0), [leaves[k] for k in places]
-        along = unpacked(pair[1], y0), [moves[k] for k in places]
+        here = unravel(pair[0], y0), [leaves[k] for k in places]
+        along = unravel(pair[1], y0), [moves[k] for k in places]
 
         def slope(direction: Any) -> Any:
             return jax.jvp(lambda y, moving: field(share, y, moving), here, direction)[1]
 
         beside = jax.vmap(slope, in_axes=-1, out_axes=-1)(along)
-        return packed(field(share, *here)), packed(beside, 1)
+        return ravel(field(share, *here)), ravel(beside, 1)
 
     def over_step(pair: tuple[Array, Array]) -> tuple[Array, Array]:
         total, change = pair
@@ -157,12 +170,12 @@ def _advance_beside(inputs: Any, slopes: Any) -> tuple[Any, Any]:
 
     def whole(slopes: Any) -> Array:
         size = jax.tree.leaves((dt0, ddt, dy0, dfirst, others))[0].shape[-1]
-        pairs = zip(flat_slopes(slopes, y0), jax.tree.leaves(y0), strict=True)
-        return packed([jnp.zeros((*leaf.shape, size), leaf.dtype) if slope is None else slope for slope, leaf in pairs], 1)
+        pairs = zip(flat_tangents(slopes, y0), jax.tree.leaves(y0), strict=True)
+        return ravel([jnp.zeros((*leaf.shape, size), leaf.dtype) if slope is None else slope for slope, leaf in pairs], 1)
 
-    starts = (packed(y0), whole(dy0)), (packed(first), whole(dfirst))
+    starts = (ravel(y0), whole(dy0)), (ravel(first), whole(dfirst))
     (end, dend), (stages, dstages), (error, derror) = _stages(*starts, rates, over_step, dt)
-    return _told(end, stages, error, y0), _told(dend, dstages, derror, y0)
+    return _unpack_result(end, stages, error, y0), _unpack_result(dend, dstages, derror, y0)
 
 
 def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[[Any], Any], dt: Array) -> tuple[Any, Any, Any]:
@@ -173,8 +186,8 @@ def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[
     one = lax.stop_gradient(jnp.where(dt >= 0.0, 1.0, dt))
 
     def weighted(known: Any, weights: Any) -> Any:
-        heard = np.flatnonzero(weights) if isinstance(weights, np.ndarray) else range(len(weights))
-        return over_step(jax.tree.map(lambda k: sum(weights[i].astype(k.dtype) * k[i] for i in heard), known))
+        dense_stages = np.flatnonzero(weights) if isinstance(weights, np.ndarray) else range(len(weights))
+        return over_step(jax.tree.map(lambda k: sum(weights[i].astype(k.dtype) * k[i] for i in dense_stages), known))
 
     def moved(known: Any, weights: Any) -> Any:
         return jax.tree.map(lambda start, change: (start + change) / one, y0, weighted(known, weights))
@@ -194,5 +207,5 @@ def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[
     return end, known, weighted(known, ERROR)
 
 
-def _told(end: Array, stages: Array, error: Array, like: Any) -> tuple[Any, Array, Any, Any]:
-    return unpacked(end, like), stages, unpacked(stages[-1], like), unpacked(error, like)
+def _unpack_result(end: Array, stages: Array, error: Array, like: Any) -> tuple[Any, Array, Any, Any]:
+    return unravel(end, like), stages, unravel(stages[-1], like), unravel(error, like)

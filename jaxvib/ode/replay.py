@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.ode.control import Around
+from jaxvib.ode.control import WrappedController
 
 __all__ = ["solve"]
 
@@ -74,7 +74,7 @@ def _once(inputs: Any, controller: Any, *rest: Any) -> diffrax.Solution:
 
 
 @_once.def_fwd
-def _noted(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[diffrax.Solution, Array | None]:
+def _recorded(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[diffrax.Solution, Array | None]:
     """The run, and the times at which its steps end."""
     if isinstance(controller, (diffrax.ConstantStepSize, diffrax.StepTo)):
         return _solve(inputs, controller, diffrax.ForwardMode(), *rest), None
@@ -117,19 +117,19 @@ def _nothing(t: Any, y: Any, args: Any) -> None:
 
 
 def _along(controller: Any, times: Array) -> Any:
-    """The controller that takes the noted steps; where it jumps over kinks of the field, it still does."""
+    """The controller that takes the noted steps; where it jumps over jump_ts of the field, it still does."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, _along(controller.controller, times))
-    return _Noted(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
+    return _RecordedSteps(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
 
 
-class _Noted(Around):
+class _RecordedSteps(WrappedController):
     """Takes the steps that end at `times`."""
 
     controller: Any
     times: Array
 
-    def wrap(self, direction: Any) -> _Noted:
+    def wrap(self, direction: Any) -> _RecordedSteps:
         return self
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk, so that the next process that asks the same question neither traces nor compiles."""
+"""Compiled programs cached on disk, so that the next process that asks the same question neither traces nor compiles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from jax.experimental import serialize_executable
 
 from jaxvib.runtime.cpu import processor
 
-__all__ = ["keep_programs", "kept"]
+__all__ = ["cached", "keep_programs"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -32,7 +32,7 @@ _folder: list[Path] = []
 
 
 def keep_programs(folder: Path | None) -> None:
-    """From now on `kept` functions are looked for in `folder` and written there; None: they are not.
+    """From now on `cached` functions are looked for in `folder` and written there; None: they are not.
 
     JAX's own compilation cache saves compiling, not tracing and lowering, which take as long for a program of this kind.
     Whoever can write to the folder can run code as you: it must be your own.
@@ -40,7 +40,7 @@ def keep_programs(folder: Path | None) -> None:
     _folder[:] = [] if folder is None else [folder]
 
 
-class _Kept(Generic[P, T]):
+class _CachedFunction(Generic[P, T]):
     """`equinox.filter_jit` of a function, whose programs outlive the process where `keep_programs` has named a folder."""
 
     def __init__(self, function: Callable[P, T]):
@@ -138,10 +138,10 @@ def _machine() -> str:
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
 
 
-def kept(function: Callable[P, T]) -> Callable[P, T]:
+def cached(function: Callable[P, T]) -> Callable[P, T]:
     """Compiles a function of pytrees, as `equinox.filter_jit` does, and keeps its programs where a folder is named.
 
     Under a JAX transformation it is just the compiled function. The key holds everything a program depends on: the shapes,
     the static parts of the arguments, the processor, the versions, and when the sources were changed.
     """
-    return _Kept(function)
+    return _CachedFunction(function)

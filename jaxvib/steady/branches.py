@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.runtime.programs import kept
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, fold_points
 from jaxvib.steady.jams.jam import Jam, branch_points
 from jaxvib.steady.jams.picture import picture
@@ -111,7 +111,7 @@ def branches(
     return _branches(scene, top, points, per_side)
 
 
-@kept
+@cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
     crowded, resonances = fold_points(jax.lax.stop_gradient(scene), per_side)
     # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.motion.system import Motion
+from jaxvib.motion.system import PackedSystem
 
 STATIONS = (0.28, 0.25, -0.25, -0.28)
 MASS, ECCENTRICITY, LEAN, GAMMA = 37.0, 2.2e-4, 3e-4, 0.7
@@ -160,8 +160,8 @@ def residual(s, t, state, field):
         elif not planar:
             total += 0.5 * s.machine.transverse_inertia * jnp.sum(v[2:4] ** 2)
         if "moment_imbalance" in kinds:
-            lean, lead = kinds["moment_imbalance"].moment, kinds["moment_imbalance"].angle
-            total += lean * v[-1] * (-jnp.sin(x[-1] + lead) * v[2] + jnp.cos(x[-1] + lead) * v[3])
+            moment, lead = kinds["moment_imbalance"].moment, kinds["moment_imbalance"].angle
+            total += moment * v[-1] * (-jnp.sin(x[-1] + lead) * v[2] + jnp.cos(x[-1] + lead) * v[3])
         if motor:
             total += 0.5 * s.drive.inertia * v[-1] ** 2
         return total
@@ -266,7 +266,7 @@ def test_equations_are_the_same_on_numbers(name):
     """As they are integrated."""
     s = case(name)
     state, t = rotor_state(s, 5), jnp.asarray(0.7)
-    motion = Motion(jv.vector_field(s), state)
+    motion = PackedSystem(jv.vector_field(s), state)
     assert motion.few
     rates = motion.term.vf(t, motion.held(state), motion.args)
     ours = motion.states(jax.tree.map(lambda x: x[None], rates))
@@ -278,7 +278,7 @@ def test_equations_are_the_same_on_numbers(name):
 def test_equations_that_are_many_or_cut_arrays_up_stay_on_arrays(name):
     s = case(name)
     state = rotor_state(s, 5)
-    motion = Motion(jv.vector_field(s), state)
+    motion = PackedSystem(jv.vector_field(s), state)
     assert not motion.few
     assert motion.held(state) is state
 
@@ -299,7 +299,7 @@ def test_published_equations_of_the_rotor():
     """Equation (1) of the paper, written by hand with its own numbers, c2 and b2 as printed."""
     k1, k2, l1, l2, big, a_, c_, m, length, mu = 0.604e6, 0.555e6, 0.165, 0.155, 37.0, 0.479, 0.093, 0.05, 0.08, 1e-2
     c = (k1 + k2, k1 * l1 - k2 * l2, k1 * l1**2 + k2 * l2**2)
-    b, accel, e, lean, gamma = (843.17, -0.47, 10.41), 230.0, 2.2e-4, 1e-3, 0.3
+    b, accel, e, moment, gamma = (843.17, -0.47, 10.41), 230.0, 2.2e-4, 1e-3, 0.3
     s = jv.Scene(
         jv.rotor(
             mass=big,
@@ -313,7 +313,7 @@ def test_published_equations_of_the_rotor():
         ),
         jv.pendulums(count=4, mass=m, radius=length, drag=mu / length**2),
         jv.RunUp(460.0, accel),
-        (jv.Gravity(), jv.StaticImbalance(big * e), jv.MomentImbalance((a_ - c_) * lean, angle=-gamma)),
+        (jv.Gravity(), jv.StaticImbalance(big * e), jv.MomentImbalance((a_ - c_) * moment, angle=-gamma)),
     )
     state, t = rotor_state(s, 5), 1.1
     field = jv.vector_field(s)(jnp.asarray(t), state)
@@ -323,7 +323,7 @@ def test_published_equations_of_the_rotor():
     whole, tilted = big + 4 * m, a_ + m * np.sum(st**2)
     radial, along = df**2 * np.cos(f) + ddf * np.sin(f), df**2 * np.sin(f) - ddf * np.cos(f)
     force = m * length
-    out = (a_ - c_) * lean
+    out = (a_ - c_) * moment
     sine, cosine = np.sin(phi), np.cos(phi)
     lean_sine, lean_cosine = np.sin(phi - gamma), np.cos(phi - gamma)
     rows = [

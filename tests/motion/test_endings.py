@@ -9,8 +9,8 @@ import pytest
 from scenes import published, scene
 
 import jaxvib as jv
-from jaxvib.ode.control import Tolerance
-from jaxvib.ode.dopri8 import WrittenOut
+from jaxvib.ode.control import PIController
+from jaxvib.ode.dopri8 import UnrolledDopri8
 
 
 def test_a_run_that_does_not_finish_says_so():
@@ -69,10 +69,10 @@ def test_a_lane_that_is_not_finite_does_not_keep_the_others_waiting():
 def test_a_motion_without_bound_ends_where_it_has_none():
     """y' = y^2 from 1 has no bound at t = 1."""
     one = jnp.asarray(1.0)
-    controller = Tolerance(tolerance=jnp.asarray(1e-8), unit=(one,), relative=(one,))
+    controller = PIController(tolerance=jnp.asarray(1e-8), unit=(one,), relative=(one,))
     found = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, args: (y[0] ** 2,)),
-        WrittenOut(),
+        UnrolledDopri8(),
         t0=0.0,
         t1=2.0,
         dt0=0.01,

@@ -9,7 +9,7 @@ import numpy as np
 from scenes import published
 
 import jaxvib as jv
-from jaxvib.motion.analysis.distance import distance, scales
+from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
 from jaxvib.motion.integrate import natural_units
 
 
@@ -33,7 +33,7 @@ def nth(tree, k):
 def error_of(given, k, found, exact):
     """What `Ensemble.error` is about, of run k."""
     a, b = nth(found.state, k), nth(exact.state, k)
-    return float(distance(a, b, scales(b, natural_units(make(nth(given, k))[0]))))
+    return float(scaled_error(a, b, error_scale(b, natural_units(make(nth(given, k))[0]))))
 
 
 def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():

@@ -1,4 +1,4 @@
-"""Motion in time against independent engines, energy, leading order; and what a run can do."""
+"""PackedSystem in time against independent engines, energy, leading order; and what a run can do."""
 
 import itertools
 

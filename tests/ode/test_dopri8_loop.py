@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.ode.batching import in_all_directions
-from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.ode.batching import multi_tangent_jvp
+from jaxvib.ode.dopri8_loop import LoopDopri8
 
 POINT = jnp.asarray([0.7, 1.3, 0.2, 0.4, -0.3, 1.9, 0.05, 0.6, 2.5])
 
@@ -30,7 +30,7 @@ def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.F
     control = diffrax.PIDController(rtol=1e-6, atol=1e-6) if adaptive else diffrax.ConstantStepSize()
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(on_arrays if arrays else on_numbers),
-        Looped(slopes=slopes),
+        LoopDopri8(slopes=slopes),
         jnp.zeros(()),
         end,
         0.1 if adaptive else end / 12.0,
@@ -122,6 +122,6 @@ def test_directions_lie_along_the_last_axis_and_fill_vectors():
         return jnp.sin(x), jnp.cos(x)[:, None] * slope
 
     x = jnp.arange(5.0)
-    found = jax.jacfwd(in_all_directions(jnp.sin, beside))(x)
+    found = jax.jacfwd(multi_tangent_jvp(jnp.sin, beside))(x)
     np.testing.assert_allclose(found, np.diag(np.cos(np.arange(5.0))))
     assert shapes[-1] == (5, 8)

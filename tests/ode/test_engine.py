@@ -14,9 +14,9 @@ from scenes import loads, machines, published, scene
 
 import jaxvib as jv
 from jaxvib.motion.integrate import integrate
-from jaxvib.motion.system import Motion
-from jaxvib.ode.dopri8 import WrittenOut
-from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import Unwritten, on_numbers, program_on_numbers
 from jaxvib.ode.sincos import sine_and_cosine
 
@@ -57,10 +57,10 @@ def test_sines_have_exact_derivatives_of_any_order():
 def test_on_numbers_the_equations_are_the_same(machine, load, effects):
     s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
     state, field = some_state(s), jv.vector_field(s)
-    motion = Motion(field, state)
-    assert motion.few
-    rates = motion.term.vf(jnp.asarray(0.3), motion.held(state), motion.args)
-    ours = motion.states(jax.tree.map(lambda x: x[None], rates))
+    motion = PackedSystem(field, state)
+    assert motion.is_scalarized
+    rates = motion.term.vf(jnp.asarray(0.3), motion.pack(state), motion.args)
+    ours = motion.unpack(jax.tree.map(lambda x: x[None], rates))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(field(jnp.asarray(0.3), state)), strict=True):
         np.testing.assert_allclose(a[0], b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
 
@@ -68,7 +68,7 @@ def test_on_numbers_the_equations_are_the_same(machine, load, effects):
 def test_complex_numbers_are_written_in_their_parts():
     """Every operation on complex numbers that has a rule, with real ones among them; a factor i costs no multiplication."""
 
-    def mixed(x, w):
+    def linear_combination(x, w):
         real, imag = x
         z = real + 1j * imag
         chosen = jnp.where(x[0] > 0.0, z * w, jnp.conj(z))
@@ -76,7 +76,9 @@ def test_complex_numbers_are_written_in_their_parts():
 
     x, w = jnp.asarray([0.7, -1.3]), jnp.asarray(0.4 - 0.9j)
     cells = [np.array([*x], dtype=object), np.full((), w, dtype=object)]
-    np.testing.assert_allclose([complex(v) for v in on_numbers(mixed, x, w)(*cells)], mixed(x, w), rtol=1e-14)
+    np.testing.assert_allclose(
+        [complex(v) for v in on_numbers(linear_combination, x, w)(*cells)], linear_combination(x, w), rtol=1e-14
+    )
 
     turned = program_on_numbers(lambda a, b: (1j * (a + 1j * b)).real, x[0], x[1])
     assert turned is not None and [e.primitive.name for e in turned.jaxpr.eqns] == ["neg"]
@@ -107,7 +109,7 @@ def test_a_term_that_is_not_there_is_not_computed():
 # The step
 
 
-@pytest.mark.parametrize("method", [WrittenOut(), WrittenOut(lanes=True), Looped()])
+@pytest.mark.parametrize("method", [UnrolledDopri8(), UnrolledDopri8(lanes=True), LoopDopri8()])
 def test_the_step_is_diffraxs(method):
     """Same method, another form: the same steps to rounding, dense output included."""
     s = published(speed=3.0, eps=0.05).scene()
@@ -275,15 +277,15 @@ def test_wrapping_counts_every_turn():
     s = scene("one_mass", "balls")
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
     for together in (False, True):
-        motion = Motion(jv.vector_field(s), state, wrapped=True, together=together)
+        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, together=together)
         method = motion.method()
-        assert isinstance(method, (Looped, WrittenOut)) and method.wrap is not None
-        held = method.wrap(motion.held(state))
+        assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
+        held = method.wrap(motion.pack(state))
         if not together:
             assert float(jnp.max(jnp.abs(motion._angles(held[0])[0]))) <= np.pi
-        back = motion.states(jax.tree.map(lambda *x: jnp.stack(x), motion.held(state), held))
+        back = motion.unpack(jax.tree.map(lambda *x: jnp.stack(x), motion.pack(state), held))
         np.testing.assert_allclose(back.angle[0], np.stack(2 * [state.angle[0]]), rtol=1e-14)
-        alone = motion.states(jax.tree.map(lambda x: x[None], held))
+        alone = motion.unpack(jax.tree.map(lambda x: x[None], held))
         np.testing.assert_allclose(np.sin(alone.angle[0][0]), np.sin(state.angle[0]), atol=1e-13)
 
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.ode.control import Tolerance
-from jaxvib.ode.dopri8 import WrittenOut
-from jaxvib.ode.dopri8_loop import Looped
+from jaxvib.ode.control import PIController
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.replay import solve
 
 ARGS = (jnp.asarray(0.7), jnp.asarray(1.3))
@@ -40,12 +40,12 @@ def forced(again, jump):
 def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=None, end=300.0, noted=False):
     one = (jnp.ones(()), jnp.ones(()))
     if controller is None:
-        controller = Tolerance(tolerance=jnp.asarray(1e-7), unit=one, relative=one)
+        controller = PIController(tolerance=jnp.asarray(1e-7), unit=one, relative=one)
         if jump:
             controller = diffrax.ClipStepSizeController(controller, jump_ts=jnp.asarray([7.0]))
     solution = solve(
         forced(again, jump),
-        solver or (WrittenOut() if again is rounded else diffrax.Dopri8()),
+        solver or (UnrolledDopri8() if again is rounded else diffrax.Dopri8()),
         end=jnp.asarray(end),
         first_step=None if isinstance(controller, diffrax.StepTo) else jnp.asarray(0.1),
         y0=(jnp.asarray(1.0), jnp.asarray(0.0)),
@@ -89,7 +89,7 @@ def test_steps_end_where_the_field_jumps():
     np.testing.assert_allclose(reverse, forward, atol=1e-10)
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), Looped()])
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), LoopDopri8()])
 def test_every_lane_of_a_batch_has_its_own_steps(solver):
     """Lanes that have come to their end wait for the others in steps of no length; no derivative of theirs may be lost."""
     factors = jnp.asarray([1.0, 3.0])

@@ -15,7 +15,7 @@ from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.loads import Loads
 from jaxvib.units import Number, number
 
-__all__ = ["Effect", "Friction", "Gravity", "MomentImbalance", "StaticImbalance", "Throw"]
+__all__ = ["Effect", "Friction", "Gravity", "Imbalance", "MomentImbalance", "StaticImbalance"]
 
 
 class Friction(NamedTuple):
@@ -37,11 +37,11 @@ class Friction(NamedTuple):
         return self.lever * jnp.abs(reaction)
 
 
-class Throw(NamedTuple):
-    """What is out of balance in a rotor: `static` (across, up) kg m, `lean` about the tilts kg m^2."""
+class Imbalance(NamedTuple):
+    """What is out of balance in a rotor: `static` (across, up) kg m, `moment` about the tilts kg m^2."""
 
     static: tuple[Array, Array]
-    lean: tuple[Array, Array]
+    moment: tuple[Array, Array]
 
 
 class Effect(eqx.Module):
@@ -71,8 +71,8 @@ class Effect(eqx.Module):
         """Friction of each load against the rotor that turns at `speed` under gravity `g`, see `Friction`; or None."""
         return None
 
-    def throw(self, angle: Array) -> Throw | None:
-        """What is out of balance in the rotor at its `angle`, see `Throw`; or None."""
+    def imbalance(self, angle: Array) -> Imbalance | None:
+        """What is out of balance in the rotor at its `angle`, see `Imbalance`; or None."""
         return None
 
     def place(self, carrier: Carrier) -> Array | None:
@@ -88,9 +88,9 @@ class Effect(eqx.Module):
         return None
 
     @property
-    def throws(self) -> bool:
+    def has_imbalance(self) -> bool:
         """Whether the effect puts the rotor out of balance."""
-        return type(self).throw is not Effect.throw
+        return type(self).imbalance is not Effect.imbalance
 
     def load_force(self, loads: Loads, u: tuple[Array, ...]) -> tuple[Array, ...] | None:
         """Generalised force of the potential on each load, by automatic differentiation; None where there is none."""
@@ -155,11 +155,11 @@ class StaticImbalance(Effect):
         self.angle = number(angle, "rad", "effects.static_imbalance.angle")
         self.kind = "static_imbalance"
 
-    def throw(self, angle: Array) -> Throw:
+    def imbalance(self, angle: Array) -> Imbalance:
         """M e (cos, sin) of the heavy side."""
         zero = jnp.zeros_like(self.moment)
         turned = angle + self.angle
-        return Throw((self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)), (zero, zero))
+        return Imbalance((self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)), (zero, zero))
 
 
 class MomentImbalance(Effect):
@@ -187,11 +187,11 @@ class MomentImbalance(Effect):
         self.angle = number(angle, "rad", "effects.moment_imbalance.angle")
         self.kind = "moment_imbalance"
 
-    def throw(self, angle: Array) -> Throw:
-        """(A - C) delta (cos, sin) of the lean."""
+    def imbalance(self, angle: Array) -> Imbalance:
+        """(A - C) delta (cos, sin) of the moment."""
         zero = jnp.zeros_like(self.moment)
         turned = angle + self.angle
-        return Throw((zero, zero), (self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)))
+        return Imbalance((zero, zero), (self.moment * jnp.cos(turned), self.moment * jnp.sin(turned)))
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """A machine that can tilt."""

@@ -32,7 +32,7 @@ class _Support(Effect):
         if self.position is not None:
             if carrier.tilt is None:
                 raise InputError(f"effects.{self.kind}.position", "goes with a rotor that can tilt; name a platform instead")
-            return carrier.port_at(self.position if carrier.seat is None else carrier.seat + self.position)
+            return carrier.port_at(self.position if carrier.cg_offset is None else carrier.cg_offset + self.position)
         if carrier.axes != (1,):
             if self.platform is not None:
                 raise InputError(f"effects.{self.kind}.platform", "goes with machines of platforms; a rotor needs a position")

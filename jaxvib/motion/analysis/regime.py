@@ -201,18 +201,18 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     across, up = loads.position(*(jnp.zeros((loads.count,), phase.dtype),))
     each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
-    thrown = [throw for throw in (effect.throw(origin) for effect in scene.effects) if throw is not None]
-    own = sum((throw.static[0] + 1j * throw.static[1] for throw in thrown), jnp.zeros_like(each[0]))
+    thrown = [imbalance for imbalance in (effect.imbalance(origin) for effect in scene.effects) if imbalance is not None]
+    own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))
     size = jnp.sum(jnp.abs(each))
     left = jnp.abs(jnp.sum(each) + own) / size
     if carrier.tilt is None:
         return left
     stations = jnp.zeros_like(phase) if carrier.stations is None else carrier.stations
-    lean = sum((throw.lean[0] + 1j * throw.lean[1] for throw in thrown), jnp.sum(stations * each))
-    lean = lean if carrier.seat is None else lean + carrier.seat * own
+    moment = sum((imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in thrown), jnp.sum(stations * each))
+    moment = moment if carrier.cg_offset is None else moment + carrier.cg_offset * own
     rows = [jnp.linalg.solve(carrier.mass, row[0]) @ row[0] for row in (carrier.port, carrier.tilt)]
     whole = jnp.sum(jnp.abs(stations * each))
-    return jnp.maximum(left, jnp.abs(lean) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
+    return jnp.maximum(left, jnp.abs(moment) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:

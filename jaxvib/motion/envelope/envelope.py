@@ -24,7 +24,7 @@ from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.ode.control import Around, moved_on
+from jaxvib.ode.control import WrappedController, moved_on
 from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
@@ -39,7 +39,7 @@ _LONGEST = 256
 """Turns of the rotor that the window is long at most, as in `simulate`."""
 
 
-class _Tolerance(Around):
+class _Tolerance(WrappedController):
     """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
 
     controller: Any

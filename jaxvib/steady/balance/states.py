@@ -128,12 +128,12 @@ def _sides(loads: CircularLoads) -> np.ndarray:
 
 def _imbalance(scene: Scene) -> complex:
     """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
-    thrown = [effect.throw(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
+    thrown = [effect.imbalance(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
     static = [complex(*map(float, each.static)) for each in thrown if each is not None]
-    lean = [complex(*map(float, each.lean)) for each in thrown if each is not None]
-    seat = scene.machine.carrier().seat
-    lean += [] if seat is None else [float(seat) * each for each in static]
-    if abs(sum(lean)) > 1e-9 * max(map(abs, lean), default=0.0):
+    moment = [complex(*map(float, each.moment)) for each in thrown if each is not None]
+    cg_offset = scene.machine.carrier().cg_offset
+    moment += [] if cg_offset is None else [float(cg_offset) * each for each in static]
+    if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
         problem = (
             "tilt the rotor: loads at one point cannot cancel a moment imbalance, nor a static one away from them "
             "(it sits at the rotor's mass centre); leave it out, or simulate"

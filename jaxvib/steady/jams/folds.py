@@ -64,10 +64,10 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
     if not any(isinstance(effect, DryFriction) for effect in scene.effects):
         return free
 
-    def left_over(n: Array) -> Array:
+    def residual(n: Array) -> Array:
         return loads.drag_sum() * (n - omega) + light_friction(scene, omega, n) - torque
 
-    return bracketed_root(left_over, omega, free)
+    return bracketed_root(residual, omega, free)
 
 
 def branch_slope(scene: Scene, omega: Array) -> Array:

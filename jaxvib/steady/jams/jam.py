@@ -13,7 +13,7 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.runtime.programs import kept
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, jam_rotor_speed
 from jaxvib.units import traced
 
@@ -141,7 +141,7 @@ def jam_modes(scene: Scene) -> JamModes:
     return _jam_modes(scene)
 
 
-@kept
+@cached
 def _jam_modes(scene: Scene) -> JamModes:
     n = scene.drive.speed
     pieces = branch_pieces(scene)

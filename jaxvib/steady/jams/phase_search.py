@@ -237,7 +237,7 @@ def _phases(parts: Parts, influence: Array, omega: Array, start: Array) -> tuple
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
         return -torques_at(parts, influence, omega, angles) / (parts.drag * (parts.speed - omega))
 
-    scale = jnp.sum(jnp.abs(influence) * parts.throw[:, None] * parts.throw[None, :]) * omega**4 / jnp.min(parts.drag)
+    scale = jnp.sum(jnp.abs(influence) * parts.unbalance[:, None] * parts.unbalance[None, :]) * omega**4 / jnp.min(parts.drag)
     scale = scale / jnp.abs(parts.speed - omega)
 
     def differ(x: Array) -> Array:
@@ -332,7 +332,7 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
         influence, answer = influence_of(parts, w)
         factor, angles, good = _phases(parts, influence, w, start)
         braked = parts._replace(drag=factor * parts.drag)
-        growth = growth_of(braked, w, angles, w**2 * answer @ (parts.throw * jnp.exp(1j * angles)))
+        growth = growth_of(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
@@ -355,14 +355,16 @@ def _load_speeds(parts: Parts) -> np.ndarray:
 
 def _regular(parts: Parts) -> np.ndarray:
     """Regular sets of phases (ns, count): together, and every split into two opposite groups."""
-    n = parts.throw.shape[0]
+    n = parts.unbalance.shape[0]
     splits = range(2 ** min(n - 1, 5))
     return np.array([[np.pi * ((k >> j) & 1) if j < min(n - 1, 5) else 0.0 for j in range(n)] for k in splits])
 
 
 def _equal_loads(parts: Parts) -> list[np.ndarray]:
     """Groups of loads that are alike in every number, by their places."""
-    rows = np.concatenate([parts.shake.real, parts.shake.imag, np.stack([parts.throw, parts.drag, parts.inertia], 1)], axis=1)
+    rows = np.concatenate(
+        [parts.shake.real, parts.shake.imag, np.stack([parts.unbalance, parts.drag, parts.inertia], 1)], axis=1
+    )
     _, which = np.unique(rows, axis=0, return_inverse=True)
     return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]
 

@@ -67,7 +67,7 @@ class Parts(NamedTuple):
     damping: Array
     stiffness: Array
     shake: Array
-    throw: Array
+    unbalance: Array
     drag: Array
     inertia: Array
     speed: Array
@@ -88,7 +88,7 @@ def parts_of(scene: Scene) -> Parts:
         damping=carrier.damping if carrier.gyroscopic is None else carrier.damping + speed * carrier.gyroscopic,
         stiffness=carrier.stiffness,
         shake=jnp.einsum("jka,k->ja", rows, turning(carrier)),
-        throw=each(loads.mass * loads.radius),
+        unbalance=each(loads.mass * loads.radius),
         drag=each(loads.drag * loads.radius**2),
         inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
         speed=speed,
@@ -105,8 +105,8 @@ def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
 def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
     """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
     turned = jnp.exp(1j * phase)
-    coupled = jnp.conj(turned) * (influence @ (parts.throw * turned))
-    return 0.5 * omega**4 * parts.throw * coupled.imag
+    coupled = jnp.conj(turned) * (influence @ (parts.unbalance * turned))
+    return 0.5 * omega**4 * parts.unbalance * coupled.imag
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
@@ -201,7 +201,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     w, angles = balanced(parts, omega, phase)
     influence, answer = influence_of(parts, w)
     torque = torques_at(parts, influence, w, angles)
-    z = w**2 * answer @ (parts.throw * jnp.exp(1j * angles))
+    z = w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles))
     carrier = scene.machine.carrier()
     force = (carrier.bed_stiffness + 1j * w * carrier.bed_damping) @ z
     residual = jnp.max(jnp.abs(parts.drag * (parts.speed - w) + torque)) / jnp.max(parts.drag * parts.speed)
@@ -213,7 +213,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     at_rest = good & (slip < tiny)
     status = PhaseStatus.where(good, PhaseStatus.found, PhaseStatus.not_converged)
     status = PhaseStatus.where(at_rest, PhaseStatus.with_rotor, status)
-    size = jnp.where(parts.throw > 0.0, parts.throw, 1.0) / jnp.min(jnp.diagonal(parts.mass))
+    size = jnp.where(parts.unbalance > 0.0, parts.unbalance, 1.0) / jnp.min(jnp.diagonal(parts.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
     there = good & bounded
@@ -249,7 +249,7 @@ def growth_of(parts: Parts, omega: Array, phase: Array, z: Array) -> Array:
         re, im, re_rate, im_rate = (state[k * nd : (k + 1) * nd] for k in range(4))
         a, rate = state[4 * nd : 4 * nd + loads], state[4 * nd + loads :]
         y, y_rate = re + 1j * im, re_rate + 1j * im_rate
-        shakes = (parts.throw * jnp.exp(1j * a))[:, None] * parts.shake  # (count, nd), S_k P_k exp(i a_k)
+        shakes = (parts.unbalance * jnp.exp(1j * a))[:, None] * parts.shake  # (count, nd), S_k P_k exp(i a_k)
         rest = 2j * omega * y_rate - omega**2 * y
         right = shakes.T @ (omega + rate) ** 2 - parts.mass @ rest
         right = right - parts.damping @ (y_rate + 1j * omega * y) - parts.stiffness @ y

@@ -1,4 +1,4 @@
-"""Periodic motions of collected loads: the carrier eliminated harmonic by harmonic, the load's lag by collocation."""
+"""Periodic motions of collected loads: the carrier eliminated by harmonics, the loads' phase deviation by collocation."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.linalg import small_solve
 
-__all__ = ["Along", "Given", "Harmonics", "Motion", "along", "harmonics_of", "periodic_motion"]
+__all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branch_tangent", "harmonics_of", "periodic_motion"]
 
-Given = Literal["omega", "rotor_speed"]
+Parameter = Literal["omega", "rotor_speed"]
 
 _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
@@ -54,23 +54,23 @@ class _Balance(NamedTuple):
     """The torques on the bodies at the points, per drag and load speed: what is left over (G, M), what it is judged by, and
     what its derivative needs."""
 
-    left_over: Array
+    residual: Array
     scale: Array
     acceleration: Array
     moving: Array
     pull: Array
 
 
-def _balance(scene: Scene, grid: Grid, answer: Array, lag: Array, omega: Array, speed: Array) -> _Balance:
+def _balance(scene: Scene, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
     whole = bodies(scene)
-    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
+    phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = circle(scene, phi)
     along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", whole.unbalance, point) @ grid.analysis)
     acceleration = (along_port @ grid.synthesis).real
     size, unit = whole.unbalance[:, None], (whole.drag * omega)[:, None]
     vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
     torque = load_torque(scene, phi, rate, speed, acceleration)
-    inertia = (whole.inertia * omega**2)[:, None] * (lag @ grid.second.T)
+    inertia = (whole.inertia * omega**2)[:, None] * (deviation @ grid.second.T)
     largest = jnp.max((jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration)) / unit)
     return _Balance(
         (inertia - torque + vibration) / unit,
@@ -81,12 +81,14 @@ def _balance(scene: Scene, grid: Grid, answer: Array, lag: Array, omega: Array, 
     )
 
 
-def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: Array, omega: Array, speed: Array) -> Array:
-    """d left_over / d lag (G M, G M)."""
+def _jacobian(
+    scene: Scene, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+) -> Array:
+    """d residual / d deviation (G M, G M)."""
     whole = bodies(scene)
-    g, m = lag.shape
+    g, m = deviation.shape
     unit = (whole.drag * omega)[:, None]
-    phi, rate = grid.theta[None] + lag, omega * (1.0 + lag @ grid.first.T)
+    phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     by_angle, by_rate, by_acceleration = torque_slopes(scene, phi, rate, speed, balance.acceleration)
     own = (
         (whole.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
@@ -100,17 +102,19 @@ def _jacobian(scene: Scene, grid: Grid, answer: Array, balance: _Balance, lag: A
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
-class Motion(NamedTuple):
-    """A periodic motion on its grid: `lag` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of the torque
-    balance at the points, relative to the torques in it."""
+class PeriodicSolution(NamedTuple):
+    """A periodic motion on its grid: `deviation` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of
+    the torque balance at the points, relative to the torques in it."""
 
-    lag: Array
+    deviation: Array
     omega: Array
     rotor_speed: Array
     residual: Array
 
 
-def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start: Array, lag: Array | None = None) -> Motion:
+def periodic_motion(
+    scene: Scene, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
+) -> PeriodicSolution:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
         I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
@@ -119,21 +123,21 @@ def periodic_motion(scene: Scene, grid: Grid, given: Given, value: Array, start:
 
     at the M points of `grid`, with the index k for harmonics, a the port's acceleration, e the point of a load on the unit
     circle. The unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter
-    starts from, `lag` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
+    starts from, `deviation` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
     residual.
 
     Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
-    if lag is None:
-        lag = jnp.zeros((1 if jammed_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
-    frozen = jax.lax.stop_gradient((start, lag))
+    if deviation is None:
+        deviation = jnp.zeros((1 if jammed_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
+    frozen = jax.lax.stop_gradient((start, deviation))
     psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
     omega, speed = _both(given, value, x)
     found = _balance(scene, grid, _answer(scene, grid, omega, speed), psi, omega, speed)
-    return Motion(psi, omega, speed, jnp.max(jnp.abs(found.left_over)) / found.scale)
+    return PeriodicSolution(psi, omega, speed, jnp.max(jnp.abs(found.residual)) / found.scale)
 
 
-def _both(given: Given, value: Array, x: Array) -> tuple[Array, Array]:
+def _both(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
     """Load speed and rotor speed."""
     return (value, x) if given == "omega" else (x, value)
 
@@ -143,9 +147,9 @@ class _State(NamedTuple):
     is the last one: because it needs no look at where it leads, or because there is no better one (`lost`)."""
 
     steps: Array
-    lag: Array
+    deviation: Array
     x: Array
-    left_over: Array
+    residual: Array
     matrix: Array
     norm: Array
     scale: Array
@@ -156,7 +160,7 @@ class _State(NamedTuple):
 
 @eqx.filter_custom_jvp
 def _newton(
-    scene: Scene, value: Array, start: Array, lag: Array, *, grid: tuple[int, bool], given: Given
+    scene: Scene, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
 ) -> tuple[Array, Array]:
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
@@ -165,22 +169,22 @@ def _newton(
     known = _answer(scene, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
-    def look(steps: Array, lag: Array, x: Array, length: Array) -> _State:
-        left_over, matrix, scale = _linearised(scene, on, given, value, lag, x, known)
-        norm = jnp.sqrt(jnp.mean(left_over[:-1] ** 2))
-        return _State(steps, lag, x, left_over, matrix, norm, scale, length, norm < tiny * scale, no)
+    def look(steps: Array, deviation: Array, x: Array, length: Array) -> _State:
+        residual, matrix, scale = _linearised(scene, on, given, value, deviation, x, known)
+        norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
+        return _State(steps, deviation, x, residual, matrix, norm, scale, length, norm < tiny * scale, no)
 
     def change_of(now: _State) -> tuple[Array, Array]:
         """Newton's step, and the part of it that may be taken."""
-        change = -jnp.linalg.solve(now.matrix, now.left_over)
-        # A lag changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
+        change = -jnp.linalg.solve(now.matrix, now.residual)
+        # A deviation changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
         most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
         if given == "rotor_speed":
             most = jnp.minimum(most, 0.5 * jnp.abs(now.x / change[-1]))
         return change, jnp.minimum(now.length, most)
 
     def moved(now: _State, change: Array, take: Array) -> tuple[Array, Array]:
-        return now.lag + take * change[:-1].reshape(now.lag.shape), now.x + take * change[-1]
+        return now.deviation + take * change[:-1].reshape(now.deviation.shape), now.x + take * change[-1]
 
     def step(now: _State) -> _State:
         change, take = change_of(now)
@@ -195,7 +199,7 @@ def _newton(
         stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
 
-    begin = look(jnp.asarray(0), lag, start, jnp.ones_like(start))
+    begin = look(jnp.asarray(0), deviation, start, jnp.ones_like(start))
     end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
     change, take = change_of(end)
     good = end.settled & ~end.lost
@@ -203,23 +207,23 @@ def _newton(
 
 
 @_newton.def_jvp
-def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Given):
-    scene, value, start, lag = primals
-    lag, x = _newton(scene, value, start, lag, grid=grid, given=given)
+def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
+    scene, value, start, deviation = primals
+    deviation, x = _newton(scene, value, start, deviation, grid=grid, given=given)
     on = grid_of(*grid)
 
     def equations(scene: Scene, value: Array) -> Array:
         omega, speed = _both(given, value, x)
-        left_over = _balance(scene, on, _answer(scene, on, omega, speed), lag, omega, speed).left_over
-        return jnp.append(left_over, 0.0)
+        residual = _balance(scene, on, _answer(scene, on, omega, speed), deviation, omega, speed).residual
+        return jnp.append(residual, 0.0)
 
     push = eqx.filter_jvp(equations, (scene, value), tangents[:2])[1]
-    change = -jnp.linalg.solve(_linearised(scene, on, given, value, lag, x, None)[1], push)
-    return (lag, x), (change[:-1].reshape(lag.shape), change[-1])
+    change = -jnp.linalg.solve(_linearised(scene, on, given, value, deviation, x, None)[1], push)
+    return (deviation, x), (change[:-1].reshape(deviation.shape), change[-1])
 
 
 def _linearised(
-    scene: Scene, grid: Grid, given: Given, value: Array, lag: Array, x: Array, known: Array | None
+    scene: Scene, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
     if known is None:
@@ -227,48 +231,48 @@ def _linearised(
     else:
         answer, by_x = known, jnp.zeros_like(known)
 
-    def left_over(z: Array, answer: Array) -> tuple[Array, _Balance]:
-        found = _balance(scene, grid, answer, lag, *_both(given, value, z))
-        return found.left_over.ravel(), found
+    def residual(z: Array, answer: Array) -> tuple[Array, _Balance]:
+        found = _balance(scene, grid, answer, deviation, *_both(given, value, z))
+        return found.residual.ravel(), found
 
-    at, column, found = jax.jvp(left_over, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
-    matrix = _jacobian(scene, grid, answer, found, lag, *_both(given, value, x))
-    return jnp.append(at, jnp.mean(lag)), _pinned(matrix, column), found.scale
+    at, column, found = jax.jvp(residual, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
+    matrix = _jacobian(scene, grid, answer, found, deviation, *_both(given, value, x))
+    return jnp.append(at, jnp.mean(deviation)), _pinned(matrix, column), found.scale
 
 
-class Along(NamedTuple):
-    """`slope` dn/dOmega of the branch; `speed_error`, relative, of the rotor speed at this load speed and `lag_error`, rad: an
-    estimate of what the number of points leaves."""
+class BranchTangent(NamedTuple):
+    """`slope` dn/dOmega of the branch; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`,
+    rad: an estimate of what the number of points leaves."""
 
     slope: Array
     speed_error: Array
-    lag_error: Array
+    deviation_error: Array
 
 
-def along(scene: Scene, grid: Grid, motion: Motion) -> Along:
+def branch_tangent(scene: Scene, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """How the branch goes on from a periodic motion, and how good the motion is.
 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
-    harmonic of psi for the lag.
+    harmonic of psi for the deviation.
     """
-    lag, omega, speed = motion.lag, motion.omega, motion.rotor_speed
-    _, matrix, _ = _linearised(scene, grid, "omega", omega, lag, speed, None)
+    deviation, omega, speed = motion.deviation, motion.omega, motion.rotor_speed
+    _, matrix, _ = _linearised(scene, grid, "omega", omega, deviation, speed, None)
 
-    def left_over(w: Array) -> Array:
-        return _balance(scene, grid, _answer(scene, grid, w, speed), lag, w, speed).left_over.ravel()
+    def residual(w: Array) -> Array:
+        return _balance(scene, grid, _answer(scene, grid, w, speed), deviation, w, speed).residual.ravel()
 
-    by_omega = jax.jvp(left_over, (omega,), (jnp.ones_like(omega),))[1]
+    by_omega = jax.jvp(residual, (omega,), (jnp.ones_like(omega),))[1]
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
-    lag_k = _lag_harmonics(grid, lag)
-    there = (lag_k @ np.exp(1j * grid.lag_orders[:, None] * fine.theta)).real
-    between = _balance(scene, fine, _answer(scene, fine, omega, speed), there, omega, speed).left_over
-    low = _lag_harmonics(fine, between)[:, : grid.lag_orders.shape[0]]
-    seen = (low @ np.exp(1j * grid.lag_orders[:, None] * grid.theta)).real.ravel()
+    deviation_k = _deviation_harmonics(grid, deviation)
+    there = (deviation_k @ np.exp(1j * grid.deviation_orders[:, None] * fine.theta)).real
+    between = _balance(scene, fine, _answer(scene, fine, omega, speed), there, omega, speed).residual
+    low = _deviation_harmonics(fine, between)[:, : grid.deviation_orders.shape[0]]
+    seen = (low @ np.exp(1j * grid.deviation_orders[:, None] * grid.theta)).real.ravel()
     # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
     slope = jnp.linalg.solve(matrix, -jnp.append(by_omega, 0.0))[-1]
     error = jnp.linalg.solve(matrix, jnp.append(jax.lax.stop_gradient(seen), 0.0))
-    last = jnp.max(lag_k[:, -1].real ** 2 + lag_k[:, -1].imag ** 2)
-    return Along(slope, jnp.abs(error[-1] / speed), jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)))
+    last = jnp.max(deviation_k[:, -1].real ** 2 + deviation_k[:, -1].imag ** 2)
+    return BranchTangent(slope, jnp.abs(error[-1] / speed), jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)))
 
 
 def _pinned(by_lag: Array, by_unknown: Array) -> Array:
@@ -278,32 +282,32 @@ def _pinned(by_lag: Array, by_unknown: Array) -> Array:
     return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
 
 
-def _lag_harmonics(grid: Grid, values: Array) -> Array:
+def _deviation_harmonics(grid: Grid, values: Array) -> Array:
     """(G, J) of values (G, M) at the points."""
     m = grid.theta.shape[0]
-    return values @ (grid.lag_weights / m * np.exp(-1j * grid.lag_orders * grid.theta[:, None]))
+    return values @ (grid.deviation_weights / m * np.exp(-1j * grid.deviation_orders * grid.theta[:, None]))
 
 
 class Harmonics(NamedTuple):
-    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `lag` (G, J) rad; `displacement` (nd, K) m of
-    the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+    """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
+    m of the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
 
-    lag: Array
+    deviation: Array
     displacement: Array
     acceleration: Array
     force: Array
 
 
-def harmonics_of(scene: Scene, grid: Grid, motion: Motion) -> Harmonics:
+def harmonics_of(scene: Scene, grid: Grid, motion: PeriodicSolution) -> Harmonics:
     """The harmonics of psi and of everything that the carrier does."""
     carrier = scene.machine.carrier()
-    point, _ = circle(scene, grid.theta[None] + motion.lag)
+    point, _ = circle(scene, grid.theta[None] + motion.deviation)
     push = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
     answer = receptance(scene, motion.omega, motion.rotor_speed, grid.orders)
     displacement = jnp.einsum("kdp,pk->dk", answer, push)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(
-        _lag_harmonics(grid, motion.lag),
+        _deviation_harmonics(grid, motion.deviation),
         displacement,
         -(carrier.port @ displacement) * w[None] ** 2,
         carrier.bed_stiffness @ displacement + 1j * (carrier.bed_damping @ displacement) * w[None],

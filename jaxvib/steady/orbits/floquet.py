@@ -14,7 +14,7 @@ from jaxvib.equations.collected import bodies, circle, has_half_turn, torque_slo
 from jaxvib.equations.linear import jammed_loads, loaded_mass, natural_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import Grid
-from jaxvib.steady.orbits.collocation import Harmonics, Motion
+from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 
 __all__ = ["Floquet", "floquet", "steps_for"]
 
@@ -66,7 +66,7 @@ class _Coefficients(NamedTuple):
     by_rate: Array
 
 
-def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, steps: int | Array) -> Floquet:
+def floquet(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
     """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
@@ -103,14 +103,14 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     h = turn / steps
 
     def coefficients(theta: Array) -> _Coefficients:
-        lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, theta, k) for k in range(3))
-        phi, rate = theta[None, :, None] + lag, 1.0 + lag1
+        deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, theta, k) for k in range(3))
+        phi, rate = theta[None, :, None] + deviation, 1.0 + deviation1
         point, moving = circle(scene, phi)
         acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
         slopes = jax.vmap(lambda p, r, w, n, a: torque_slopes(scene, p, w * r, n, a), in_axes=-1, out_axes=-1)
         by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
         stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
-        moving2 = -point * lag2[None] - moving * rate[None] ** 2
+        moving2 = -point * deviation2[None] - moving * rate[None] ** 2
         s = share[None, :, None, None]
         unit = whole.inertia[:, None, None] * omega[None, None] ** 2
         by_rate = by_rate * omega[None, None] / unit
@@ -170,13 +170,13 @@ def floquet(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics, step
     # A shift in time: q' and phi' along the orbit itself.
     zero = jnp.zeros((1,), dtype=omega.dtype)
     at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
-    lag, lag1, lag2 = (_signal(grid.lag_orders, harmonics.lag, zero, k) for k in range(3))
-    _, moving = circle(scene, lag)
+    deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, zero, k) for k in range(3))
+    _, moving = circle(scene, deviation)
     along = jnp.concatenate([
-        at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + lag1)[None], axis=1)),
+        at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + deviation1)[None], axis=1)),
         -damped(at1, w, n) - _times(stiffness, at) / w**2,
-        1.0 + lag1,
-        lag2,
+        1.0 + deviation1,
+        deviation2,
     ])[:, 0]  # fmt: skip
     trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
     roots = jnp.linalg.eigvals(rest).T

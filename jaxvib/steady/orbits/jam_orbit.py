@@ -15,7 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.steady.orbits.collocation import Given, along, periodic_motion
+from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
 from jaxvib.units import Number, number, traced
@@ -109,7 +109,7 @@ def jam_orbit(
         start = jnp.where(exists, jam.omega, frozen.drive.speed)
     elif near is not None:
         start = number(near, "rad/s", "near", low=0.0, open_low=True)
-    which: Given = "rotor_speed"
+    which: Parameter = "rotor_speed"
     value = scene.drive.speed
     if omega is not None:
         value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
@@ -160,18 +160,18 @@ def _orbit(
     start: Array,
     exists: Array,
     direction: Array | None,
-    given: Given,
+    given: Parameter,
     points: int,
     steps: int | Array,
     accuracy: float,
     settle: bool = False,
 ) -> Orbit:
     """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
-    lag = None
+    deviation = None
     if settle:
         grid = grid_of(points, has_half_turn(scene))
-        lag = periodic_motion(scene, grid, "omega", start, light_rotor_speed(scene, start)).lag[None]
-    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, lag)
+        deviation = periodic_motion(scene, grid, "omega", start, light_rotor_speed(scene, start)).deviation[None]
+    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, deviation)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
     there = exists
@@ -228,6 +228,8 @@ def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
     def one(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
         there = motion.residual < 4096.0 * jnp.finfo(w.dtype).eps
-        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, along(scene, grid, motion).slope, jnp.nan)
+        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(
+            there, branch_tangent(scene, grid, motion).slope, jnp.nan
+        )
 
     return jax.lax.map(jax.vmap(one), omega)

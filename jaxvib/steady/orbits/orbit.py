@@ -14,7 +14,14 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.collocation import Given, Harmonics, Motion, along, harmonics_of, periodic_motion
+from jaxvib.steady.orbits.collocation import (
+    Harmonics,
+    Parameter,
+    PeriodicSolution,
+    branch_tangent,
+    harmonics_of,
+    periodic_motion,
+)
 from jaxvib.steady.orbits.floquet import Floquet, floquet
 
 __all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
@@ -47,10 +54,10 @@ class Orbit(eqx.Module):
     - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
       Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
       the multiplier that is 1, as computed
-    - `lag_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, of tilts rad, `force_harmonics` (nb, K) N: the c_k; loads
-      that share every number have one lag (G = 1), else each has its own (G = count)
+    - `deviation_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, of tilts rad, `force_harmonics` (nb, K) N: the c_k;
+      loads that share every number have one deviation (G = 1), else each has its own (G = count)
     - `units` (nd,): of the amplitudes, "m" or "rad"
-    - `lag_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
+    - `deviation_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
     """
 
     status: OrbitStatus
@@ -66,11 +73,11 @@ class Orbit(eqx.Module):
     power: Array
     residual: Array
     error: Array
-    lag_harmonics: Array
+    deviation_harmonics: Array
     displacement_harmonics: Array
     force_harmonics: Array
     offsets: Array
-    lag_orders: tuple[int, ...] = eqx.field(static=True)
+    deviation_orders: tuple[int, ...] = eqx.field(static=True)
     orders: tuple[int, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
 
@@ -90,10 +97,10 @@ class Orbit(eqx.Module):
         Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
         the motion.
         """
-        k, j = np.asarray(self.orders), np.asarray(self.lag_orders)
+        k, j = np.asarray(self.orders), np.asarray(self.deviation_orders)
         wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
-        phi = theta + (self.lag_harmonics @ lag_wave).real
-        rate = self.omega * (1.0 + (self.lag_harmonics @ (1j * j * lag_wave)).real)
+        phi = theta + (self.deviation_harmonics @ lag_wave).real
+        rate = self.omega * (1.0 + (self.deviation_harmonics @ (1j * j * lag_wave)).real)
         return (
             (self.displacement_harmonics @ wave).real,
             self.omega * (self.displacement_harmonics @ (1j * k * wave)).real,
@@ -125,49 +132,49 @@ def light_rotor_speed(scene: Scene, omega: Array) -> Array:
     if scene.machine.carrier().gyroscopic is None:
         return jam_rotor_speed(scene, omega)
 
-    def left_over(n: Array) -> Array:
+    def residual(n: Array) -> Array:
         return n - jam_rotor_speed(scene, omega, n)
 
     speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
-    above = jax.vmap(left_over)(speeds) > 0.0
+    above = jax.vmap(residual)(speeds) > 0.0
     first = jnp.maximum(jnp.argmax(above), 1)
-    return bracketed_root(left_over, speeds[first - 1], speeds[first])
+    return bracketed_root(residual, speeds[first - 1], speeds[first])
 
 
 def orbits(
     scene: Scene,
     value: Array,
     start: Array,
-    given: Given,
+    given: Parameter,
     points: int,
     steps: int | Array,
     accuracy: float,
-    lag: Array | None = None,
+    deviation: Array | None = None,
 ) -> tuple[Orbit, Floquet]:
-    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from, `lag`
-    (P, G, M) where psi does.
+    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from,
+    `deviation` (P, G, M) where psi does.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
     grid = grid_of(points, has_half_turn(scene))
 
-    def one(v: Array, s: Array, lag: Array | None) -> tuple[Motion, Harmonics, tuple[Array, ...]]:
-        motion = periodic_motion(scene, grid, given, v, s, lag)
+    def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
+        motion = periodic_motion(scene, grid, given, v, s, deviation)
         harmonics = harmonics_of(scene, grid, motion)
         return motion, harmonics, _measured(scene, grid, motion, harmonics)
 
-    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, lag)
+    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
     growth = floquet(scene, grid, motion, harmonics, steps)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
     largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
 
-    slope, speed_error, lag_error, amplitude, force, power, push = measured
+    slope, speed_error, deviation_error, amplitude, force, power, push = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = motion.residual < 4096.0 * tiny
-    error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), lag_error)
+    error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
     parts = push < 0.0
@@ -195,10 +202,10 @@ def orbits(
         power=or_nan(power),
         residual=motion.residual,
         error=or_nan(error),
-        lag_harmonics=or_nan(harmonics.lag),
+        deviation_harmonics=or_nan(harmonics.deviation),
         displacement_harmonics=or_nan(harmonics.displacement),
         force_harmonics=or_nan(harmonics.force),
-        lag_orders=tuple(map(int, grid.lag_orders)),
+        deviation_orders=tuple(map(int, grid.deviation_orders)),
         orders=tuple(map(int, grid.orders)),
         units=scene.machine.structure().units,
         offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
@@ -206,10 +213,10 @@ def orbits(
     return orbit, growth
 
 
-def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> tuple[Array, ...]:
+def _measured(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
     """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
-    branch = along(scene, grid, motion)
-    phi, rate = grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T)
+    branch = branch_tangent(scene, grid, motion)
+    phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, acceleration, rotor_torque), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
@@ -218,7 +225,7 @@ def _measured(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) ->
     return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
 
 
-def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) -> Array:
+def _least_push(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
@@ -227,7 +234,7 @@ def _least_push(scene: Scene, grid: Grid, motion: Motion, harmonics: Harmonics) 
     loads = jammed_loads(scene)
     if loads.own_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
-    phi, rate = each_load(scene, grid.theta[None] + motion.lag, motion.omega * (1.0 + motion.lag @ grid.first.T))
+    phi, rate = each_load(scene, grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, phi)[1], acceleration)
     needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)

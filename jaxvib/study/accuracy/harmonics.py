@@ -17,7 +17,7 @@ from jaxvib.equations.collected import has_half_turn
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.orbits.collocation import along, periodic_motion
+from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
 from jaxvib.steady.orbits.orbit import light_rotor_speed
 from jaxvib.units import Number, number
 
@@ -77,6 +77,6 @@ def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
 
     def one(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
-        return motion.rotor_speed, along(scene, grid, motion).speed_error
+        return motion.rotor_speed, branch_tangent(scene, grid, motion).speed_error
 
     return jax.vmap(one)(omega)

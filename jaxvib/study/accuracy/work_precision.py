@@ -18,7 +18,7 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.distance import distance, scales, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run
@@ -30,7 +30,7 @@ from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
 from jaxvib.units import Number, count, number
 
-__all__ = ["QUANTITIES", "SOLVERS", "accuracy"]
+__all__ = ["QUANTITIES", "SOLVERS", "work_precision"]
 
 Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
 QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
@@ -54,7 +54,7 @@ _SLOW_PERIODS, _MOST_PERIODS = 20.0, 2000.0
 """The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
 
 
-def accuracy(
+def work_precision(
     scene: Scene,
     quantity: Quantity = "amplitude",
     *,
@@ -96,7 +96,7 @@ def accuracy(
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
-    >>> cost = jv.accuracy(scene, "amplitude", mode=1, tolerances=(1e-6,), solvers=["default"], repeats=1)
+    >>> cost = jv.work_precision(scene, "amplitude", mode=1, tolerances=(1e-6,), solvers=["default"], repeats=1)
     >>> [row.tier for row in cost.rows if row.error < 1e-6][0], cost.reference_error < 1e-9
     ('exact orbit', True)
 
@@ -300,12 +300,12 @@ def _final_state(ask: _Ask, end: float | None) -> Cost:
 
     @functools.cache
     def scale() -> State:
-        return scales(best().window.state, natural_units(ask.scene))
+        return error_scale(best().window.state, natural_units(ask.scene))
 
     def error(run: Run) -> float:
         last, exact = _last(run), _last(best())
         single = run.error.dtype.itemsize < 8  # of its angles whole turns are not known
-        value = float(distance(turned(last, exact) if single else last, exact, scale()))
+        value = float(scaled_error(turned(last, exact) if single else last, exact, scale()))
         return value if np.isfinite(value) else np.inf
 
     rows = _full(ask, initial_state(ask.scene), lambda tolerance: end, error)

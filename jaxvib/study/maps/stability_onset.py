@@ -15,7 +15,7 @@ from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["StabilityMap", "onset", "stability_map"]
+__all__ = ["StabilityMap", "stability_map", "stability_onset"]
 
 
 class StabilityMap(NamedTuple):
@@ -68,7 +68,7 @@ def stability_map(
     )
 
 
-def onset(
+def stability_onset(
     make: Callable[[float], Scene],
     kind: str,
     between: tuple[float, float],
@@ -92,7 +92,7 @@ def onset(
     >>> def machine(eps):
     ...     return jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                             rho=1.0, eps=eps, beta=1.0, speed=2.0).scene()
-    >>> round(onset(machine, "torus", (0.02, 0.05), omega=(0.36, 0.5), points=60, accuracy=0.5), 4)
+    >>> round(stability_onset(machine, "torus", (0.02, 0.05), omega=(0.36, 0.5), points=60, accuracy=0.5), 4)
     0.0398
 
     Source: ours, on the diagrams of `exact_branches`.

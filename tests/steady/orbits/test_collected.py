@@ -61,9 +61,9 @@ def test_gyroscopic_jam_at_a_given_rotor_speed():
 def test_loads_that_differ_take_different_places():
     """The one with the greater drag per unbalance is ahead; loads of one kind named one by one jam as when they are shared."""
     scene = different()
-    lag = jv.jam_orbit(scene, omega=27.0).lag_harmonics[:, 0].real
+    deviation = jv.jam_orbit(scene, omega=27.0).deviation_harmonics[:, 0].real
     ratio = scene.loads.drag * scene.loads.radius / scene.loads.mass
-    assert (lag[0] < lag[1]) == (ratio[0] < ratio[1]) and abs(float(lag[1] - lag[0])) > 0.01
+    assert (deviation[0] < deviation[1]) == (ratio[0] < ratio[1]) and abs(float(deviation[1] - deviation[0])) > 0.01
     machine = scene.machine
     shared, single = (jv.balls(count=2, mass=m, radius=0.1, drag=d) for m, d in ((0.6, 0.7), ([0.6] * 2, [0.7] * 2)))
     one, other = (jv.jam_orbit(jv.Scene(machine, x, scene.drive), omega=27.0) for x in (shared, single))
@@ -78,7 +78,7 @@ def test_gradient_with_gyroscopic_coupling_by_differences():
     @jax.jit
     def f(x):
         motion = periodic_motion(restore(x), grid_of(8, True), "omega", jnp.asarray(135.0), jnp.asarray(140.0))
-        return motion.rotor_speed + motion.lag[0, 1]
+        return motion.rotor_speed + motion.deviation[0, 1]
 
     direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))
     forward = jax.jvp(f, (flat,), (direction,))[1]

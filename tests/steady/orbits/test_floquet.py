@@ -13,7 +13,7 @@ from scenes import machines, published
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
-from jaxvib.study.maps.stability_onset import onset
+from jaxvib.study.maps.stability_onset import stability_onset
 
 
 def gravity():
@@ -116,7 +116,7 @@ def test_figure_of_stability_over_the_load_mass():
 )
 def test_load_mass_from_which_on_odd_modes_are_not_stable_everywhere(kind, between, omega, eps):
     """eps = m/(kappa M2S): self-pins, confirmed by the time integrations above on both sides at eps = 0.3."""
-    found = onset(lambda x: published(eps=x).scene(), kind, between, omega=omega)
+    found = stability_onset(lambda x: published(eps=x).scene(), kind, between, omega=omega)
     np.testing.assert_allclose(found, eps, rtol=4e-3)
 
 

@@ -80,8 +80,8 @@ def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
     assert has_half_turn(alike(dry())) and not has_half_turn(alike(dry(), jv.Gravity()))
     # On a whole period, where the symmetry is not put in, it comes out.
     motion = periodic_motion(alike(dry()), grid_of(33, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
-    lag = np.fft.rfft(motion.lag[0])
-    assert np.max(np.abs(lag[1::2])) < 1e-10 * np.max(np.abs(lag)) and float(motion.residual) < 1e-12
+    deviation = np.fft.rfft(motion.deviation[0])
+    assert np.max(np.abs(deviation[1::2])) < 1e-10 * np.max(np.abs(deviation)) and float(motion.residual) < 1e-12
 
 
 def test_gradient_by_the_coefficient_by_differences():
@@ -91,7 +91,7 @@ def test_gradient_by_the_coefficient_by_differences():
     def f(coefficient):
         scene = alike(dry(coefficient), jv.Gravity())
         motion = periodic_motion(scene, grid_of(17, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
-        return motion.rotor_speed + 1e2 * motion.lag[0, 1]
+        return motion.rotor_speed + 1e2 * motion.deviation[0, 1]
 
     x, h = jnp.asarray(0.1), 1e-5
     forward = jax.jvp(f, (x,), (jnp.ones(()),))[1]

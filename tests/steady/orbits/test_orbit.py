@@ -18,7 +18,7 @@ from scipy.optimize import fsolve
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.collocation import along, periodic_motion
+from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
 
 
 class Shaker(jv.Machine):
@@ -144,7 +144,7 @@ def test_stable_motion_stays_and_unstable_one_leaves():
 def many(scene, omega, points):
     def one(w):
         motion = periodic_motion(scene, grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
-        return motion.rotor_speed, motion.residual, along(scene, grid_of(points, True), motion).speed_error
+        return motion.rotor_speed, motion.residual, branch_tangent(scene, grid_of(points, True), motion).speed_error
 
     return jax.vmap(one)(omega)
 
@@ -186,7 +186,7 @@ def test_light_loads_jam_at_leading_order():
 
 def numbers_of(orbit):
     parts = (orbit.omega, orbit.slope, orbit.amplitude, orbit.foundation_force, orbit.power)
-    parts += (orbit.lag_harmonics[0, 1:3].real, orbit.displacement_harmonics[:, 0].imag)
+    parts += (orbit.deviation_harmonics[0, 1:3].real, orbit.displacement_harmonics[:, 0].imag)
     return jnp.concatenate([jnp.ravel(part) for part in parts])
 
 

@@ -38,13 +38,13 @@ def light():
 @pytest.mark.slow
 def test_runs_are_long_enough_to_forget_their_start():
     """Had they half the time, the square root of the tolerance would be left of the start."""
-    cost = jv.accuracy(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["Tsit5"], repeats=1)
+    cost = jv.work_precision(light(), mode=1, tolerances=(1e-4, 1e-8), solvers=["Tsit5"], repeats=1)
     error = {row.setting: row.error for row in cost.rows if row.tier == "full"}
     assert error.keys() == {"1e-04", "1e-08"} and error["1e-04"] < 3e-4 and error["1e-08"] < 3e-8
 
 
 def test_a_run_does_not_stay_in_an_unstable_jam():
-    cost = jv.accuracy(light(), mode=2, repeats=1)
+    cost = jv.work_precision(light(), mode=2, repeats=1)
     assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
     (reason,) = cost.left_out
     assert reason.startswith("envelope, full: jam mode 2 is unstable (largest Floquet multiplier 2.2")
@@ -54,7 +54,7 @@ def test_a_run_does_not_stay_in_an_unstable_jam():
 def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
     """Nor is it asked how long a run would need to forget its start: less than no time."""
     scene = jv.Scene(light().machine, light().loads, jv.ConstantSpeed("40 rad/s"))
-    cost = jv.accuracy(scene, "gradient", mode=2, repeats=1)
+    cost = jv.work_precision(scene, "gradient", mode=2, repeats=1)
     assert {row.tier for row in cost.rows} == {"leading order", "exact orbit"}
     (reason,) = cost.left_out
     assert reason.startswith("full: jam mode 2 is unstable (largest Floquet multiplier 1.597")
@@ -64,7 +64,7 @@ def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
 def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
     """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
     scene = published(speed=5.19, eps=0.05).scene()
-    cost = jv.accuracy(scene, mode=3, until=30.0, tolerances=(1e-6,), solvers=["Tsit5"], repeats=1)
+    cost = jv.work_precision(scene, mode=3, until=30.0, tolerances=(1e-6,), solvers=["Tsit5"], repeats=1)
     by_tier = {row.tier: row.error for row in cost.rows}
     assert by_tier.keys() == {"exact orbit", "envelope", "full"} and by_tier["full"] < 1e-4 < by_tier["envelope"]
     (reason,) = cost.left_out
@@ -75,7 +75,7 @@ def test_a_run_up_is_measured_at_its_end():
     machine = jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0)
     loads = jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5)
     scene = jv.Scene(machine, loads, jv.RunUp(60.0, 60.0), (jv.StaticImbalance("1 g m"),))
-    cost = jv.accuracy(scene, until=2.0, tolerances=(1e-4, 1e-7), solvers=["Tsit5"], repeats=1)
+    cost = jv.work_precision(scene, until=2.0, tolerances=(1e-4, 1e-7), solvers=["Tsit5"], repeats=1)
     assert [row.setting for row in cost.rows] == ["1e-04", "1e-07"] and {row.method for row in cost.rows} == {"Tsit5"}
     assert cost.reference_error < 1e-9 and cost.rows[1].error < 1e-6 < cost.rows[0].error
     run = jv.simulate(scene, 2.0, tolerance=1e-10, estimate=False)
@@ -84,11 +84,11 @@ def test_a_run_up_is_measured_at_its_end():
     assert exact == "leading order, exact orbit: drive.kind is 'run_up'; a jam is one at a constant speed"
     assert averaged.startswith("envelope: effects.static_imbalance is not averaged")
     with pytest.raises(jv.InputError, match=r"drive\.kind is 'run_up'; a jam is one at a constant speed"):
-        jv.accuracy(scene, mode=1)
+        jv.work_precision(scene, mode=1)
 
 
 def test_a_final_state_is_told_apart_but_for_whole_turns_in_single_precision():
-    cost = jv.accuracy(light(), "final_state", until=20.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
+    cost = jv.work_precision(light(), "final_state", until=20.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
     error = {row.dtype: row.error for row in cost.rows}
     assert error.keys() == {"float64", "float32"} and 0.0 < error["float64"] < 1e-3 and error["float32"] < 0.1
     assert cost.reference_error < 1e-8 and len(cost.reference) == 4
@@ -120,10 +120,10 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
 )
 def test_what_cannot_be_asked_is_refused(asked, message):
     with pytest.raises(jv.InputError, match=message):
-        jv.accuracy(published().scene(), **asked)
+        jv.work_precision(published().scene(), **asked)
 
 
 def test_single_precision_has_nothing_to_be_measured_against():
     scene = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), light())
     with pytest.raises(jv.InputError, match="scene is in single precision; errors are measured against double"):
-        jv.accuracy(scene)
+        jv.work_precision(scene)

@@ -11,10 +11,10 @@ import numpy as np
 from jaxvib.equations.dynamics import State
 from jaxvib.units import traced
 
-__all__ = ["distance", "scales", "turned"]
+__all__ = ["error_scale", "scaled_error", "turned"]
 
 
-def scales(state: State, unit: State) -> State:
+def error_scale(state: State, unit: State) -> State:
     """What differences to a state count relative to, a number for each part of it.
 
     Of displacements and velocities it is the largest of all, but no less than the natural unit: a motion that is at rest has
@@ -38,18 +38,18 @@ def scales(state: State, unit: State) -> State:
     )
 
 
-def distance(a: State, b: State, scale: State) -> Any:
+def scaled_error(a: State, b: State, scale: State) -> Any:
     """The largest difference of two states in all their numbers, each relative to its part's `scale`.
 
     **Arguments**: `a`, `b` states, or stretches of them whose arrays have a leading axis; `scale` a `State` of numbers, see
-    `scales`.
+    `error_scale`.
 
     **Returns** a number, NumPy's where numbers are known; NaN where one of the states is not finite.
 
     >>> import numpy as np, jaxvib as jv
     >>> a, b = (jv.State(np.array([x]), np.zeros(1), (np.array([3.0]),), (np.array([50.0]),)) for x in (2e-3, 1e-3))
     >>> unit = jv.State(1e-4, 5e-3, (1.0,), (50.0,))
-    >>> float(distance(a, b, scales(a, unit))), float(distance(a, b, scales(b, unit)))
+    >>> float(scaled_error(a, b, error_scale(a, unit))), float(scaled_error(a, b, error_scale(b, unit)))
     (0.5, 1.0)
     """
     xp = _library((a, b, scale))
