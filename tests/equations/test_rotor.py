@@ -267,8 +267,8 @@ def test_equations_are_the_same_on_numbers(name):
     s = case(name)
     state, t = rotor_state(s, 5), jnp.asarray(0.7)
     motion = PackedSystem(jv.vector_field(s), state)
-    assert motion.few
-    rates = motion.term.vf(t, motion.held(state), motion.args)
+    assert motion.is_scalarized
+    rates = motion.term.vf(t, motion.pack(state), motion.args)
     ours = motion.states(jax.tree.map(lambda x: x[None], rates))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jv.vector_field(s)(t, state)), strict=True):
         np.testing.assert_allclose(a[0], b, rtol=1e-11, atol=1e-12 * np.max(np.abs(b)))
@@ -279,8 +279,8 @@ def test_equations_that_are_many_or_cut_arrays_up_stay_on_arrays(name):
     s = case(name)
     state = rotor_state(s, 5)
     motion = PackedSystem(jv.vector_field(s), state)
-    assert not motion.few
-    assert motion.held(state) is state
+    assert not motion.is_scalarized
+    assert motion.pack(state) is state
 
 
 @pytest.mark.parametrize("name", CASES)
