@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import loaded_mass
+from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
@@ -175,7 +175,7 @@ def support_frequency_squared() -> Quantity:
     def budget(scene: Scene, _: JamModes) -> Array:
         if not isinstance(scene.machine, Platforms):
             raise InputError("machine.kind", f"is {scene.machine.kind!r}; the budget is that of platforms' supports")
-        return jnp.sum(scene.machine.stiffness / jnp.diagonal(loaded_mass(scene)))
+        return jnp.sum(scene.machine.stiffness / jnp.diagonal(linear_model(scene).mass))
 
     return Quantity("support_frequency_squared", "rad^2/s^2", budget)
 

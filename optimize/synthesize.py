@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
@@ -210,7 +209,7 @@ def synthesize(
     if objective.mode is not None:
         jam_modes(space.scene).select(objective.mode, throw=False)  # says which numbers there are
     tell = progress or (lambda _what, _share: None)
-    if not isinstance(space.scene.drive, ConstantSpeed):
+    if not space.scene.drive.constant:
         raise InputError("drive", f"is {space.scene.drive.kind!r}; a design is sought at one speed, give a ConstantSpeed")
     if space.scene.drive.speed.dtype != jnp.float64:
         raise InputError(

@@ -40,21 +40,39 @@ paper's (1), (2) in general form.
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.equations.linear import _modes, loaded_mass, turning_loads
+from jaxvib.equations.linear import LinearModel, linear_model, turning_loads
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import IdealDrive
-from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.drive import Drive
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import magnitude, small_solve, written_inverse
+from jaxvib.numerics.linalg import magnitude, small_solve, times, written_inverse
 
-__all__ = ["Amplitudes", "Averaged", "amplitudes_of", "averaged_field", "averaged_loads"]
+__all__ = [
+    "Amplitudes",
+    "Averaged",
+    "amplitudes_of",
+    "averaged_field",
+    "averaged_growth",
+    "averaged_loads",
+    "averaged_model",
+    "mean_torque",
+]
 
 _CIRCLE = (1.0, -1.0j)
+
+
+def mean_torque(unbalance: Array, turn: Array, acceleration: Array) -> Array:
+    """-(S/2) Im(conj(e^{i psi}) a), N m: the mean torque of a vibration on a load.
+
+    **Arguments**: `unbalance` S = m R, kg m; `turn` e^{i psi}, the load's phase; `acceleration` a = e^H B A, m/s^2, the forward
+    circular part of the acceleration of the point that carries it. Arrays of one shape.
+    """
+    return -unbalance * (jnp.conj(turn) * acceleration).imag / 2.0
 
 
 class Amplitudes(eqx.Module):
@@ -90,17 +108,17 @@ class Averaged(eqx.Module):
     unbalance: Array
     inertia: Array
     drag: Array
-    drive: IdealDrive
+    drive: Drive
     axes: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, t: Array, state: Amplitudes) -> Amplitudes:
         """The time derivative of `state` at time `t`."""
-        n = self.drive.speed_at(t)
+        n = self.drive.rotor_speed(t, None)
         at = jnp.cos(state.phase) + 1j * jnp.sin(state.phase)
         free = self.drag * (n - state.rate) / self.inertia
-        unforced = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
+        unforced = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            unforced = unforced - n * _times(self.gyroscopic, state.velocity)
+            unforced = unforced - n * times(self.gyroscopic, state.velocity)
 
         circle, levers = self._circle(), self.levers
         push = jnp.sum(self.push * circle, axis=1)
@@ -113,9 +131,9 @@ class Averaged(eqx.Module):
         share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
         alone = jnp.eye(levers.shape[0]) - _product(mobility, jnp.sum(share, axis=-1))
         mirrored = _product(mobility, jnp.sum(share * (at**2)[None, None, :], axis=-1))
-        felt = _with_conjugate(alone, mirrored, _times(listen, unforced) + _times(mobility, pushes(free)))
+        felt = _with_conjugate(alone, mirrored, times(listen, unforced) + times(mobility, pushes(free)))
         felt = jnp.sum(levers * felt[:, None], axis=0)
-        rate = free - self.unbalance * (jnp.conj(at) * felt).imag / (2.0 * self.inertia)
+        rate = free + mean_torque(self.unbalance, at, felt) / self.inertia
         acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
         turn = 1j * jnp.mean(state.rate)
         return Amplitudes(
@@ -127,7 +145,7 @@ class Averaged(eqx.Module):
 
     def ripple(self, state: Amplitudes) -> Array:
         """By how much the dropped torque shakes each load's angle, (count,) rad: S |e^T B i Omega V| / (2 I (2 Omega)^2)."""
-        backward = _times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
+        backward = times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
         backward = jnp.sum(self.levers * backward[:, None], axis=0)
         size = magnitude(backward)
         omega = jnp.abs(jnp.mean(state.rate))
@@ -140,11 +158,15 @@ class Averaged(eqx.Module):
 
 
 def averaged_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where the scene holds nothing that is not averaged here."""
+    """The scene's loads, where the scene holds nothing that is not averaged here.
+
+    **Raises** `InputError`, besides what `turning_loads` refuses, for effects that `has_imbalance` or `couples_loads`.
+    """
     loads = turning_loads(scene)
     for effect in scene.effects:
-        if not isinstance(effect, Gravity):
-            raise InputError(f"effects.{effect.kind}", "is not averaged; leave it out here, or simulate")
+        for name in ("has_imbalance", "couples_loads"):
+            if getattr(effect, name):
+                raise InputError(f"effects.{effect.kind}", f"is not averaged (property {name}); leave it out here, or simulate")
     return loads
 
 
@@ -163,15 +185,20 @@ def averaged_field(scene: Scene) -> Averaged:
     >>> bool(jnp.abs(jv.averaged_field(scene)(0.0, state).rate[0]) < 1e-10)     # a jam is an equilibrium
     True
     """
-    carrier, loads = scene.machine.carrier(), averaged_loads(scene)
-    assert isinstance(scene.drive, IdealDrive)
+    averaged_loads(scene)
+    return averaged_model(linear_model(scene))
+
+
+def averaged_model(model: LinearModel) -> Averaged:
+    """`averaged_field` of a scene that is assembled and checked already."""
+    carrier, loads, drive = model.carrier, turning_loads(model.scene), model.scene.drive
     port, levers = carrier.port[None], jnp.ones((1, loads.count), dtype=carrier.port.dtype)
     if carrier.stations is not None and carrier.tilt is not None:
         port, levers = jnp.stack([carrier.port, carrier.tilt]), jnp.stack([levers[0], carrier.stations])
     n = carrier.mass.shape[0]
     parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
     parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
-    solved = small_solve(loaded_mass(scene), jnp.concatenate(parts, axis=1))
+    solved = small_solve(model.mass, jnp.concatenate(parts, axis=1))
     p = port.shape[0] * port.shape[1]
 
     def each(value: Array) -> Array:
@@ -187,9 +214,35 @@ def averaged_field(scene: Scene) -> Averaged:
         unbalance=each(loads.mass * loads.radius),
         inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
         drag=each(loads.drag * loads.radius**2),
-        drive=scene.drive,
+        drive=drive,
         axes=carrier.axes,
     )
+
+
+def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: Array) -> Array:
+    """Growth of small disturbances of a jam, 1/s: the largest real part of an eigenvalue of the averaged equations about it.
+
+    The common turn of all phases, which nothing restores, is left out. NaN where the jam is not finite.
+
+    **Arguments**: `omega` rad/s; `phase` (count,) rad; `displacement` (nd,) complex, m, as in `Amplitudes`. The drive is one of
+    constant speed.
+    """
+    nd, count = displacement.shape[0], phase.shape[0]
+
+    def flow(x: Array) -> Array:
+        y = x[: 2 * nd] + 1j * x[2 * nd : 4 * nd]
+        change = field(jnp.zeros_like(omega), Amplitudes(y[:nd], y[nd:], x[4 * nd : 4 * nd + count], x[4 * nd + count :]))
+        rates = jnp.concatenate([change.displacement, change.velocity])
+        return jnp.concatenate([rates.real, rates.imag, change.rate, change.phase])
+
+    y = jnp.concatenate([displacement, 1j * omega * displacement])
+    matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase, omega), phase]))
+    # Eigenvalues of a matrix that is not finite keep a library busy for ever.
+    finite = jnp.all(jnp.isfinite(matrix))
+    values = jnp.linalg.eigvals(jnp.where(finite, matrix, 0.0))
+    common = jnp.argmin(jnp.abs(values))
+    growth = jnp.max(jnp.where(jnp.arange(values.shape[0]) == common, -jnp.inf, values.real))
+    return jnp.where(finite, growth, jnp.nan)
 
 
 def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
@@ -200,21 +253,18 @@ def amplitudes_of(scene: Scene, state: State) -> Amplitudes:
     A load's rate is taken for its mean.
     """
     (angle,), (rate,) = state.angle, state.rate
-    frequencies, shapes = _modes(scene)
+    model = linear_model(scene)
+    frequencies, shapes = model.modes()
     omega, theta = jnp.mean(rate), jnp.mean(angle)
     there = frequencies > 0.0
     slow = jnp.abs(omega) < 0.5 * jnp.min(jnp.where(there, frequencies, jnp.inf))
     own = jnp.where(there, 1.0 / jnp.where(there, frequencies, 1.0), 0.0)
-    to_modal = shapes.T @ loaded_mass(scene)
+    to_modal = shapes.T @ model.mass
     turning = jnp.where(slow, 1.0, omega)
     late = jnp.where(slow, shapes @ (own * (to_modal @ state.velocity)), state.velocity / turning)
     soon = jnp.where(slow, shapes @ (frequencies * (to_modal @ state.displacement)), turning * state.displacement)
     back = jnp.exp(-1j * theta)
     return Amplitudes(back * (state.displacement - 1j * late), back * (state.velocity + 1j * soon), rate, angle - theta)
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -228,6 +278,6 @@ def _with_conjugate(a: Array, b: Array, right: Array) -> Array:
         return (jnp.conj(a) * right - b * jnp.conj(right)) / (a.real**2 + a.imag**2 - b.real**2 - b.imag**2)
     top = jnp.concatenate([a.real + b.real, b.imag - a.imag], axis=1)
     bottom = jnp.concatenate([a.imag + b.imag, a.real - b.real], axis=1)
-    x = _times(written_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
+    x = times(written_inverse(jnp.concatenate([top, bottom])), jnp.concatenate([right.real, right.imag]))
     n = right.shape[0]
     return x[:n] + 1j * x[n:]

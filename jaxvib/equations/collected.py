@@ -12,9 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import Gravity
-from jaxvib.machine.effects.contact import LoadContact
-from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 
 __all__ = [
@@ -64,11 +62,8 @@ def bodies(scene: Scene) -> Bodies:
 
 
 def has_half_turn(scene: Scene) -> bool:
-    """Whether the equations stay the same under phi + pi, -q: effects on the loads (gravity) break it.
-
-    Dry friction by itself does not: the radial load N takes the acceleration along the load's direction, and both turn over.
-    """
-    return all(isinstance(effect, DryFriction) for effect in scene.effects)
+    """Whether the equations stay the same under phi + pi, -q: effects on the loads (gravity) break it."""
+    return all(effect.half_turn_symmetric for effect in scene.effects)
 
 
 def each_load(scene: Scene, phi: Points, rate: Array) -> tuple[Array, Array]:
@@ -84,8 +79,8 @@ def rotor_torque(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array)
     """
     loads, u, rates = scene.loads, (jnp.asarray(phi),), (rate,)
     at = dict(zip(scene.machine.structure().axes, a, strict=True))
-    g = sum(effect.g for effect in scene.effects if isinstance(effect, Gravity))
-    found = (effect.friction(loads, u, rates, speed, g) for effect in scene.effects)
+    gravity = total_gravity(scene.effects)
+    found = (effect.friction(loads, u, rates, speed, gravity) for effect in scene.effects)
     torque = loads.resistance(u, rates, speed)[0]
     return sum((friction.torque(at) for friction in found if friction is not None), torque)
 
@@ -93,7 +88,7 @@ def rotor_torque(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array)
 def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
     """What turns loads at angles `phi` besides the vibration, N m: the rotor and effects; `a` as in `rotor_torque`."""
     # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
-    acting = (effect for effect in scene.effects if not isinstance(effect, LoadContact))
+    acting = (effect for effect in scene.effects if not effect.couples_loads)
     forces = (effect.load_force(scene.loads, (jnp.asarray(phi),)) for effect in acting)
     return sum((force[0] for force in forces if force is not None), rotor_torque(scene, phi, rate, speed, a))
 

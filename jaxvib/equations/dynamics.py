@@ -14,10 +14,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.drive import Drive, IdealDrive, Motor
-from jaxvib.machine.effects.base import Effect, Friction, Gravity
+from jaxvib.machine.effects.base import Effect, Friction, total_gravity
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import small_inverse
+from jaxvib.numerics.linalg import small_inverse, times
 
 __all__ = ["Dynamics", "State", "rotor_angle", "rotor_speed", "vector_field"]
 
@@ -116,16 +116,16 @@ class Dynamics(eqx.Module):
 
     def _unforced(self, state: State, speed: Array) -> Array:
         """Accelerations of the carrier without loads and imbalance."""
-        flow = -_times(self.stiffness, state.displacement) - _times(self.damping, state.velocity)
+        flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
-            flow = flow - speed * _times(self.gyroscopic, state.velocity)
+            flow = flow - speed * times(self.gyroscopic, state.velocity)
         for support in self.supports:
-            x, v = _times(support.rows, state.displacement), _times(support.rows, state.velocity)
-            flow = flow - _times(support.push, support.effect.support_force(x, v))
+            x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
+            flow = flow - times(support.push, support.effect.support_force(x, v))
         return flow
 
     def _friction(self, state: State, speed: Array) -> list[Friction]:
-        g = sum(effect.g for effect in self.effects if isinstance(effect, Gravity))
+        g = total_gravity(self.effects)
         found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
         return [_signed(each, {}) if each.normal is None else each for each in found if each is not None]
 
@@ -213,7 +213,7 @@ class Dynamics(eqx.Module):
     def _close(self, weight: list[list[Array]], reaction: list[Array], unforced: Array) -> tuple[list[Any], Array]:
         """Accelerations of P's rows and of the carrier."""
         n = len(reaction)
-        free = _times(self.port, unforced)
+        free = times(self.port, unforced)
         matrix = [
             [(1.0 if i == k else 0.0) + sum(self.mobility[i, j] * weight[j][k] for j in range(n)) for k in range(n)]
             for i in range(n)
@@ -338,8 +338,3 @@ def _sum(values: Iterable[Array]) -> Array:
 
 def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
     return sum(a * b for a, b in zip(x, y, strict=True))
-
-
-def _times(matrix: Array, vector: Array) -> Array:
-    """Matrix times vector as a sum: a library call in the time loop would keep the compiler from fusing it."""
-    return jnp.sum(matrix * vector[None, :], axis=-1)

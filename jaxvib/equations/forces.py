@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_field
-from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.drive import Motor
-from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 
 __all__ = ["energy", "foundation_force", "power"]
@@ -28,7 +27,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
     Source: the antiphase paper, equation (7).
     """
     carrier = scene.machine.carrier()
-    force = carrier.bed_stiffness @ state.displacement + carrier.bed_damping @ state.velocity
+    force = carrier.bed_force(state.displacement, state.velocity)
     for effect in scene.effects:
         rows = effect.place(carrier)
         if rows is not None:
@@ -48,7 +47,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     carrier, loads = scene.machine.carrier(), scene.loads
     q, v = state.displacement, state.velocity
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
-    at_load = _at_loads(carrier, v)
+    at_load = carrier.point_rates(v)
     total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
     own = loads.inertia_factor() - 1.0
     parts = [
@@ -80,9 +79,9 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     carrier, loads = scene.machine.carrier(), scene.loads
     turn, speed = rotor_angle(scene.drive, t, state), rotor_speed(scene.drive, t, state)
     acceleration = vector_field(scene)(t, state).velocity
-    at_load = _at_loads(carrier, acceleration)
+    at_load = carrier.point_rates(acceleration)
     torque = loads.resistance(state.angle, state.rate, speed)
-    g = sum(effect.g for effect in scene.effects if isinstance(effect, Gravity))
+    g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
     for effect in scene.effects:
         friction = effect.friction(loads, state.angle, state.rate, speed, g)
@@ -104,14 +103,6 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     else:
         supplied = speed * (braking + _throw_rate(scene, turn) @ acceleration)
     return supplied, sum(lost[1:], lost[0])
-
-
-def _at_loads(carrier: Carrier, rate: Array) -> dict[int, Array]:
-    """Velocities (or accelerations) of the points that carry the loads, (count,) or shared, by axis."""
-    port = carrier.port @ rate
-    if carrier.stations is not None and carrier.tilt is not None:
-        port = port[:, None] + (carrier.tilt @ rate)[:, None] * carrier.stations[None, :]
-    return dict(zip(carrier.axes, port, strict=True))
 
 
 def _throw_rate(scene: Scene, turn: Array) -> Array:

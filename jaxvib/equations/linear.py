@@ -1,32 +1,89 @@
-"""The carrier's answer to loads that turn at a given speed, all collected at one point."""
+"""The linear carrier with its loads on it: natural frequencies, dynamic stiffness, answer to loads that turn together."""
 
 from __future__ import annotations
 
+from typing import cast
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
-from jaxvib.machine.drive import IdealDrive
-from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance
-from jaxvib.machine.effects.contact import LoadContact
-from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import hermitian_modes, relative_to, root_or_zero, small_solve
+from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 
-__all__ = ["dynamic_stiffness", "loaded_mass", "natural_frequencies", "steady_displacement"]
+__all__ = [
+    "LinearModel",
+    "circular_loads",
+    "jammed_loads",
+    "linear_model",
+    "natural_frequencies",
+    "peak_force",
+    "require_one_point",
+    "steady_displacement",
+    "turning",
+    "turning_loads",
+]
 
 
-def loaded_mass(scene: Scene) -> Array:
-    """M + sum_j m_j B_j^T B_j (nd, nd) kg: the carrier's mass matrix with the loads' masses at the port or their stations."""
+class LinearModel(eqx.Module):
+    """A scene, its carrier, and the carrier's mass with the loads on it: assembled once a question, and handed on.
+
+        D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
+
+    **Attributes**: `scene`; `carrier`, see `Carrier`; `mass` M (nd, nd) kg, the loads' masses at the port or at their stations.
+    """
+
+    scene: Scene
+    carrier: Carrier
+    mass: Array
+
+    @property
+    def direction(self) -> Array:
+        """B^T e (nd,) complex: the force on the coordinates of a unit force that turns at the port is Re(B^T e exp(i w t))."""
+        return self.carrier.port.T @ turning(self.carrier)
+
+    def damping(self, speed: Array) -> Array:
+        """C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s."""
+        carrier = self.carrier
+        return carrier.damping if carrier.gyroscopic is None else carrier.damping + speed * carrier.gyroscopic
+
+    def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:
+        """D(w) (nd, nd) complex, N/m: force per displacement at frequency `omega` (scalar, rad/s).
+
+        n is the rotor's `speed`, rad/s; if None, loads and rotor turn together at w.
+        """
+        damping = self.damping(omega if speed is None else speed)
+        return self.carrier.stiffness - omega**2 * self.mass + 1j * omega * damping
+
+    def displacement(self, omega: Array, speed: Array | None = None) -> Array:
+        """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
+        if self.carrier.gyroscopic is not None and speed is None:
+            problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
+            raise InputError("machine.kind", f"is {self.scene.machine.kind!r}; {problem}")
+        force = jammed_loads(self.scene).unbalance() * omega**2 * self.direction
+        return small_solve(self.dynamic_stiffness(omega, speed), force)
+
+    def modes(self) -> tuple[Array, Array]:
+        """Undamped natural frequencies (nd,) rad/s, ascending, and mass-normalised mode shapes (nd, nd), a column a mode."""
+        square, inverse = relative_to(self.mass, self.carrier.stiffness)
+        values, vectors = hermitian_modes(square)
+        return root_or_zero(values), inverse.T @ vectors
+
+
+def linear_model(scene: Scene) -> LinearModel:
+    """The scene's carrier with the loads on it, see `LinearModel`."""
     carrier = scene.machine.carrier()
     each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
     if carrier.stations is None:
-        return carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
-    rows = jax.vmap(carrier.port_at)(carrier.stations)
-    return carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
+        mass = carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
+    else:
+        rows = jax.vmap(carrier.port_at)(carrier.stations)
+        mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
+    return LinearModel(scene, carrier, mass)
 
 
 def natural_frequencies(scene: Scene) -> Array:
@@ -44,73 +101,7 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return _modes(scene)[0]
-
-
-def _modes(scene: Scene) -> tuple[Array, Array]:
-    """Natural frequencies (nd,) and mass-normalised mode shapes (nd, nd), a column a mode."""
-    square, inverse = relative_to(loaded_mass(scene), scene.machine.carrier().stiffness)
-    values, vectors = hermitian_modes(square)
-    return root_or_zero(values), inverse.T @ vectors
-
-
-def circular_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
-    loads = turning_loads(scene)
-    require_one_point(scene)
-    return loads
-
-
-def jammed_loads(scene: Scene) -> CircularLoads:
-    """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
-    loads = turning_loads(scene, (*_EFFECTS, DryFriction))
-    require_one_point(scene)
-    return loads
-
-
-def require_one_point(scene: Scene) -> None:
-    """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
-    if scene.machine.structure().stations is not None:
-        problem = (
-            "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
-        )
-        raise InputError("machine.stations", problem)
-
-
-_EFFECTS = (Gravity, StaticImbalance, MomentImbalance, LoadContact)
-"""Effects that change nothing in what loads do on the average of a turn, or that whoever asks deals with."""
-
-
-def turning_loads(scene: Scene, effects: tuple[type[Effect], ...] = _EFFECTS) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns."""
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
-    if not isinstance(scene.loads, CircularLoads):
-        raise InputError("loads.kind", f"is {scene.loads.kind!r}; this holds for loads on a circle: ball, roller, pendulum")
-    if not isinstance(scene.drive, IdealDrive):
-        raise InputError(
-            "drive.kind", f"is {scene.drive.kind!r}; this holds at a given rotor speed: use ConstantSpeed, or simulate"
-        )
-    for effect in scene.effects:
-        if not isinstance(effect, effects):
-            raise InputError(f"effects.{effect.kind}", "is not part of this theory; leave it out here, or simulate")
-    return scene.loads
-
-
-def turning(carrier: Carrier) -> Array:
-    """e (np,): a point that turns at a speed w with unit radius moves by Re(e exp(i w t)) at the port."""
-    return jnp.asarray([(1.0, -1.0j)[axis] for axis in carrier.axes])
-
-
-def dynamic_stiffness(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """K - w^2 (M + sum m_j B^T B) + i w (C + n G) (nd, nd) complex: force per displacement at frequency `omega` (scalar).
-
-    n is the rotor's `speed`, rad/s; if None, loads and rotor turn together at w.
-    """
-    carrier = scene.machine.carrier()
-    n = omega if speed is None else speed
-    damping = carrier.damping if carrier.gyroscopic is None else carrier.damping + n * carrier.gyroscopic
-    return carrier.stiffness - omega**2 * loaded_mass(scene) + 1j * omega * damping
+    return linear_model(scene).modes()[0]
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
@@ -132,9 +123,64 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 
     Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
     """
-    carrier = scene.machine.carrier()
-    if carrier.gyroscopic is not None and speed is None:
-        problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
-        raise InputError("machine.kind", f"is {scene.machine.kind!r}; {problem}")
-    force = jammed_loads(scene).unbalance() * omega**2 * (carrier.port.T @ turning(carrier))
-    return small_solve(dynamic_stiffness(scene, omega, speed), force)
+    return linear_model(scene).displacement(omega, speed)
+
+
+def turning(carrier: Carrier) -> Array:
+    """e (np,): a point that turns at a speed w with unit radius moves by Re(e exp(i w t)) at the port."""
+    return jnp.asarray([(1.0, -1.0j)[axis] for axis in carrier.axes])
+
+
+def peak_force(force: Array) -> Array:
+    """The root of the summed squares of the peaks of a force's directions, N, from its complex amplitudes (nb,) N."""
+    return magnitude(force[0]) if force.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(force) ** 2))
+
+
+def circular_loads(scene: Scene) -> CircularLoads:
+    """The scene's loads, where a formula holds for loads on a circle at one point of the machine only."""
+    loads = turning_loads(scene)
+    require_one_point(scene)
+    return loads
+
+
+def jammed_loads(scene: Scene) -> CircularLoads:
+    """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
+    loads = turning_loads(scene, friction=True)
+    require_one_point(scene)
+    return loads
+
+
+def require_one_point(scene: Scene) -> None:
+    """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
+    if scene.machine.structure().stations is not None:
+        problem = (
+            "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
+        )
+        raise InputError("machine.stations", problem)
+
+
+def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
+    """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns.
+
+    The scene's parts are asked for their properties: loads that are `circular`, an `ideal` drive, effects that `averages_out`
+    and, where the formula has it, `friction`. **Raises** `InputError` that names the property a part lacks.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    loads, drive = scene.loads, scene.drive
+    if not loads.circular:
+        raise InputError(
+            "loads.kind", f"is {loads.kind!r}; this holds for loads on a circle (property circular): ball, roller, pendulum"
+        )
+    if not drive.ideal:
+        raise InputError(
+            "drive.kind",
+            f"is {drive.kind!r}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
+        )
+    for effect in scene.effects:
+        if not (effect.averages_out or (friction and effect.has_friction)):
+            named = "averages_out or has_friction" if friction else "averages_out"
+            raise InputError(
+                f"effects.{effect.kind}", f"is not part of this theory (property {named}); leave it out here, or simulate"
+            )
+    return cast(CircularLoads, loads)

@@ -28,7 +28,7 @@ class Carrier(eqx.Module):
     - `port` B (np, nd): the port's displacement is B q
     - `axes`: which direction of a load's plane (0 across, 1 up) each row of B moves in
     - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): ties to the bed, N/m and N s/m
-    - `coordinates`: a name for each coordinate; `units`: the unit of each, "rad" of tilts, "m" of all others
+    - `coordinates`: a name for each coordinate; `coordinate_units`: the unit of each, "m" or "rad", None where all are "m"
     - `tilt` T (np, nd), 1/m times the unit of a displacement: how the structure's axis turns with q; None where it cannot.
       A point at the distance s along the axis from the port moves by (B + s T) q
     - `stations` s_j (count,) m: where along the axis, counted from the port, each load runs; None where all run at the port
@@ -50,20 +50,33 @@ class Carrier(eqx.Module):
     tilt: Array | None = None
     stations: Array | None = None
     cg_offset: Array | None = None
+    coordinate_units: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The unit of each coordinate: "rad" of the tilts "theta" and "psi", "m" of all others.
+        """The unit of each coordinate, "m" or "rad".
 
         >>> import jaxvib as jv
         >>> jv.planar_rotor(mass=37.0, stiffness="1160 N/mm", damping=840.0).structure().units
         ('m', 'm')
         """
-        return tuple("rad" if name in ("theta", "psi") else "m" for name in self.coordinates)
+        return self.coordinate_units or ("m",) * len(self.coordinates)
 
     def port_at(self, distance: Array | float) -> Array:
         """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""
         return self.port if self.tilt is None else self.port + distance * self.tilt
+
+    def point_rates(self, rate: Array) -> dict[int, Array]:
+        """Velocities (accelerations) of the points that carry the loads where the coordinates' are `rate` (nd,), by axis;
+        (count,) each where loads have stations."""
+        port = self.port @ rate
+        if self.stations is not None and self.tilt is not None:
+            port = port[:, None] + (self.tilt @ rate)[:, None] * self.stations[None, :]
+        return dict(zip(self.axes, port, strict=True))
+
+    def bed_force(self, displacement: Array, velocity: Array) -> Array:
+        """Force on the bed (nb,) N, T_K q + T_C q', also of complex amplitudes; without supports that are effects."""
+        return self.bed_stiffness @ displacement + self.bed_damping @ velocity
 
 
 class Machine(eqx.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,6 +15,10 @@ from jaxvib.units import Number, number, traced
 __all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
 
 
+Rotor = tuple[Array, Array] | None
+"""The rotor's angle (rad) and speed (rad/s) where they are states of the motion, else None."""
+
+
 class Drive(eqx.Module):
     """What turns the rotor; `speed` is the one it works at, without a load.
 
@@ -23,9 +28,29 @@ class Drive(eqx.Module):
     speed: eqx.AbstractVar[Array]
     kind: eqx.AbstractVar[str]
 
+    ideal: ClassVar[bool]
+    """Whether the rotor's speed is given as a function of time, whatever the loads do."""
+
+    constant: ClassVar[bool] = False
+    """Whether the rotor turns at `speed` from the start."""
+
+    @abc.abstractmethod
+    def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
+        """The rotor's speed at time `t` (s), rad/s, in the state `rotor`."""
+
+    @abc.abstractmethod
+    def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
+        """The rotor's angle at time `t` (s), rad, in the state `rotor`."""
+
+    def jump_ts(self) -> tuple[Array, ...]:
+        """Times at which the acceleration jumps, on which an integrator has to put a step."""
+        return ()
+
 
 class IdealDrive(Drive):
     """A drive that gives the rotor's speed as a function of time."""
+
+    ideal = True
 
     @abc.abstractmethod
     def speed_at(self, t: Array) -> Array:
@@ -39,9 +64,13 @@ class IdealDrive(Drive):
     def acceleration_at(self, t: Array) -> Array:
         """The rotor's angular acceleration at time t, rad/s^2."""
 
-    def jump_ts(self) -> tuple[Array, ...]:
-        """Times at which the acceleration jumps, on which an integrator has to put a step."""
-        return ()
+    def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
+        """`speed_at`."""
+        return self.speed_at(t)
+
+    def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
+        """`angle_at`."""
+        return self.angle_at(t)
 
 
 class Motor(Drive):
@@ -52,7 +81,19 @@ class Motor(Drive):
     J is the rotor's whole moment of inertia about its axis, what is out of balance included, loads not.
     """
 
+    ideal = False
+
     inertia: eqx.AbstractVar[Array]
+
+    def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
+        """That of the state."""
+        assert rotor is not None
+        return rotor[1]
+
+    def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
+        """That of the state."""
+        assert rotor is not None
+        return rotor[0]
 
     @abc.abstractmethod
     def torque(self, speed: Array) -> Array:
@@ -70,6 +111,8 @@ class ConstantSpeed(IdealDrive):
     >>> round(float(jv.ConstantSpeed("1500 rpm").speed), 3)
     157.08
     """
+
+    constant = True
 
     speed: Array
     kind: str = eqx.field(static=True)

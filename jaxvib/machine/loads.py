@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,15 +21,25 @@ class Loads(eqx.Module):
     """Loads that move on the carrier. A new kind of load is a new subclass with its own position function.
 
     All arrays are one entry a load, or one scalar that all loads share; functions act elementwise on (count,) arrays.
+
+    A load has one or several coordinates u; the first is its angle about the rotor's axis, rad, and its generalised force the
+    torque that the load takes off the rotor.
     """
 
     mass: eqx.AbstractVar[Array]
     count: eqx.AbstractVar[int]
     kind: eqx.AbstractVar[str]
 
+    circular: ClassVar[bool] = False
+    """Whether the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
+
     @abc.abstractmethod
-    def position(self, *u: Array) -> tuple[Array, Array]:
-        """The load's own position p(u) in the rotor's plane, (across, up), in m."""
+    def position(self, *u: Array) -> tuple[Array, ...]:
+        """The load's own position p(u), m: (across, up) in the rotor's plane, and along its axis where it moves there."""
+
+    @abc.abstractmethod
+    def rest(self) -> tuple[Array, ...]:
+        """The coordinates u of loads at rest, all at one point, (count,) each."""
 
     @abc.abstractmethod
     def inertia_factor(self) -> Array:
@@ -54,6 +65,8 @@ class CircularLoads(Loads):
     Source: the antiphase paper, equations (1), (2), (6).
     """
 
+    circular = True
+
     mass: Array
     radius: Array
     drag: Array
@@ -71,6 +84,10 @@ class CircularLoads(Loads):
         """R (cos phi, sin phi)."""
         (phi,) = u
         return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
+
+    def rest(self) -> tuple[Array]:
+        """At the bottom of the track, phi = -pi/2."""
+        return (jnp.full((self.count,), -0.5 * jnp.pi, dtype=jnp.result_type(self.radius)),)
 
     def inertia_factor(self) -> Array:
         """7/5 (ball), 3/2 (roller), 1 + J_C/(m R^2) (pendulum)."""

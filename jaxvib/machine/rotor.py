@@ -80,6 +80,7 @@ class Rotor(Machine):
             bed_damping=damping[0] * across + damping[1] * tilt,
             axes=(0, 1),
             coordinates=("y", "z", "theta", "psi"),
+            coordinate_units=("m", "m", "rad", "rad"),
             tilt=tilt,
             stations=None if shared else self.stations,
             cg_offset=-self.stations if shared else None,

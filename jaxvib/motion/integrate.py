@@ -12,8 +12,6 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.machine.drive import IdealDrive, Motor
-from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory
 from jaxvib.motion.run import Run, RunStatus
@@ -41,13 +39,14 @@ class StepControl(eqx.Module):
 
 @cached
 def natural_units(scene: Scene) -> State:
-    """What counts as 1 in each part of the state: the throw of the loads, S/M, at the port, at the rotor's speed; 1 rad."""
+    """What counts as 1 in each part of the state: the loads' unbalance radius S/M, that at the rotor's speed; 1 rad."""
     carrier, loads = scene.machine.carrier(), scene.loads
-    throw = jnp.mean(loads.mass) * jnp.sqrt(sum(jnp.mean(jnp.square(x)) for x in loads.position(jnp.zeros(loads.count))))
-    length = loads.count * throw / jnp.mean(jnp.diagonal(carrier.mass))
+    across, up, *_ = loads.position(*loads.rest())
+    unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    length = loads.count * unbalance / jnp.mean(jnp.diagonal(carrier.mass))
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
-    rotor = (one, speed) if isinstance(scene.drive, Motor) else None
+    rotor = None if scene.drive.ideal else (one, speed)
     return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
 
 
@@ -75,7 +74,7 @@ def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepC
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
     """The controller, made to step onto the times at which the drive's acceleration jumps; fixed steps are left alone."""
-    jump_ts = scene.drive.jump_ts() if isinstance(scene.drive, IdealDrive) else ()
+    jump_ts = scene.drive.jump_ts()
     if not jump_ts or isinstance(controller, diffrax.ConstantStepSize):
         return controller
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
@@ -91,7 +90,7 @@ def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     """Whether angles are kept within a turn, and all loads' by the same turns: single precision, loads that touch."""
-    return jnp.dtype(dtype).itemsize < 8, any(isinstance(effect, LoadContact) for effect in scene.effects)
+    return jnp.dtype(dtype).itemsize < 8, any(effect.couples_loads for effect in scene.effects)
 
 
 @cached

@@ -14,7 +14,6 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import Motor
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Trajectory
@@ -179,7 +178,7 @@ class Run(Measured):
                 kept_all = bool(archive["kept_all"])
                 leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
                 zero = jnp.zeros(())
-                rotor = (zero, zero) if isinstance(scene.drive, Motor) else None
+                rotor = None if scene.drive.ideal else (zero, zero)
                 motion = Trajectory(zero, State(zero, zero, (zero,), (zero,), rotor), zero, zero, zero)
                 kept = motion if kept_all else None
                 shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, zero, zero, zero, scene)

@@ -17,7 +17,6 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
@@ -242,7 +241,7 @@ def _with(run: Run, **values: Any) -> Run:
 
 def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
     """Into how many stretches a run is cut: more than one in single precision, where time would lose its digits."""
-    if state.displacement.dtype.itemsize >= 8 or save != "window" or not isinstance(scene.drive, ConstantSpeed):
+    if state.displacement.dtype.itemsize >= 8 or save != "window" or not scene.drive.constant:
         return 1
     if any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state))):
         return 1

@@ -12,8 +12,8 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed, Motor, SpinUp
-from jaxvib.machine.effects.contact import LoadContact
+from jaxvib.machine.drive import SpinUp
+from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, numbers, traced
@@ -34,8 +34,9 @@ def initial_state(
     - `start`: "rest" (platforms in equilibrium, loads at rest, together at the bottom of their track), "spin_up" (the same
       state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"
-    - `angles`: the loads' angles, one number or (count,), rad, in place of the named ones (-pi/2 at rest, 0 in a jam, where
-      the platforms go with the mean angle; loads that touch each other lie side by side there)
+    - `angles`: the loads' angles about the rotor's axis, one number or (count,), rad, in place of the named ones (those of
+      `Loads.rest` at rest, 0 in a jam, where the platforms go with the mean angle; loads that touch each other lie side by side
+      there)
     - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
@@ -57,18 +58,20 @@ def initial_state(
     mass = scene.machine.structure().mass
     zero = jnp.zeros(mass.shape[:1], mass.dtype)
 
-    def phases(value: float) -> Array:
+    def phases(value: float | Array) -> Array:
         if angles is not None:
             return numbers(angles, "rad", "angles", n)
-        touching = any(isinstance(effect, LoadContact) for effect in scene.effects)
-        return value + (scene.loads.offsets() if touching else jnp.zeros((n,), zero.dtype))  # pyright: ignore
+        touching = any(effect.couples_loads for effect in scene.effects) and isinstance(scene.loads, CircularLoads)
+        return value + (scene.loads.offsets() if touching else jnp.zeros((n,), zero.dtype))
 
     if start != "jam":
-        rotor = (zero[0], zero[0]) if isinstance(scene.drive, Motor) else None
-        return State(zero, zero, (phases(-jnp.pi / 2),), (jnp.zeros((n,), zero.dtype),), rotor)
+        rotor = None if scene.drive.ideal else (zero[0], zero[0])
+        first, *others = scene.loads.rest()
+        angle = (phases(first), *others)
+        return State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor)
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
-    if not isinstance(scene.drive, ConstantSpeed):
+    if not scene.drive.constant:
         raise InputError(
             "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
         )
@@ -99,7 +102,7 @@ def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number |
         if spin_up is not None:
             raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
         return scene
-    if not isinstance(scene.drive, ConstantSpeed):
+    if not scene.drive.constant:
         raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
     drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
     if not traced(end - drive.duration) and drive.duration > end:
@@ -115,7 +118,7 @@ def whole_state(scene: Scene, state: State, mode: int | None) -> State:
     if mode is not None:
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
     nd, n = scene.machine.structure().mass.shape[0], scene.loads.count
-    if isinstance(scene.drive, Motor) != (state.rotor is not None):
+    if scene.drive.ideal != (state.rotor is None):
         needed = (
             "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
         )

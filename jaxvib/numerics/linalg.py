@@ -19,8 +19,14 @@ __all__ = [
     "root_or_zero",
     "small_inverse",
     "small_solve",
+    "times",
     "written_inverse",
 ]
+
+
+def times(matrix: Array, vector: Array) -> Array:
+    """Matrix times vector as a sum: a library call in a time loop would keep the compiler from fusing it."""
+    return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
 def small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:

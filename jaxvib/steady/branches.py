@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
@@ -113,11 +114,12 @@ def branches(
 
 @cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
-    crowded, resonances = fold_points(jax.lax.stop_gradient(scene), per_side)
+    model = linear_model(scene)
+    crowded, resonances = fold_points(jax.lax.stop_gradient(model), per_side)
     # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)
     omega = jnp.sort(jnp.where(inside < top, inside, top * (0.001 + 0.999 * share)))
-    jams, folds = branch_points(scene, omega)
+    jams, folds = branch_points(model, omega)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
     return Branches(**fields, resonances=resonances, folds=folds, scene=scene)

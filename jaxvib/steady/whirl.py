@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.draw.whirl import campbell_diagram
-from jaxvib.equations.linear import loaded_mass
+from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.scene import Scene
@@ -82,10 +82,11 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
 
     Source: Artyunin 2013, section IV; free motion of equation (1).
     """
-    carrier = _two_directions(scene)
+    model = _two_directions(scene)
+    carrier = model.carrier
     speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
     speeds = jnp.atleast_1d(speeds)
-    mass = _mass(scene, loads)
+    mass = _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
     part = _TIE * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
@@ -114,7 +115,7 @@ def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "
         return speed, -values.real[chosen], _sense(carrier, shapes[:nd, one_of_each(apart)[0]]) > 0.0
 
     whirls = jax.vmap(at)(speeds)
-    return Whirl(speeds, *whirls, critical=critical_speeds(scene, loads=loads))
+    return Whirl(speeds, *whirls, critical=_critical_speeds(model, loads))
 
 
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
@@ -133,8 +134,11 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 
     Source: Artyunin 2013, section V.
     """
-    carrier = _two_directions(scene)
-    mass = _mass(scene, loads)
+    return _critical_speeds(_two_directions(scene), loads)
+
+
+def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
+    carrier, mass = model.carrier, _mass(model, loads)
     inertia = mass if carrier.gyroscopic is None else mass - 1j * carrier.gyroscopic
     part = 1j * _TIE * jnp.trace(mass) * _sense_matrix(carrier)
     values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
@@ -146,10 +150,11 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
     return CriticalSpeeds(speed, _sense(carrier, shapes) > 0.0)
 
 
-def _two_directions(scene: Scene) -> Carrier:
+def _two_directions(scene: Scene) -> LinearModel:
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
-    carrier = scene.machine.carrier()
+    model = linear_model(scene)
+    carrier = model.carrier
     if carrier.axes != (0, 1):
         raise InputError(
             "machine.kind",
@@ -157,7 +162,7 @@ def _two_directions(scene: Scene) -> Carrier:
         )
     if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):
         raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
-    return carrier
+    return model
 
 
 def _held(stiffness: np.ndarray) -> bool:
@@ -167,10 +172,10 @@ def _held(stiffness: np.ndarray) -> bool:
     return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))
 
 
-def _mass(scene: Scene, loads: Weights) -> Array:
+def _mass(model: LinearModel, loads: Weights) -> Array:
     if loads not in ("fixed", "none"):
         raise InputError("loads", f"is {loads!r}; allowed: fixed, none")
-    return loaded_mass(scene) if loads == "fixed" else scene.machine.carrier().mass
+    return model.mass if loads == "fixed" else model.carrier.mass
 
 
 def _sense_matrix(carrier: Carrier) -> Array:

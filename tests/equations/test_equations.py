@@ -217,7 +217,18 @@ class Planar(jv.Machine):
     def carrier(self):
         mass, damping, stiffness, gyroscopic, port = self.matrices
         none = jnp.zeros((1, 3))
-        return jv.Carrier(mass, damping, stiffness, gyroscopic, port, none, none, axes=(0, 1), coordinates=("x", "y", "tilt"))
+        return jv.Carrier(
+            mass,
+            damping,
+            stiffness,
+            gyroscopic,
+            port,
+            none,
+            none,
+            axes=(0, 1),
+            coordinates=("x", "y", "tilt"),
+            coordinate_units=("m", "m", "rad"),
+        )
 
 
 @pytest.mark.parametrize("load", loads())

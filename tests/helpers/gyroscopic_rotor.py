@@ -27,6 +27,7 @@ class Rotor(jv.Machine):
             bed_damping=jnp.zeros((2, 4)),
             axes=(0, 1),
             coordinates=("y", "z", "theta", "psi"),
+            coordinate_units=("m", "m", "rad", "rad"),
         )
 
 

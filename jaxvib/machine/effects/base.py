@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.loads import Loads
 from jaxvib.units import Number, number
 
-__all__ = ["Effect", "Friction", "Gravity", "Imbalance", "MomentImbalance", "StaticImbalance"]
+__all__ = ["Effect", "Friction", "Gravity", "Imbalance", "MomentImbalance", "StaticImbalance", "total_gravity"]
 
 
 class Friction(NamedTuple):
@@ -44,15 +44,38 @@ class Imbalance(NamedTuple):
     moment: tuple[Array, Array]
 
 
+def total_gravity(effects: Iterable[Effect]) -> Array | float:
+    """The acceleration of gravity of a scene with these `effects`, m/s^2, 0 where none brings any."""
+    return sum((effect.gravity for effect in effects if effect.gravity is not None), 0.0)
+
+
 class Effect(eqx.Module):
     """One effect says what it adds by the methods it overrides; what it leaves alone is not in the traced program.
+
+    Its properties say which theories may hold a scene with it; what they refuse, they refuse by naming the property.
 
     Energies and forces are in J and N; a load's generalised force is in N m for an angle.
     """
 
     kind: eqx.AbstractVar[str]
+
     repeatable: ClassVar[bool] = False
     """Whether a scene may hold several of them (supports at several places)."""
+
+    averages_out: ClassVar[bool] = False
+    """Whether it leaves the carrier linear, and its mean torque on loads that turn together, over a turn, is 0 to leading order
+    of their mass. Theories of turning loads admit such effects, and besides them friction where they say so."""
+
+    half_turn_symmetric: ClassVar[bool] = False
+    """Whether the equations with it stay the same under phi + pi, -q: then a jam's deviations have even harmonics only."""
+
+    couples_loads: ClassVar[bool] = False
+    """Whether loads act on each other by it, so that their order and their distances count."""
+
+    @property
+    def gravity(self) -> Array | None:
+        """The acceleration of gravity, m/s^2, that the effect brings into the scene; None where it brings none."""
+        return None
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
@@ -92,6 +115,16 @@ class Effect(eqx.Module):
         """Whether the effect puts the rotor out of balance."""
         return type(self).imbalance is not Effect.imbalance
 
+    @property
+    def has_load_potential(self) -> bool:
+        """Whether the effect gives the loads a potential energy."""
+        return type(self).load_potential is not Effect.load_potential
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether the effect adds friction of the loads against the rotor."""
+        return type(self).friction is not Effect.friction
+
     def load_force(self, loads: Loads, u: tuple[Array, ...]) -> tuple[Array, ...] | None:
         """Generalised force of the potential on each load, by automatic differentiation; None where there is none."""
         energy, back = jax.vjp(lambda *v: self.load_potential(loads, v), *u)
@@ -118,12 +151,19 @@ class Gravity(Effect):
     9.81
     """
 
+    averages_out = True
+
     g: Array
     kind: str = eqx.field(static=True)
 
     def __init__(self, g: Number = 9.81):
         self.g = number(g, "m/s^2", "effects.gravity.g", low=0.0)
         self.kind = "gravity"
+
+    @property
+    def gravity(self) -> Array:
+        """g."""
+        return self.g
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
         """m g p_up(u)."""
@@ -145,6 +185,8 @@ class StaticImbalance(Effect):
 
     Source: Artyunin 2013, equation (1), the terms with M e.
     """
+
+    averages_out = True
 
     moment: Array
     angle: Array
@@ -177,6 +219,8 @@ class MomentImbalance(Effect):
 
     Source: Artyunin 2013, equation (1), the terms with (A - C) delta.
     """
+
+    averages_out = True
 
     moment: Array
     angle: Array

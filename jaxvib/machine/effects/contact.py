@@ -36,6 +36,9 @@ class LoadContact(Effect):
     Source: asked for by Strautmanis et al. 2018; a linear spring and damper between the centres.
     """
 
+    averages_out = True
+    couples_loads = True
+
     stiffness: Array
     damping: Array
     kind: str = eqx.field(static=True)

@@ -67,6 +67,9 @@ class DryFriction(Effect):
     Source: Artyunin and Sumenkov 2019, equations (1)-(5).
     """
 
+    # By itself: the radial load takes the acceleration along the load's direction, and both turn over.
+    half_turn_symmetric = True
+
     coefficient: Array
     diameter: Array
     width: Array
@@ -91,7 +94,7 @@ class DryFriction(Effect):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads on a circle."""
-        if not isinstance(loads, CircularLoads):
+        if not loads.circular:
             raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {loads.kind!r}")
 
     def friction(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float) -> Friction:

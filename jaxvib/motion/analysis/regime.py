@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.machine.drive import Motor
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, _mean_speed
 from jaxvib.steady.jams.patterns import PhasePattern, pattern_word, phase_pattern
@@ -179,7 +178,7 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
     """Whether a motor's rotor hangs at a resonance: less than 15 % below one, and more than 5 % below the motor's own speed."""
-    if not isinstance(scene.drive, Motor):
+    if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)
 
@@ -198,7 +197,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     none to the rotor's radius of gyration.
     """
     carrier, loads = scene.machine.carrier(), scene.loads
-    across, up = loads.position(*(jnp.zeros((loads.count,), phase.dtype),))
+    across, up, *_ = loads.position(*loads.rest())
     each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
     thrown = [imbalance for imbalance in (effect.imbalance(origin) for effect in scene.effects) if imbalance is not None]

@@ -16,8 +16,6 @@ from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, avera
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.drive import IdealDrive
-from jaxvib.machine.effects.base import Gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
@@ -269,17 +267,16 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
 
 def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
     carrier = scene.machine.carrier()
-    assert isinstance(scene.drive, IdealDrive)
     return Envelopes(
         time=t,
         displacement=state.displacement,
         velocity=state.velocity,
         amplitude=magnitude(state.displacement),
-        foundation_force=magnitude(carrier.bed_stiffness @ state.displacement + carrier.bed_damping @ state.velocity),
+        foundation_force=magnitude(carrier.bed_force(state.displacement, state.velocity)),
         omega=jnp.mean(state.rate),
         load_speed=state.rate,
         phase=state.phase,
-        rotor_speed=scene.drive.speed_at(t),
+        rotor_speed=scene.drive.rotor_speed(t, None),
         ripple=field.ripple(state),
     )
 
@@ -305,13 +302,18 @@ def _measure(window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
     and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
-    loads, pulling = scene.loads, [effect for effect in scene.effects if isinstance(effect, Gravity)]
+    loads, pulling = scene.loads, [effect for effect in scene.effects if effect.has_load_potential]
     if not pulling:
         return jnp.asarray(True)
+
+    def potential(u: Array) -> Array:
+        found = [each for each in (effect.load_potential(loads, (u,)) for effect in pulling) if each is not None]
+        return sum(found[1:], found[0])
+
     angles = jnp.linspace(0.0, 2.0 * jnp.pi, 64, endpoint=False)
     around = [jnp.broadcast_to(angle, (loads.count,)) for angle in angles]
-    height = jnp.stack([sum(effect.load_potential(loads, (u,)) for effect in pulling) for u in around])
-    slope = jax.vmap(jax.grad(lambda u: sum(jnp.sum(effect.load_potential(loads, (u,))) for effect in pulling)))
+    height = jnp.stack([potential(u) for u in around])
+    slope = jax.vmap(jax.grad(lambda u: jnp.sum(potential(u))))
     torque = slope(jnp.stack(around))
     passes = (jnp.max(height, axis=0) - jnp.min(height, axis=0)) / field.inertia
     lifted = field.drag * jnp.max(window.rotor_speed) > jnp.max(jnp.abs(torque), axis=0)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import dynamic_stiffness, loaded_mass, require_one_point, turning
+from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
@@ -85,8 +85,9 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 
     Source: Filimonikhin et al. 2022, equations (14), (30), (48), for any carrier.
     """
-    port = scene.machine.carrier().port
-    stiffness = dynamic_stiffness(scene, jnp.asarray(omega, dtype=port.dtype))
+    model = linear_model(scene)
+    port = model.carrier.port
+    stiffness = model.dynamic_stiffness(jnp.asarray(omega, dtype=port.dtype))
     columns = [small_solve(stiffness, row.astype(stiffness.dtype)) for row in port]
     return port @ jnp.stack(columns, axis=1)
 
@@ -131,33 +132,33 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
 @eqx.filter_jit
 def _characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
-    carrier = scene.machine.carrier()
-    direction = _direction(scene)
+    model = linear_model(scene)
+    carrier, direction = model.carrier, _direction(model)
     if carrier.gyroscopic is None:
-        square, inverse = relative_to(loaded_mass(scene), carrier.stiffness)
+        square, inverse = relative_to(model.mass, carrier.stiffness)
         values, vectors, held = _free_and_held_modes(square, inverse @ direction)
         resonances, additional = root_or_zero(values), root_or_zero(held)
         shapes = inverse.T @ vectors
     else:
         # K is the metric: with a large polar moment M_S - i G is not positive definite, and a resonance is missing.
-        square, inverse = relative_to(carrier.stiffness, loaded_mass(scene) - 1j * carrier.gyroscopic)
+        square, inverse = relative_to(carrier.stiffness, model.mass - 1j * carrier.gyroscopic)
         values, vectors, held = _free_and_held_modes(square, inverse @ direction)
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
-    changes = _sign_changes(scene, direction, resonances, additional, shapes)
+    changes = _sign_changes(model, direction, resonances, additional, shapes)
     return CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
 
 
-def _direction(scene: Scene) -> Array:
+def _direction(model: LinearModel) -> Array:
     """b = B^T e (nd,); real for a port with one direction, whose phase does not matter."""
-    carrier = scene.machine.carrier()
-    return carrier.port[0] if len(carrier.axes) == 1 else carrier.port.T @ turning(carrier)
+    return model.carrier.port[0] if len(model.carrier.axes) == 1 else model.direction
 
 
 def _require_port_that_moves(scene: Scene) -> None:
     """Input checks, for concrete numbers only."""
-    carrier = scene.machine.carrier()
-    parts = (carrier.port, carrier.stiffness, loaded_mass(scene))
+    model = linear_model(scene)
+    carrier = model.carrier
+    parts = (carrier.port, carrier.stiffness, model.mass)
     if any(traced(part) for part in parts):
         return
     port, stiffness, mass = (np.asarray(part) for part in parts)
@@ -203,19 +204,19 @@ def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
     return values[0], vectors[0], values[1, :-1]
 
 
-def _sign_changes(scene: Scene, direction: Array, resonances: Array, additional: Array, shapes: Array) -> Array:
+def _sign_changes(model: LinearModel, direction: Array, resonances: Array, additional: Array, shapes: Array) -> Array:
     """Where Re(b^H D(w)^-1 b) changes sign, ascending (2 nd - 1,), the first from + to -; NaN where there is none."""
-    frozen, b, poles, zeros, forms = jax.lax.stop_gradient((scene, direction, resonances, additional, shapes))
-    carrier = scene.machine.carrier()
+    frozen, b, poles, zeros, forms = jax.lax.stop_gradient((model, direction, resonances, additional, shapes))
+    carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
     trace = jnp.finfo(last.dtype).eps ** 0.75 * last
     # Adds nothing to the real part of 1/A, so moves no sign change, and makes the function smooth at the poles.
     mobility = jnp.sum(jnp.abs(b.conj() @ forms) ** 2)
     smooth = 1j * last**2 / mobility * jnp.outer(b, b.conj())
 
-    def pull(s: Scene, w: Array) -> Array:
+    def pull(m: LinearModel, w: Array) -> Array:
         # A trace of damping: a mode that never moves the port and has none would divide 0 by 0 at its resonance.
-        matrix = dynamic_stiffness(s, w) + 2j * w * trace * loaded_mass(frozen) + smooth
+        matrix = m.dynamic_stiffness(w) + 2j * w * trace * frozen.mass + smooth
         return jnp.sum(b.conj() * small_solve(matrix, b.astype(matrix.dtype))).real
 
     width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + trace
@@ -243,7 +244,7 @@ def _sign_changes(scene: Scene, direction: Array, resonances: Array, additional:
     order = jnp.arange(2 * resonances.shape[0] - 1)
     cell = jnp.minimum(jnp.sum(passed[None, :] <= order[:, None], axis=1), passed.shape[0] - 1)
     found = order < passed[-1]
-    refine = lambda lo, hi: bracketed_root(lambda w: pull(scene, w), lo, hi)  # noqa: E731
+    refine = lambda lo, hi: bracketed_root(lambda w: pull(model, w), lo, hi)  # noqa: E731
     roots = jax.vmap(refine)(grid[cell], grid[cell + 1])
     roots = jnp.where((order == 0) & (grid[0] == 0.0), 0.0, roots)
     return jnp.where(found, roots, jnp.nan)

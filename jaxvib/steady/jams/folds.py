@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
-from jaxvib.equations.linear import _modes, jammed_loads, loaded_mass, steady_displacement, turning
-from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, turning
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.roots import bracketed_root
 
-__all__ = ["Folds", "jam_rotor_speed"]
+__all__ = ["Folds", "jam_rotor_speed", "rotor_speed_at"]
 
 _POINTS = 64
 """Grid points on each side of each pole, where folds are looked for."""
@@ -56,12 +56,17 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
     Source: the antiphase paper, equations (31), (35).
     """
-    loads = jammed_loads(scene)
-    carrier = scene.machine.carrier()
-    port = carrier.port @ steady_displacement(scene, omega, speed)
-    torque = -loads.unbalance() * omega**2 * jnp.sum(jnp.conj(turning(carrier)) * port).imag / 2.0
+    return rotor_speed_at(linear_model(scene), omega, speed)
+
+
+def rotor_speed_at(model: LinearModel, omega: Array, speed: Array | None = None) -> Array:
+    """`jam_rotor_speed` of a scene that is assembled already."""
+    scene, loads = model.scene, jammed_loads(model.scene)
+    acceleration = -(omega**2) * (model.carrier.port @ model.displacement(omega, speed))
+    forward = jnp.sum(jnp.conj(turning(model.carrier)) * acceleration)
+    torque = -mean_torque(loads.unbalance(), jnp.ones_like(forward), forward)
     free = omega + torque / loads.drag_sum()
-    if not any(isinstance(effect, DryFriction) for effect in scene.effects):
+    if not any(effect.has_friction for effect in scene.effects):
         return free
 
     def residual(n: Array) -> Array:
@@ -70,9 +75,9 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
     return bracketed_root(residual, omega, free)
 
 
-def branch_slope(scene: Scene, omega: Array) -> Array:
+def branch_slope(model: LinearModel, omega: Array) -> Array:
     """dn/dOmega along the branch."""
-    return jax.jvp(lambda w: jam_rotor_speed(scene, w), (omega,), (jnp.ones_like(omega),))[1]
+    return jax.jvp(lambda w: rotor_speed_at(model, w), (omega,), (jnp.ones_like(omega),))[1]
 
 
 class Pieces(NamedTuple):
@@ -85,9 +90,9 @@ class Pieces(NamedTuple):
     folds: Folds
 
 
-def branch_pieces(scene: Scene) -> Pieces:
+def branch_pieces(model: LinearModel) -> Pieces:
     """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
-    frozen = jax.lax.stop_gradient(scene)
+    frozen = jax.lax.stop_gradient(model)
     grid, resonances = fold_points(frozen, _POINTS)
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(lambda w: branch_slope(frozen, w), grid, 2 * nd)
@@ -96,11 +101,11 @@ def branch_pieces(scene: Scene) -> Pieces:
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
-    omega = jax.vmap(partial(bracketed_root, lambda w: branch_slope(scene, w)))(*ends)
-    speeds = jax.vmap(lambda w: jam_rotor_speed(scene, w))(omega)
+    omega = jax.vmap(partial(bracketed_root, lambda w: branch_slope(model, w)))(*ends)
+    speeds = jax.vmap(lambda w: rotor_speed_at(model, w))(omega)
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
-    end = jnp.maximum(grid[-1], 2.0 * frozen.drive.speed)
+    end = jnp.maximum(grid[-1], 2.0 * frozen.scene.drive.speed)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
         rotor_speed=jnp.where(found, speeds, jnp.nan),
@@ -149,18 +154,14 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
     return keep[:most]
 
 
-def fold_points(scene: Scene, per_side: int) -> tuple[Array, Array]:
+def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances.
 
     Folds lie between some of these points. They crowd about the poles s of det(K + s^2 M + s C) = 0, not about undamped
     resonances: a strong damper between two platforms locks them into one, whose sharp peak is at neither's resonance.
     """
-    resonances, _ = _modes(scene)
-    carrier = scene.machine.carrier()
-    damping = carrier.damping
-    if carrier.gyroscopic is not None:
-        damping = damping + scene.drive.speed * carrier.gyroscopic
-    poles = _poles(loaded_mass(scene), damping, carrier.stiffness)
+    resonances, _ = model.modes()
+    poles = _poles(model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
     top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]

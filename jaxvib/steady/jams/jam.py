@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import jammed_loads, loaded_mass, natural_frequencies, steady_displacement
+from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, peak_force
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, jam_rotor_speed
+from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, rotor_speed_at
 from jaxvib.units import traced
 
 __all__ = ["Jam", "JamModes", "JamStatus", "jam_modes"]
@@ -143,9 +143,9 @@ def jam_modes(scene: Scene) -> JamModes:
 
 @cached
 def _jam_modes(scene: Scene) -> JamModes:
-    n = scene.drive.speed
-    pieces = branch_pieces(scene)
-    omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(scene, lo, hi))(pieces.low, pieces.high)
+    n, model = scene.drive.speed, linear_model(scene)
+    pieces = branch_pieces(model)
+    omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(model, lo, hi))(pieces.low, pieces.high)
 
     numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
     hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
@@ -159,7 +159,7 @@ def _jam_modes(scene: Scene) -> JamModes:
     close = (close | jnp.roll(close, -1))[chosen]
 
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
-        found = _jam_at(scene, number, w, n, flat)
+        found = _jam_at(model, number, w, n, flat)
         values = jax.tree.map(
             lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
             found,
@@ -172,16 +172,16 @@ def _jam_modes(scene: Scene) -> JamModes:
 
     jams = jax.vmap(jam)(numbers, omega, there, close)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
-    return JamModes(**fields, resonances=natural_frequencies(scene), folds=pieces.folds)
+    return JamModes(**fields, resonances=model.modes()[0], folds=pieces.folds)
 
 
-def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
-    displacement = steady_displacement(scene, omega)
+def _jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+    displacement = model.displacement(omega)
     # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
-    throw = jammed_loads(scene).unbalance() / jnp.min(jnp.diagonal(loaded_mass(scene)))
-    bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(throw.dtype).eps < throw)
+    radius = jammed_loads(model.scene).unbalance() / jnp.min(jnp.diagonal(model.mass))
+    bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)
-    slope = jnp.where(bounded, branch_slope(scene, omega), jnp.nan)
+    slope = jnp.where(bounded, branch_slope(model, omega), jnp.nan)
     status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
     return Jam(
         mode=number,
@@ -192,37 +192,33 @@ def _jam_at(scene: Scene, number: Array, omega: Array, rotor_speed: Array, at_fo
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
-        foundation_force=_bed_force(scene, omega, displacement),
+        foundation_force=peak_force(model.carrier.bed_force(displacement, 1j * omega * displacement)),
     )
 
 
-def branch_points(scene: Scene, omega: Array) -> tuple[Jam, Folds]:
+def branch_points(model: LinearModel, omega: Array) -> tuple[Jam, Folds]:
     """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
-    pieces = branch_pieces(scene)
+    pieces = branch_pieces(model)
     cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
     numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
 
     def jam(number: Array, w: Array) -> Jam:
-        flat = jnp.abs(branch_slope(scene, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
-        return _jam_at(scene, number, w, jam_rotor_speed(scene, w), flat)
+        flat = jnp.abs(branch_slope(model, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
+        return _jam_at(model, number, w, rotor_speed_at(model, w), flat)
 
     jams = jax.vmap(jam)(numbers, omega)
     return jams, pieces.folds
 
 
-def _bed_force(scene: Scene, omega: Array, displacement: Array) -> Array:
-    carrier = scene.machine.carrier()
-    forces = (carrier.bed_stiffness + 1j * omega * carrier.bed_damping) @ displacement
-    return magnitude(forces[0]) if forces.shape[0] == 1 else jnp.sqrt(jnp.sum(magnitude(forces) ** 2))
-
-
-def _solve_on_piece(scene: Scene, low: Array, high: Array) -> tuple[Array, Array]:
+def _solve_on_piece(model: LinearModel, low: Array, high: Array) -> tuple[Array, Array]:
     """The load speed on a monotone piece at which the branch has the scene's rotor speed, and whether there is one."""
 
+    target = model.scene.drive.speed
+
     def gap(w: Array) -> Array:
-        return jam_rotor_speed(scene, w) - scene.drive.speed
+        return rotor_speed_at(model, w) - target
 
     gap_low, gap_high = jax.vmap(gap)(jnp.stack([jnp.where(low > 0.0, low, high), high]))
-    gap_low = jnp.where(low > 0.0, gap_low, -scene.drive.speed)
+    gap_low = jnp.where(low > 0.0, gap_low, -target)
     exists = (high > low) & (gap_low * gap_high <= 0.0)
     return bracketed_root(gap, low, high, (gap_low, gap_high)), exists

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.averaged import averaged_growth
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import damped_newton
@@ -19,7 +20,6 @@ from jaxvib.steady.jams.phases import (
     PhaseJam,
     PhaseStatus,
     balanced,
-    growth_of,
     influence_of,
     jam_from,
     loads_with_drag,
@@ -331,8 +331,8 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
         start = jnp.where(begins, phase, last)
         influence, answer = influence_of(parts, w)
         factor, angles, good = _phases(parts, influence, w, start)
-        braked = parts._replace(drag=factor * parts.drag)
-        growth = growth_of(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
+        braked = eqx.tree_at(lambda field: field.drag, parts.averaged, factor * parts.drag)
+        growth = averaged_growth(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
@@ -341,8 +341,9 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
 
 def _load_speeds(parts: Parts) -> np.ndarray:
     """Load speeds below the rotor's, closer together near the carrier's resonances at this rotor speed."""
-    nd = parts.mass.shape[0]
-    flow = np.linalg.solve(parts.mass, np.concatenate([-parts.stiffness, -parts.damping], axis=1))
+    mass, nd = np.asarray(parts.model.mass), parts.model.mass.shape[0]
+    stiffness, damping = np.asarray(parts.model.carrier.stiffness), np.asarray(parts.model.damping(parts.speed))
+    flow = np.linalg.solve(mass, np.concatenate([-stiffness, -damping], axis=1))
     poles = np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
     speed = float(parts.speed)
     centres = np.unique(np.abs(poles[np.abs(poles.imag) > 0.0].imag))
@@ -363,7 +364,7 @@ def _regular(parts: Parts) -> np.ndarray:
 def _equal_loads(parts: Parts) -> list[np.ndarray]:
     """Groups of loads that are alike in every number, by their places."""
     rows = np.concatenate(
-        [parts.shake.real, parts.shake.imag, np.stack([parts.unbalance, parts.drag, parts.inertia], 1)], axis=1
+        [parts.direction.real, parts.direction.imag, np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
     )
     _, which = np.unique(rows, axis=0, return_inverse=True)
     return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]

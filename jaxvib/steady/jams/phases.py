@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import loaded_mass, turning, turning_loads
+from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
+from jaxvib.equations.linear import LinearModel, linear_model, peak_force, turning, turning_loads
 from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude
@@ -60,53 +60,54 @@ class PhaseJam(eqx.Module):
         return pattern_word(self.pattern)
 
 
-class Parts(NamedTuple):
-    """A scene as the balance needs it: matrices (nd, nd), what each load shakes (count, nd) complex, and the loads' numbers."""
+class Parts(eqx.Module):
+    """A scene as the balance of torques needs it: its linear model, its averaged equations at the working speed of the rotor,
+    and the `direction` (count, nd), complex, in which each load pushes the coordinates."""
 
-    mass: Array
-    damping: Array
-    stiffness: Array
-    shake: Array
-    unbalance: Array
-    drag: Array
-    inertia: Array
-    speed: Array
+    model: LinearModel
+    averaged: Averaged
+    direction: Array
+
+    @property
+    def unbalance(self) -> Array:
+        """S = m R of each load, (count,) kg m."""
+        return self.averaged.unbalance
+
+    @property
+    def drag(self) -> Array:
+        """b_W R^2 of each load, (count,) N m s."""
+        return self.averaged.drag
+
+    @property
+    def speed(self) -> Array:
+        """The rotor's, rad/s."""
+        return self.averaged.drive.speed
 
 
 def parts_of(scene: Scene) -> Parts:
-    """The scene's matrices and numbers at its own rotor speed, see `Parts`."""
-    carrier, loads = scene.machine.carrier(), turning_loads(scene)
-
-    def each(value: Array) -> Array:
-        return jnp.broadcast_to(value, (loads.count,))
-
+    """The scene's model, equations and directions, see `Parts`."""
+    model, loads = linear_model(scene), turning_loads(scene)
+    carrier, averaged = model.carrier, averaged_model(model)
     stations = jnp.zeros(loads.count, carrier.port.dtype) if carrier.stations is None else carrier.stations
     rows = jax.vmap(carrier.port_at)(stations)
-    speed = scene.drive.speed
     return Parts(
-        mass=loaded_mass(scene),
-        damping=carrier.damping if carrier.gyroscopic is None else carrier.damping + speed * carrier.gyroscopic,
-        stiffness=carrier.stiffness,
-        shake=jnp.einsum("jka,k->ja", rows, turning(carrier)),
-        unbalance=each(loads.mass * loads.radius),
-        drag=each(loads.drag * loads.radius**2),
-        inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
-        speed=speed,
+        model=model,
+        averaged=eqx.tree_at(lambda field: field.drive, averaged, ConstantSpeed(scene.drive.speed)),
+        direction=jnp.einsum("jka,k->ja", rows, turning(carrier)),
     )
 
 
 def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
     """A_jk (count, count) complex and D^-1 P^T (nd, count): what load k does to load j, and to the carrier, per throw."""
-    dynamic = parts.stiffness - omega**2 * parts.mass + 1j * omega * parts.damping
-    answer = eliminate(dynamic, parts.shake.T.astype(dynamic.dtype))
-    return parts.shake.conj() @ answer, answer
+    dynamic = parts.model.dynamic_stiffness(omega, parts.speed)
+    answer = eliminate(dynamic, parts.direction.T.astype(dynamic.dtype))
+    return parts.direction.conj() @ answer, answer
 
 
 def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
     """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
-    turned = jnp.exp(1j * phase)
-    coupled = jnp.conj(turned) * (influence @ (parts.unbalance * turned))
-    return 0.5 * omega**4 * parts.unbalance * coupled.imag
+    turn = jnp.exp(1j * phase)
+    return mean_torque(parts.unbalance, turn, -(omega**4) * (influence @ (parts.unbalance * turn)))
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
@@ -202,10 +203,9 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     influence, answer = influence_of(parts, w)
     torque = torques_at(parts, influence, w, angles)
     z = w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles))
-    carrier = scene.machine.carrier()
-    force = (carrier.bed_stiffness + 1j * w * carrier.bed_damping) @ z
+    force = parts.model.carrier.bed_force(z, 1j * w * z)
     residual = jnp.max(jnp.abs(parts.drag * (parts.speed - w) + torque)) / jnp.max(parts.drag * parts.speed)
-    growth = growth_of(frozen, *jax.lax.stop_gradient((w, angles, z)))
+    growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((w, angles, z)))
 
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
     slip = (frozen.speed - w) / frozen.speed
@@ -213,7 +213,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     at_rest = good & (slip < tiny)
     status = PhaseStatus.where(good, PhaseStatus.found, PhaseStatus.not_converged)
     status = PhaseStatus.where(at_rest, PhaseStatus.with_rotor, status)
-    size = jnp.where(parts.unbalance > 0.0, parts.unbalance, 1.0) / jnp.min(jnp.diagonal(parts.mass))
+    size = jnp.where(parts.unbalance > 0.0, parts.unbalance, 1.0) / jnp.min(jnp.diagonal(parts.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
     there = good & bounded
@@ -231,46 +231,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
         stable=there & (growth < 0.0),
         displacement=kept(z),
         amplitude=kept(magnitude(z)),
-        foundation_force=kept(jnp.sqrt(jnp.sum(magnitude(force) ** 2)) if force.shape[0] > 1 else magnitude(force[0])),
+        foundation_force=kept(peak_force(force)),
         torque=kept(torque),
         residual=residual,
     )
-
-
-def growth_of(parts: Parts, omega: Array, phase: Array, z: Array) -> Array:
-    """Growth of the averaged motion's disturbances, 1/s: its largest eigenvalue but that of a common turn of all phases.
-
-    M (z'' + 2 i w z' - w^2 z) + (C + n G) (z' + i w z) + K z = sum_k S_k P_k ((w + a_k')^2 - i a_k'') exp(i a_k)
-    I_j a_j'' + b_j R_j^2 (w + a_j' - n) + (S_j/2) Im[exp(-i a_j) P_j^H (w^2 z - 2 i w z' - z'')] ... = 0
-    """
-    nd, loads = parts.mass.shape[0], phase.shape[0]
-
-    def flow(state: Array) -> Array:
-        re, im, re_rate, im_rate = (state[k * nd : (k + 1) * nd] for k in range(4))
-        a, rate = state[4 * nd : 4 * nd + loads], state[4 * nd + loads :]
-        y, y_rate = re + 1j * im, re_rate + 1j * im_rate
-        shakes = (parts.unbalance * jnp.exp(1j * a))[:, None] * parts.shake  # (count, nd), S_k P_k exp(i a_k)
-        rest = 2j * omega * y_rate - omega**2 * y
-        right = shakes.T @ (omega + rate) ** 2 - parts.mass @ rest
-        right = right - parts.damping @ (y_rate + 1j * omega * y) - parts.stiffness @ y
-        coupling = 1j * shakes  # its real and imaginary parts tie a'' and z'' together, both ways alike
-        zero = jnp.zeros_like(parts.mass)
-        matrix = jnp.block(
-            [
-                [parts.mass, zero, coupling.real.T],
-                [zero, parts.mass, coupling.imag.T],
-                [0.5 * coupling.real, 0.5 * coupling.imag, jnp.diag(parts.inertia)],
-            ]
-        )
-        torque = parts.drag * (parts.speed - omega - rate) - 0.5 * (coupling.conj() @ rest).real
-        second = eliminate(matrix, jnp.concatenate([right.real, right.imag, torque]))
-        return jnp.concatenate([re_rate, im_rate, second[: 2 * nd], rate, second[2 * nd :]])
-
-    at = jnp.concatenate([z.real, z.imag, jnp.zeros(2 * nd, phase.dtype), phase, jnp.zeros(loads, phase.dtype)])
-    matrix = jax.jacfwd(flow)(at)
-    # Eigenvalues of a matrix that is not finite keep a library busy for ever.
-    finite = jnp.all(jnp.isfinite(matrix))
-    values = jnp.linalg.eigvals(jnp.where(finite, matrix, 0.0))
-    common = jnp.argmin(jnp.abs(values))
-    growth = jnp.max(jnp.where(jnp.arange(values.shape[0]) == common, -jnp.inf, values.real))
-    return jnp.where(finite, growth, jnp.nan)

@@ -11,8 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import bodies, circle, load_torque, torque_slopes
-from jaxvib.equations.linear import dynamic_stiffness, jammed_loads
-from jaxvib.machine.scene import Scene
+from jaxvib.equations.linear import LinearModel, jammed_loads
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.linalg import small_solve
 
@@ -24,24 +23,24 @@ _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
 
-def receptance(scene: Scene, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+def receptance(model: LinearModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
     """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
 
     D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
     """
-    push = scene.machine.carrier().port.T.astype(complex)
+    port = model.carrier.port.T.astype(complex)
 
     def at(k: Array) -> Array:
         w = k * omega
-        return small_solve(dynamic_stiffness(scene, w, speed), w**2 * push)
+        return small_solve(model.dynamic_stiffness(w, speed), w**2 * port)
 
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _answer(scene: Scene, grid: Grid, omega: Array, speed: Array) -> Array:
+def _answer(model: LinearModel, grid: Grid, omega: Array, speed: Array) -> Array:
     """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
-    return -(w**2)[:, None, None] * (scene.machine.carrier().port @ receptance(scene, omega, speed, grid.orders))
+    return -(w**2)[:, None, None] * (model.carrier.port @ receptance(model, omega, speed, grid.orders))
 
 
 def _feedback(grid: Grid, answer: Array) -> Array:
@@ -61,8 +60,8 @@ class _Balance(NamedTuple):
     pull: Array
 
 
-def _balance(scene: Scene, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
-    whole = bodies(scene)
+def _balance(model: LinearModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
+    scene, whole = model.scene, bodies(model.scene)
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = circle(scene, phi)
     along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", whole.unbalance, point) @ grid.analysis)
@@ -82,10 +81,10 @@ def _balance(scene: Scene, grid: Grid, answer: Array, deviation: Array, omega: A
 
 
 def _jacobian(
-    scene: Scene, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+    model: LinearModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
     """d residual / d deviation (G M, G M)."""
-    whole = bodies(scene)
+    scene, whole = model.scene, bodies(model.scene)
     g, m = deviation.shape
     unit = (whole.drag * omega)[:, None]
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
@@ -113,7 +112,7 @@ class PeriodicSolution(NamedTuple):
 
 
 def periodic_motion(
-    scene: Scene, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
+    model: LinearModel, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
 ) -> PeriodicSolution:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
@@ -129,11 +128,13 @@ def periodic_motion(
     Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
     if deviation is None:
-        deviation = jnp.zeros((1 if jammed_loads(scene).alike else scene.loads.count, grid.theta.size), dtype=value.dtype)
+        deviation = jnp.zeros(
+            (1 if jammed_loads(model.scene).alike else model.scene.loads.count, grid.theta.size), dtype=value.dtype
+        )
     frozen = jax.lax.stop_gradient((start, deviation))
-    psi, x = _newton(scene, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
+    psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
     omega, speed = _both(given, value, x)
-    found = _balance(scene, grid, _answer(scene, grid, omega, speed), psi, omega, speed)
+    found = _balance(model, grid, _answer(model, grid, omega, speed), psi, omega, speed)
     return PeriodicSolution(psi, omega, speed, jnp.max(jnp.abs(found.residual)) / found.scale)
 
 
@@ -160,17 +161,17 @@ class _State(NamedTuple):
 
 @eqx.filter_custom_jvp
 def _newton(
-    scene: Scene, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
+    model: LinearModel, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
 ) -> tuple[Array, Array]:
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
-    fixed = given == "omega" and scene.machine.carrier().gyroscopic is None
-    known = _answer(scene, on, value, start) if fixed else None
+    fixed = given == "omega" and model.carrier.gyroscopic is None
+    known = _answer(model, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
     def look(steps: Array, deviation: Array, x: Array, length: Array) -> _State:
-        residual, matrix, scale = _linearised(scene, on, given, value, deviation, x, known)
+        residual, matrix, scale = _linearised(model, on, given, value, deviation, x, known)
         norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
         return _State(steps, deviation, x, residual, matrix, norm, scale, length, norm < tiny * scale, no)
 
@@ -208,35 +209,35 @@ def _newton(
 
 @_newton.def_jvp
 def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
-    scene, value, start, deviation = primals
-    deviation, x = _newton(scene, value, start, deviation, grid=grid, given=given)
+    model, value, start, deviation = primals
+    deviation, x = _newton(model, value, start, deviation, grid=grid, given=given)
     on = grid_of(*grid)
 
-    def equations(scene: Scene, value: Array) -> Array:
+    def equations(model: LinearModel, value: Array) -> Array:
         omega, speed = _both(given, value, x)
-        residual = _balance(scene, on, _answer(scene, on, omega, speed), deviation, omega, speed).residual
+        residual = _balance(model, on, _answer(model, on, omega, speed), deviation, omega, speed).residual
         return jnp.append(residual, 0.0)
 
-    push = eqx.filter_jvp(equations, (scene, value), tangents[:2])[1]
-    change = -jnp.linalg.solve(_linearised(scene, on, given, value, deviation, x, None)[1], push)
+    change = eqx.filter_jvp(equations, (model, value), tangents[:2])[1]
+    change = -jnp.linalg.solve(_linearised(model, on, given, value, deviation, x, None)[1], change)
     return (deviation, x), (change[:-1].reshape(deviation.shape), change[-1])
 
 
 def _linearised(
-    scene: Scene, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
+    model: LinearModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
     if known is None:
-        answer, by_x = jax.jvp(lambda z: _answer(scene, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
+        answer, by_x = jax.jvp(lambda z: _answer(model, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
     else:
         answer, by_x = known, jnp.zeros_like(known)
 
     def residual(z: Array, answer: Array) -> tuple[Array, _Balance]:
-        found = _balance(scene, grid, answer, deviation, *_both(given, value, z))
+        found = _balance(model, grid, answer, deviation, *_both(given, value, z))
         return found.residual.ravel(), found
 
     at, column, found = jax.jvp(residual, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
-    matrix = _jacobian(scene, grid, answer, found, deviation, *_both(given, value, x))
+    matrix = _jacobian(model, grid, answer, found, deviation, *_both(given, value, x))
     return jnp.append(at, jnp.mean(deviation)), _pinned(matrix, column), found.scale
 
 
@@ -249,23 +250,23 @@ class BranchTangent(NamedTuple):
     deviation_error: Array
 
 
-def branch_tangent(scene: Scene, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
+def branch_tangent(model: LinearModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """How the branch goes on from a periodic motion, and how good the motion is.
 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
     harmonic of psi for the deviation.
     """
     deviation, omega, speed = motion.deviation, motion.omega, motion.rotor_speed
-    _, matrix, _ = _linearised(scene, grid, "omega", omega, deviation, speed, None)
+    _, matrix, _ = _linearised(model, grid, "omega", omega, deviation, speed, None)
 
     def residual(w: Array) -> Array:
-        return _balance(scene, grid, _answer(scene, grid, w, speed), deviation, w, speed).residual.ravel()
+        return _balance(model, grid, _answer(model, grid, w, speed), deviation, w, speed).residual.ravel()
 
     by_omega = jax.jvp(residual, (omega,), (jnp.ones_like(omega),))[1]
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
     deviation_k = _deviation_harmonics(grid, deviation)
     there = (deviation_k @ np.exp(1j * grid.deviation_orders[:, None] * fine.theta)).real
-    between = _balance(scene, fine, _answer(scene, fine, omega, speed), there, omega, speed).residual
+    between = _balance(model, fine, _answer(model, fine, omega, speed), there, omega, speed).residual
     low = _deviation_harmonics(fine, between)[:, : grid.deviation_orders.shape[0]]
     seen = (low @ np.exp(1j * grid.deviation_orders[:, None] * grid.theta)).real.ravel()
     # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
@@ -298,17 +299,17 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(scene: Scene, grid: Grid, motion: PeriodicSolution) -> Harmonics:
+def harmonics_of(model: LinearModel, grid: Grid, motion: PeriodicSolution) -> Harmonics:
     """The harmonics of psi and of everything that the carrier does."""
-    carrier = scene.machine.carrier()
+    carrier, scene = model.carrier, model.scene
     point, _ = circle(scene, grid.theta[None] + motion.deviation)
-    push = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
-    answer = receptance(scene, motion.omega, motion.rotor_speed, grid.orders)
-    displacement = jnp.einsum("kdp,pk->dk", answer, push)
+    force = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
+    answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders)
+    displacement = jnp.einsum("kdp,pk->dk", answer, force)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(
         _deviation_harmonics(grid, motion.deviation),
         displacement,
         -(carrier.port @ displacement) * w[None] ** 2,
-        carrier.bed_stiffness @ displacement + 1j * (carrier.bed_damping @ displacement) * w[None],
+        carrier.bed_force(displacement, 1j * w[None] * displacement),
     )

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.folds import fold_points
@@ -97,7 +98,7 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2)
-    crowded, resonances = fold_points(scene, 64)
+    crowded, resonances = _fold_points(scene)
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
     low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)
     high = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
@@ -161,11 +162,16 @@ def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 
 @eqx.filter_jit
+def _fold_points(scene: Scene) -> tuple[Array, Array]:
+    return fold_points(linear_model(scene), 64)
+
+
+@eqx.filter_jit
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
-    start = jax.vmap(lambda w: light_rotor_speed(scene, w))(omega)
-    orbit, growth = orbits(
-        scene, omega, start, "omega", many, jnp.max(jax.vmap(lambda w, n: steps_for(scene, w, n))(omega, start)), accuracy
-    )
+    model = linear_model(scene)
+    start = jax.vmap(lambda w: light_rotor_speed(model, w))(omega)
+    steps = jnp.max(jax.vmap(lambda w, n: steps_for(model, w, n))(omega, start))
+    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy)
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 

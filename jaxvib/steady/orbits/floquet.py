@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import bodies, circle, has_half_turn, torque_slopes
-from jaxvib.equations.linear import jammed_loads, loaded_mass, natural_frequencies
-from jaxvib.machine.scene import Scene
+from jaxvib.equations.linear import LinearModel, jammed_loads
 from jaxvib.numerics.fourier import Grid
+from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 
 __all__ = ["Floquet", "floquet", "steps_for"]
@@ -21,11 +20,10 @@ __all__ = ["Floquet", "floquet", "steps_for"]
 _PHASE = 0.7
 """What the fastest part of the carrier turns through in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
 
-# The tableau's last stage is the step itself, there to be evaluated for the next one.
-_TABLEAU = diffrax.Dopri8.tableau
-_NODES = np.concatenate([[0.0], _TABLEAU.c[:-1]])
-_ROWS = np.stack([np.pad(row, (0, len(_NODES) - len(row))) for row in [np.zeros(0), *_TABLEAU.a_lower[:-1]]])
-_WEIGHTS = _TABLEAU.b_sol[:-1]
+# The method's last stage is the end of the step, there to be evaluated for the next one.
+_NODES = np.concatenate([[0.0], NODES[:-1]])
+_ROWS = np.pad(ROWS[:-1, : len(_NODES)], ((1, 0), (0, 0)))
+_WEIGHTS = ROWS[-1]
 
 
 class Floquet(NamedTuple):
@@ -42,15 +40,15 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-def steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
+def steps_for(model: LinearModel, omega: Array, speed: Array) -> Array:
     """How many integration steps a turn of the grid asks for at the load speed `omega` and the rotor's `speed` (rad/s)."""
-    carrier = scene.machine.carrier()
-    half = jnp.linalg.inv(jnp.linalg.cholesky(loaded_mass(scene)))
+    carrier = model.carrier
+    half = jnp.linalg.inv(jnp.linalg.cholesky(model.mass))
     decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
-    fastest = jnp.maximum(jnp.max(natural_frequencies(scene)), decay)
+    fastest = jnp.maximum(jnp.max(model.modes()[0]), decay)
     if carrier.gyroscopic is not None:
         fastest = fastest + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
-    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    turn = np.pi if has_half_turn(model.scene) else 2.0 * np.pi
     return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
 
 
@@ -66,7 +64,7 @@ class _Coefficients(NamedTuple):
     by_rate: Array
 
 
-def floquet(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
+def floquet(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
     """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
@@ -82,8 +80,8 @@ def floquet(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmo
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
     derivatives exist) or a scalar array.
     """
-    carrier, whole = scene.machine.carrier(), bodies(scene)
-    mass = loaded_mass(scene)
+    scene, carrier, mass = model.scene, model.carrier, model.mass
+    whole = bodies(scene)
     nd, count = mass.shape[0], whole.inertia.shape[0]
     inverse = jnp.linalg.inv(mass)
     stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping

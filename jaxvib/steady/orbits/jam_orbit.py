@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import has_half_turn
-from jaxvib.equations.linear import jammed_loads
+from jaxvib.equations.linear import jammed_loads, linear_model
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -101,7 +101,7 @@ def jam_orbit(
 
     exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
     if mode is not None:
-        if frozen.machine.carrier().gyroscopic is not None:
+        if frozen.machine.structure().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
         jam = jam_modes(frozen).select(mode, throw=False)
         direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
@@ -113,7 +113,7 @@ def jam_orbit(
     value = scene.drive.speed
     if omega is not None:
         value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
-        which, start = "omega", light_rotor_speed(frozen, jax.lax.stop_gradient(value))
+        which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
 
     half = has_half_turn(scene)
     if points is None and not concrete:
@@ -121,7 +121,7 @@ def jam_orbit(
     tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
     still = jax.lax.stop_gradient(value)
     # Reverse-mode derivatives ask for a number of steps that is part of the program.
-    steps = steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
+    steps = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
     static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
     many, found, settle = tried[0], None, False
@@ -154,6 +154,21 @@ def jam_orbit(
 
 
 @eqx.filter_jit
+def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
+    return light_rotor_speed(linear_model(scene), omega)
+
+
+@eqx.filter_jit
+def _steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
+    return steps_for(linear_model(scene), omega, speed)
+
+
+@eqx.filter_jit
+def _fold_points(scene: Scene) -> tuple[Array, Array]:
+    return fold_points(linear_model(scene), _SEARCH)
+
+
+@eqx.filter_jit
 def _orbit(
     scene: Scene,
     value: Array,
@@ -167,11 +182,11 @@ def _orbit(
     settle: bool = False,
 ) -> Orbit:
     """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
-    deviation = None
+    model, deviation = linear_model(scene), None
     if settle:
         grid = grid_of(points, has_half_turn(scene))
-        deviation = periodic_motion(scene, grid, "omega", start, light_rotor_speed(scene, start)).deviation[None]
-    lanes, _ = orbits(scene, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, deviation)
+        deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model, start)).deviation[None]
+    lanes, _ = orbits(model, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, deviation)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
     there = exists
@@ -187,7 +202,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
 
     The exact branch n(Omega) is looked at point by point, cut where it turns, and its pieces numbered as `jam_modes` does.
     """
-    crowded, resonances = fold_points(scene, _SEARCH)
+    crowded, resonances = _fold_points(scene)
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
     crowded = np.sort(np.append(crowded, target))
     omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
@@ -223,13 +238,13 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 @eqx.filter_jit
 def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds and slopes of exact jams at load speeds, in batches; NaN where there is none."""
-    grid = grid_of(*((16, True) if has_half_turn(scene) else (33, False)))
+    model, grid = linear_model(scene), grid_of(*((16, True) if has_half_turn(scene) else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:
-        motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
+        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model, w))
         there = motion.residual < 4096.0 * jnp.finfo(w.dtype).eps
         return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(
-            there, branch_tangent(scene, grid, motion).slope, jnp.nan
+            there, branch_tangent(model, grid, motion).slope, jnp.nan
         )
 
     return jax.lax.map(jax.vmap(one), omega)

@@ -9,11 +9,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import bodies, circle, each_load, has_half_turn, load_torque, rotor_torque, torque_of_each
-from jaxvib.equations.linear import jammed_loads
-from jaxvib.machine.scene import Scene
+from jaxvib.equations.linear import LinearModel, jammed_loads
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.orbits.collocation import (
     Harmonics,
     Parameter,
@@ -123,17 +122,17 @@ class Orbit(eqx.Module):
         )
 
 
-def light_rotor_speed(scene: Scene, omega: Array) -> Array:
+def light_rotor_speed(model: LinearModel, omega: Array) -> Array:
     """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
 
     Where the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
     it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
     """
-    if scene.machine.carrier().gyroscopic is None:
-        return jam_rotor_speed(scene, omega)
+    if model.carrier.gyroscopic is None:
+        return rotor_speed_at(model, omega)
 
     def residual(n: Array) -> Array:
-        return n - jam_rotor_speed(scene, omega, n)
+        return n - rotor_speed_at(model, omega, n)
 
     speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
     above = jax.vmap(residual)(speeds) > 0.0
@@ -142,7 +141,7 @@ def light_rotor_speed(scene: Scene, omega: Array) -> Array:
 
 
 def orbits(
-    scene: Scene,
+    model: LinearModel,
     value: Array,
     start: Array,
     given: Parameter,
@@ -151,20 +150,21 @@ def orbits(
     accuracy: float,
     deviation: Array | None = None,
 ) -> tuple[Orbit, Floquet]:
-    """Many exact jams of one scene: `value` (P,) what is given of each, `start` (P,) where the other speed starts from,
+    """Many exact jams of one machine: `value` (P,) what is given of each, `start` (P,) where the other speed starts from,
     `deviation` (P, G, M) where psi does.
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
+    scene = model.scene
     grid = grid_of(points, has_half_turn(scene))
 
     def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
-        motion = periodic_motion(scene, grid, given, v, s, deviation)
-        harmonics = harmonics_of(scene, grid, motion)
-        return motion, harmonics, _measured(scene, grid, motion, harmonics)
+        motion = periodic_motion(model, grid, given, v, s, deviation)
+        harmonics = harmonics_of(model, grid, motion)
+        return motion, harmonics, _measured(model, grid, motion, harmonics)
 
     motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
-    growth = floquet(scene, grid, motion, harmonics, steps)
+    growth = floquet(model, grid, motion, harmonics, steps)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
@@ -207,31 +207,31 @@ def orbits(
         force_harmonics=or_nan(harmonics.force),
         deviation_orders=tuple(map(int, grid.deviation_orders)),
         orders=tuple(map(int, grid.orders)),
-        units=scene.machine.structure().units,
+        units=model.carrier.units,
         offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
     )
     return orbit, growth
 
 
-def _measured(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
+def _measured(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
     """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
-    branch = branch_tangent(scene, grid, motion)
+    scene, branch = model.scene, branch_tangent(model, grid, motion)
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, acceleration, rotor_torque), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
-    push = _least_push(scene, grid, motion, harmonics)
+    push = _least_push(model, grid, motion, harmonics)
     return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
 
 
-def _least_push(scene: Scene, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
+def _least_push(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
     vibration that holds a jam presses the loads together at every instant.
     """
-    loads = jammed_loads(scene)
+    scene, loads = model.scene, jammed_loads(model.scene)
     if loads.own_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
     phi, rate = each_load(scene, grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))

@@ -14,6 +14,7 @@ from jax import Array
 
 from jaxvib.draw.comparison import convergence_chart
 from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -73,10 +74,10 @@ def harmonic_convergence(
 
 @eqx.filter_jit
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    grid = grid_of(points, has_half_turn(scene))
+    model, grid = linear_model(scene), grid_of(points, has_half_turn(scene))
 
     def one(w: Array) -> tuple[Array, Array]:
-        motion = periodic_motion(scene, grid, "omega", w, light_rotor_speed(scene, w))
-        return motion.rotor_speed, branch_tangent(scene, grid, motion).speed_error
+        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model, w))
+        return motion.rotor_speed, branch_tangent(model, grid, motion).speed_error
 
     return jax.vmap(one)(omega)

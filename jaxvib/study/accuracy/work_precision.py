@@ -16,7 +16,6 @@ from jaxvib.equations.collected import has_half_turn
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
@@ -156,7 +155,7 @@ class _Jam(NamedTuple):
 
 
 def _exact_jam(scene: Scene, mode: int | None) -> _Jam:
-    if not isinstance(scene.drive, ConstantSpeed):
+    if not scene.drive.constant:
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
     modes = jam_modes(scene)
     if mode is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -130,9 +130,10 @@ def run_ups(
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
-    if not isinstance(scene.loads, CircularLoads):
+    if not scene.loads.circular:
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle")
-    given = scene.loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
+    loads = cast(CircularLoads, scene.loads)
+    given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
     if drag is None and given.ndim:
         raise InputError("loads.drag", "differs from load to load; name the values of `drag` to run up with")
     drags = jnp.atleast_1d(given)

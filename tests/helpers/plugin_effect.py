@@ -1,0 +1,24 @@
+"""An effect from outside the package: friction in the loads' bearings that does not depend on their load (a seal's)."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.effects.base import Effect, Friction
+
+
+class SealFriction(Effect):
+    """A torque `torque` tanh(slip / `width`), N m, of the rotor on each load, slip = the rotor's speed less the load's."""
+
+    half_turn_symmetric = True
+
+    torque: Array
+    width: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, torque, width):
+        self.torque, self.width, self.kind = jnp.asarray(torque), jnp.asarray(width), "seal_friction"
+
+    def friction(self, loads, u, rate, speed, g):
+        slip = speed - rate[0]
+        return Friction(self.torque * jnp.tanh(slip / self.width), jnp.ones_like(slip), None)

@@ -1,0 +1,37 @@
+"""Loads from outside the package with two coordinates: points that slide in a torus, drag about the axis only."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.loads import Loads
+
+
+class TorusPoints(Loads):
+    """p = ((R + rho sin a) cos f, (R + rho sin a) sin f, -rho cos a), u = (f, a); drag b_W (R + rho)^2 (f' - speed)."""
+
+    mass: Array
+    radius: Array
+    tube: Array
+    drag: Array
+    count: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, mass, radius, tube, drag, count):
+        self.mass, self.radius, self.tube, self.drag = (jnp.asarray(x) for x in (mass, radius, tube, drag))
+        self.count, self.kind = count, "torus_point"
+
+    def position(self, *u):
+        f, a = u
+        arm = self.radius + self.tube * jnp.sin(a)
+        return arm * jnp.cos(f), arm * jnp.sin(f), -self.tube * jnp.cos(a)
+
+    def rest(self):
+        """At the outer equator."""
+        return jnp.full((self.count,), -0.5 * jnp.pi), jnp.full((self.count,), 0.5 * jnp.pi)
+
+    def inertia_factor(self):
+        return jnp.ones_like(self.mass)
+
+    def resistance(self, u, rate, speed):
+        return self.drag * (self.radius + self.tube) ** 2 * (speed - rate[0]), jnp.zeros_like(rate[1])
