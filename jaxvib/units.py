@@ -18,7 +18,7 @@ from jaxvib.errors import InputError
 __all__ = ["FIELD_UNITS", "Number", "count", "number", "numbers", "to_float", "traced"]
 
 Number = Any
-"""What the edges accept as a number: a float, an array, a traced value, a string with a unit, a pint quantity."""
+"""A number as public functions accept it: a float, an array, a traced value, a string with a unit, a pint quantity."""
 
 
 _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_](?:(?!\s\d)[^,;()])*)")

@@ -1,4 +1,4 @@
-"""What is wanted of a design: numbers of a scene that a search makes small, or keeps."""
+"""Quantities of a scene that a search minimises or holds."""
 
 from __future__ import annotations
 

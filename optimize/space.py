@@ -1,4 +1,4 @@
-"""What may change in a design, between which bounds, and what must not."""
+"""The design space: free numbers of a scene, their bounds, and quantities that are held."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ class Synthesis:
 
 
 def wanted(objective: str) -> str:
-    """What a search is after, in words."""
+    """The objective in words."""
     return f"greatest {objective.removeprefix('negative ')}" if objective.startswith("negative ") else f"least {objective}"
 
 
@@ -136,7 +136,7 @@ def _show(value: float | list[float]) -> str:
 
 
 def amplitude_names(scene: Scene) -> list[str]:
-    """What the amplitude of each coordinate is called: that of platform 1 is the coordinate y1's."""
+    """Names of the coordinates' amplitudes: that of platform 1 is the coordinate y1's."""
     names = scene.machine.structure().coordinates
     if not isinstance(scene.machine, Platforms):
         return [f"amplitude of {name}" for name in names]

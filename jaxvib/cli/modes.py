@@ -90,7 +90,7 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
-    """What a table of light loads' jams does not hold, in a line; none where nothing is out of balance."""
+    """A line on the effects that a table of light loads' jams leaves out; none where the rotor is balanced."""
     named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if effect.has_imbalance)
     return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 

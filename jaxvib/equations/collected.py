@@ -1,4 +1,4 @@
-"""Collected loads as bodies, and what turns them."""
+"""Collected loads as rigid bodies, and the torques on them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def each_load(scene: Scene, phi: Points, rate: Array) -> tuple[Array, Array]:
 
 
 def rotor_torque(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
-    """What the rotor turns loads at angles `phi` with, N m: viscous resistance and dry friction.
+    """The rotor's torque on loads at angles `phi`, N m: viscous resistance and dry friction.
 
     `a` (np, ...): the port's acceleration, m/s^2.
     """
@@ -86,7 +86,7 @@ def rotor_torque(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array)
 
 
 def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
-    """What turns loads at angles `phi` besides the vibration, N m: the rotor and effects; `a` as in `rotor_torque`."""
+    """The torque of the rotor and of effects on loads at angles `phi`, N m; `a` as in `rotor_torque`."""
     # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
     acting = (effect for effect in scene.effects if not effect.couples_loads)
     forces = (effect.load_force(scene.loads, (jnp.asarray(phi),)) for effect in acting)
@@ -96,7 +96,7 @@ def torque_of_each(scene: Scene, phi: Points, rate: Array, speed: Array, a: Arra
 def load_torque(
     scene: Scene, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] = torque_of_each
 ) -> Array:
-    """What turns the bodies at angles `phi` (G, M), the sum `of_each` over the loads of each, (G, M); `a` (np, M)."""
+    """The torque on the bodies at angles `phi` (G, M), N m, the sum `of_each` over the loads of each, (G, M); `a` (np, M)."""
     loads = jammed_loads(scene)
     if not loads.alike:
         return jax.vmap(lambda p, r, x: of_each(scene, p, r, speed, x), in_axes=1, out_axes=1)(phi, rate, a)

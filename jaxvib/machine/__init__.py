@@ -1,1 +1,1 @@
-"""What is built: frozen parameters, no time."""
+"""The parameters of a scene: machine, loads, drive, effects; frozen, without time."""

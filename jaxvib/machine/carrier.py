@@ -80,7 +80,7 @@ class Carrier(eqx.Module):
 
 
 class Machine(eqx.Module):
-    """What is built, in the designer's own numbers. A new kind of machine is a new subclass with its matrices."""
+    """A machine in the designer's own numbers. A new kind of machine is a new subclass with its matrices."""
 
     kind: eqx.AbstractVar[str]
 

@@ -1,4 +1,4 @@
-"""What turns the rotor."""
+"""Drives: ideal ones, which give the rotor's speed, and motors of limited power."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Rotor = tuple[Array, Array] | None
 
 
 class Drive(eqx.Module):
-    """What turns the rotor; `speed` is the one it works at, without a load.
+    """The drive of the rotor; `speed` is its working speed without a load, rad/s.
 
     An `IdealDrive` turns the rotor at speeds that no load can change; with a `Motor` the rotor's angle and speed are states.
     """

@@ -39,7 +39,7 @@ class StepControl(eqx.Module):
 
 @cached
 def natural_units(scene: Scene) -> State:
-    """What counts as 1 in each part of the state: the loads' unbalance radius S/M, that at the rotor's speed; 1 rad."""
+    """Natural units of the state: the loads' unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed."""
     carrier, loads = scene.machine.carrier(), scene.loads
     across, up, *_ = loads.position(*loads.rest())
     unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))

@@ -38,7 +38,7 @@ class Friction(NamedTuple):
 
 
 class Imbalance(NamedTuple):
-    """What is out of balance in a rotor: `static` (across, up) kg m, `moment` about the tilts kg m^2."""
+    """A rotor's imbalance: `static` (across, up) kg m, `moment` about the tilts kg m^2."""
 
     static: tuple[Array, Array]
     moment: tuple[Array, Array]
@@ -95,7 +95,7 @@ class Effect(eqx.Module):
         return None
 
     def imbalance(self, angle: Array) -> Imbalance | None:
-        """What is out of balance in the rotor at its `angle`, see `Imbalance`; or None."""
+        """The rotor's imbalance at its `angle`, see `Imbalance`; or None."""
         return None
 
     def place(self, carrier: Carrier) -> Array | None:

@@ -1,1 +1,1 @@
-"""What is read off a motion in time."""
+"""Amplitudes, speeds and regimes of a motion in time."""

@@ -1,4 +1,4 @@
-"""What kind of motion a run has come to, with the evidence."""
+"""The regime of a motion: swinging, jammed, balanced, ..., with the evidence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOCKED = 0.1
 """Relative phases that move by less than this between two halves of the window count as fixed, rad."""
 
 _BALANCED = 0.02
-"""What may be left out of balance, relative to what the loads would make together."""
+"""Residual unbalance below which loads count as balancing the rotor, relative to the loads' own at one angle."""
 
 
 class RegimeName(eqx.Enumeration):
@@ -191,7 +191,7 @@ def _relative(angle: Array, half: int) -> tuple[Array, Array]:
 
 
 def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
-    """What is left out of balance when loads stand at `phase` to the rotor, relative to all of them at one angle.
+    """Residual unbalance of loads at `phase` to the rotor, relative to that of all loads at one angle.
 
     Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
     none to the rotor's radius of gyration.

@@ -1,4 +1,4 @@
-"""How far states are apart, each part of them in a unit of its own."""
+"""The scaled difference of two states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["error_scale", "scaled_error", "turned"]
 
 
 def error_scale(state: State, unit: State) -> State:
-    """What differences to a state count relative to, a number for each part of it.
+    """The scales of differences between states, one for each part of the state.
 
     Of displacements and velocities it is the largest of all, but no less than the natural unit: a motion that is at rest has
     none of its own. Of angles and speeds it is the natural unit, 1 rad and the rotor's speed.

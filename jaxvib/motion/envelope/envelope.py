@@ -67,7 +67,7 @@ class _Tolerance(WrappedController):
 
 
 class _Units(eqx.Module):
-    """What counts as 1: the throw S/M of the loads, that times the rotor's speed, the rotor's speed; 1 rad."""
+    """The units: the unbalance radius S/M of the loads, that times the rotor's speed, the rotor's speed; 1 rad."""
 
     length: Array
     speed: Array

@@ -1,4 +1,4 @@
-"""How small errors of the balanced motion go round with the rotor."""
+"""The balanced motion and its monodromy matrix over a turn of the rotor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def at_constant_speed(scene: Scene) -> Scene:
 
 
 def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
-    """What one turn of the rotor makes of small errors of the balanced motion, (2 (nd + N), 2 (nd + N)).
+    """The monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
 
         x' = A(n t) x,  x = (q / R, q' / (R n), dphi, dphi' / n),     monodromy = x(turn) for x(0) = 1
 

@@ -18,7 +18,7 @@ __all__ = ["picture"]
 
 
 class _Branch(Protocol):
-    """What a branch has, an entry a point along the load speed."""
+    """The arrays of a branch that are drawn, an entry a point along the load speed."""
 
     omega: Array
     rotor_speed: Array

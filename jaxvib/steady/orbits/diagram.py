@@ -176,7 +176,7 @@ def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
 
 
 _KINDS = ("torus", "half_turn", "half_turn", "symmetry")
-"""What a sign change of each test means; where there is no half-turn, s = -1 is a period doubling."""
+"""The bifurcation that a sign change of each test means; where there is no half-turn, s = -1 is a period doubling."""
 
 
 def _tests(growth: Floquet) -> Array:

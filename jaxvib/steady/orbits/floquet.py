@@ -1,4 +1,4 @@
-"""Floquet multipliers: whether a periodic jam lasts."""
+"""Floquet multipliers of periodic jams."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 __all__ = ["Floquet", "floquet", "steps_for"]
 
 _PHASE = 0.7
-"""What the fastest part of the carrier turns through in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
+"""Phase of the carrier's fastest motion in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
 
 # The method's last stage is the end of the step, there to be evaluated for the next one.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
@@ -53,8 +53,8 @@ def steps_for(model: LinearModel, omega: Array, speed: Array) -> Array:
 
 
 class _Coefficients(NamedTuple):
-    """What of the orbit enters the linear equations at one angle: s e', what is left of it as the loads give way to the port
-    (dry friction takes a part), derivatives of s e' (np, G, P); the rest (G, P)."""
+    """The coefficients of the linear equations at one angle of the orbit: `moving` s e', `giving` the same less the share of
+    dry friction, `moving1` and `moving2` derivatives of s e', (np, G, P); `by_angle`, `by_rate` of the torque, (G, P)."""
 
     moving: Array
     giving: Array

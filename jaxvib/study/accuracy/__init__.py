@@ -1,1 +1,1 @@
-"""What accuracy costs."""
+"""The cost of accuracy: work-precision diagrams, tiers, harmonics."""

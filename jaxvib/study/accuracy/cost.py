@@ -1,4 +1,4 @@
-"""What ways of computing one quantity cost: rows of a table, the cheapest of them, the figure."""
+"""Costs of the ways to compute one quantity: rows of a table, the cheapest of them, the figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the leading order is worth: jams of light-load theory against exact ones as the loads get heavier."""
+"""The error of the leading order: jams of light-load theory against exact ones as the loads get heavier."""
 
 from __future__ import annotations
 

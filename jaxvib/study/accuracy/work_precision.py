@@ -1,4 +1,4 @@
-"""What accuracy costs in time: one quantity of a scene, computed in every way there is."""
+"""Work-precision: error against seconds of one quantity of a scene, computed in every way there is."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def _integrated(
     start: State,
     length: Callable[[float], float],
 ) -> tuple[list[CostRow], list[str]]:
-    """What comes out at the end of averaged and full runs, of a `length` for each tolerance."""
+    """The quantity at the end of averaged and full runs, of a `length` for each tolerance."""
     full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []
     for tolerance in _AVERAGED:
         end = length(tolerance)

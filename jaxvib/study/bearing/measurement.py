@@ -17,11 +17,11 @@ __all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
 
 
 _FIELDS = {"file": "file", "columns": "columns", "angle_unit": "angle_unit", "from": "from_", "until": "until"}
-"""What a record's fields are called in a file, where `from` is no word of Python's, and here."""
+"""Names of a record's fields in a file, where `from` is no word of Python's, and here."""
 
 
 class Measurement(NamedTuple):
-    """What `identify` is called with: `pendulum`, `record`, `dry`, `instrument`."""
+    """The arguments of `identify`: `pendulum`, `record`, `dry`, `instrument`."""
 
     pendulum: BearingPendulum
     record: Record

@@ -81,7 +81,7 @@ class RotorRegimes(NamedTuple):
     until: float
 
     def said(self, variant: str, k: int) -> str:
-        """What the variant does at the k-th mu from the first start, in words."""
+        """The regime of the variant at the k-th mu from the first start, in words."""
         found = self.computed[variant]
         kind = str(found.kind[k, 0])
         if kind == "jammed":
