@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,9 +15,13 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.units import count
 from optimize.quantities import Pair, Quantity, between, force_per_amplitude
@@ -66,8 +71,7 @@ class Outcome:
         }
 
 
-@dataclass(frozen=True)
-class Synthesis:
+class Synthesis(Result):
     """What a search found.
 
     **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
@@ -78,7 +82,9 @@ class Synthesis:
     starts) of the objective; `objective` and `unit` its name and unit.
     """
 
-    scene: Scene
+    status = Computed.done
+
+    scene: Scene = eqx.field(metadata=SCENE)
     before: Outcome
     after: Outcome
     verified: Outcome | None
@@ -88,10 +94,10 @@ class Synthesis:
     drawn: int
     converged: int
     same: int
-    designs: np.ndarray
-    values: np.ndarray
-    done: np.ndarray
-    history: np.ndarray
+    designs: np.ndarray = eqx.field(metadata=in_unit("", "start", "parameter"))
+    values: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    done: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    history: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
     objective: str
     unit: str
 
