@@ -26,7 +26,7 @@ from optimize.synthesize import Outcome, Synthesis
 
 DATA = pathlib.Path(__file__).parent / "data"
 MACHINE = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
-SCENE = jv.Scene(MACHINE, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed("60 rad/s"))
+SCENE = jv.Scene(MACHINE, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
 ROTOR = jv.Scene(
     jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0),
     jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04),

@@ -4,7 +4,7 @@
 
 import abc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, final
+from typing import TYPE_CHECKING, Any, Self, final
 
 import equinox as eqx
 
@@ -28,7 +28,7 @@ class Result(eqx.Module):
     A class that is a `Result` is final: none is made of another by inheritance.
     """
 
-    outer_axes: ClassVar[tuple[str, ...]] = ()
+    outer_axes = ()
     """Names of the axes that "*" stands for in the metadata of fields."""
 
     if TYPE_CHECKING:  # to a type checker an abstract field is one that no constructor takes
