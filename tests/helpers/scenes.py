@@ -1,6 +1,20 @@
 """The scenes that tests go through: one of every machine, load and effect."""
 
+import jax.numpy as jnp
+import numpy as np
+
 import jaxvib as jv
+
+TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
+BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
+ROTOR = dict(
+    mass=37.0,
+    transverse_inertia=0.479,
+    polar_inertia=0.093,
+    stiffness=(6e5, 5e5),
+    damping=400.0,
+    position=(0.165, -0.155),
+)
 
 
 def machines():
@@ -45,3 +59,10 @@ def published(speed=3.0, eps=1e-3, damping=0.01, count=1, form="antiphase", **mo
     """The machine of the antiphase paper, equation (40)."""
     numbers = dict(natural=(1 / 3, 1 / 3), damping=(damping, damping), link_natural=2 / 3, link_damping=damping, rho=1.0)
     return jv.Dimensionless(form, **{**numbers, "eps": eps, "beta": 1.0, "speed": speed, "count": count, **more})
+
+
+def some_state(s):
+    n, nd = s.loads.count, s.machine.carrier().mass.shape[0]
+    rng = np.random.default_rng(0)
+    draw = [jnp.asarray(rng.normal(size=k)) for k in (nd, nd, n, n)]
+    return jv.State(draw[0], draw[1], (draw[2],), (30.0 + draw[3],))

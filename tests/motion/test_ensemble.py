@@ -1,4 +1,4 @@
-"""Many runs at once: errors of each alone, steps that are taken, single precision, and programs that are not made again."""
+"""Ensembles: many runs in lanes, their errors and their seconds."""
 
 import logging
 
@@ -6,11 +6,28 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scenes import published
+import pytest
+from scenes import published, some_state
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
 from jaxvib.motion.integrate import natural_units
+
+
+def test_an_ensemble_is_a_loop_of_runs():
+    s = published(speed=3.0, eps=0.05).scene()
+    start, speeds = some_state(s), jnp.linspace(2.0, 4.0, 7)
+
+    def make(n):
+        return eqx.tree_at(lambda x: x.drive.speed, s, n), start
+
+    many = jv.ensemble(make, speeds, 20.0, steps=4000, lanes=3)
+    for k in (0, 3, 6):
+        run = jv.simulate(make(speeds[k])[0], 20.0, start=start, tolerance=1e-12, save="window", estimate=False)
+        last = jax.tree.map(lambda x: x[-1], run.window.state)
+        for a, b in zip(jax.tree.leaves(many.state), jax.tree.leaves(last), strict=True):
+            np.testing.assert_allclose(a[k], b, atol=float(many.error[k]) * 100.0 + 1e-9)
+    assert float(many.error.max()) < 1e-6 and many.load_speed.shape == (7, 1)
 
 
 def make(value):
@@ -139,3 +156,21 @@ def test_single_precision_keeps_its_phase():
     np.testing.assert_allclose(single.load_speed[:, 0], speeds, rtol=1e-5)
     np.testing.assert_allclose(single.load_speed, double.load_speed, rtol=1e-5)
     assert np.all(single.error < 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (dict(values=jnp.zeros(())), "values has leading axes"),
+        (dict(values=(jnp.zeros(2), jnp.zeros(3))), "values has leading axes"),
+        (dict(lanes=0), "lanes is 0"),
+        (dict(steps=0), "steps is 0"),
+        (dict(make=lambda v: v), "make gives"),
+    ],
+)
+def test_ensembles_that_cannot_be(change, says):
+    s = published().scene()
+    given = {"make": lambda n: eqx.tree_at(lambda x: x.drive.speed, s, n), "values": jnp.ones(2), "until": 1.0, **change}
+    with pytest.raises(jv.InputError) as caught:
+        jv.ensemble(**given)
+    assert says in str(caught.value)

@@ -1,4 +1,4 @@
-"""Regimes are named from a motion alone; motors, dry friction and the published rotor end where they should."""
+"""Regimes are named from a motion alone; motors and dry friction end where they should."""
 
 import diffrax
 import equinox as eqx
@@ -9,7 +9,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
-from jaxvib.study.maps.published_rotor import published_rotor, rotor_regimes
+from jaxvib.study.maps.published_rotor import published_rotor
 
 TIME = jnp.linspace(0.0, 1.0, 801)
 
@@ -146,97 +146,6 @@ def test_stiff_dry_friction_by_an_implicit_solver():
     s = rubbing(4e-3, 1e-2)
     explicit, implicit = slipped(s, 0.2), slipped(s, 0.2, tolerance=1e-7, solver=diffrax.Kvaerno5())
     np.testing.assert_allclose(explicit, implicit, atol=1e-9)
-
-
-def test_published_rotor_at_three_frictions():
-    """First jam 169.6 rad/s with ripple 3.1, second 271.1 in opposite pairs, and balancing, with the data read as c2 = 0."""
-    first = rotor_regimes([9.2e-4, 1.24e-2], ["uncoupled, both dampers"], until=6.0)
-    found = first.computed["uncoupled, both dampers"]
-    assert found.kind[:, 0].tolist() == ["jammed", "jammed"]
-    np.testing.assert_allclose(found.omega[:, 0], [169.6, 271.15], atol=0.1)
-    np.testing.assert_allclose(found.regime.ripple[0, 0], 3.1, atol=0.1)
-    # The torque balance at unequal phases, started from the phases of the run, gives the speed the run has locked to.
-    for k, mu in enumerate(first.mu):
-        jam = jv.phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
-        assert bool(jam.stable)
-        np.testing.assert_allclose(jam.omega, found.omega[k, 0], atol=0.1)
-    assert "together" in first.said("uncoupled, both dampers", 0)
-    assert "opposite" in first.said("uncoupled, both dampers", 1)
-    assert "169.6" in first.summary()
-
-
-@pytest.mark.slow
-def test_published_rotor_over_its_whole_friction():
-    """What the paper reports, what its printed data give, and which readings bring it out; all at once."""
-    mu = [5e-5, 9.2e-4, 1.0e-3, 1.02e-2, 1.8e-2, 4.6e-2, 1e-1]
-    early, late = rotor_regimes(mu, until=4.0), rotor_regimes(mu, until=12.0)
-
-    def words(found, variant):
-        return [str(kind) for kind in found.computed[variant].kind[:, 0]]
-
-    printed = early.computed["printed"]
-    assert words(early, "printed")[1] != "jammed"  # no stable first jam with the printed c2
-    np.testing.assert_allclose(printed.omega[3, 0], 271.1, atol=0.1)
-    plain = words(late, "uncoupled")
-    assert plain[:2] == ["swinging", "jammed"] and plain[2] != "jammed"
-    assert words(late, "uncoupled, both dampers")[4] == "balanced"
-    # "Turns with the rotor, not balanced" is a matter of when one looks.
-    assert words(early, "uncoupled, both dampers")[5] == "unbalanced"
-    assert words(late, "uncoupled, both dampers")[5:] == ["balanced", "balanced"]
-
-
-@pytest.mark.slow
-def test_first_jam_is_reached_from_equal_starts_only():
-    """The first of 201 starts hangs together; one program for all, which takes longer to compile than to run."""
-    s = published_rotor(9.2e-4, "uncoupled")
-    together, scattered = np.full((1, 4), -np.pi / 2.0), np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 4))
-    found = jv.run_ups(s, 6.0, angles=np.concatenate([together, scattered]), batch=8, tolerance=1e-6)
-    assert np.all(found.finished)
-    near_first = (found.kind[0] == "jammed") & (np.abs(found.omega[0] - 169.6) < 0.1)
-    assert near_first[0] and np.mean(near_first[1:]) < 0.05
-
-
-def test_run_ups_name_each_lane():
-    s = jv.Scene(
-        jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
-        jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
-        jv.SpinUp(60.0, duration=1.0),
-    )
-    found = jv.run_ups(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], tolerance=1e-5)
-    assert found.kind.shape == (2, 2) and np.all(found.finished)
-    assert np.all(found.fraction("jammed") + found.fraction("unbalanced") + found.fraction("balanced") <= 1.0)
-    assert not np.any(found.fraction("failed"))
-    lone = eqx.tree_at(lambda s: s.loads.drag, s, jnp.asarray(5.0))
-    start = eqx.tree_at(lambda y: y.angle, jv.initial_state(lone), (jnp.array([1.0, 2.0]),))
-    run = jv.simulate(lone, 5.0, start=start, save="window", tolerance=1e-5)
-    assert run.regime.label == found.kind[1, 1]
-    np.testing.assert_allclose(found.omega[1, 1], run.omega, rtol=1e-6)
-    assert len(found.plot().axes) == 2
-    lines = found.summary().splitlines()
-    assert lines[0] == "of 2 starts at each drag" and lines[1].startswith("drag 0.05 N s/m: ")
-    for line, kinds in zip(lines[1:], found.kind, strict=True):
-        assert all(f"{50 * np.sum(kinds == kind)} % {kind}" in line for kind in kinds)
-    with pytest.raises(jv.InputError, match=r"angles has shape \(1, 3\)"):
-        jv.run_ups(s, 5.0, angles=[[0.0, 0.1, 0.2]])
-    with pytest.raises(jv.InputError, match="goes without angles"):
-        jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
-
-
-def test_run_ups_that_fail_are_no_motion():
-    """In single precision, whose tolerance nobody has named; one drag is none at all."""
-    with jax.enable_x64(False):
-        s = jv.Scene(
-            jv.one_mass(mass=20.0, stiffness=4e4, damping=60.0),
-            jv.balls(count=1, mass=0.4, radius=0.08, drag=0.5),
-            jv.SpinUp(60.0, duration=0.5),
-        )
-        found = jv.run_ups(s, 2.0, drag=[5.0, 1e12], max_steps=2**14)
-    assert found.finished.tolist() == [[True], [False]]
-    assert found.fraction("failed").tolist() == [0.0, 1.0] and found.kind[1, 0] == "failed"
-    assert found.summary().splitlines()[2] == "drag 1e+12 N s/m: 100 % failed"
-    assert len(found.plot().axes) == 2
-    with pytest.raises(jv.InputError, match=r"kind is 'lost'; allowed: swinging, .*unsettled, failed"):
-        found.fraction("lost")
 
 
 def test_regime_under_jit_and_vmap():

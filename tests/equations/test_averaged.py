@@ -1,0 +1,131 @@
+"""The averaged equations against the mean of the full ones, leading-order jams and exact orbits."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gyroscopic_rotor import rotor
+from scenes import machines, published, scene
+
+import jaxvib as jv
+from jaxvib.equations.averaged import amplitudes_of
+from jaxvib.equations.linear import loaded_mass
+
+
+def at_jam(jam):
+    return jv.Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
+
+
+def numbers(state):
+    y, v = state.displacement, state.velocity
+    return jnp.concatenate([y.real, y.imag, v.real, v.imag, state.rate, state.phase])
+
+
+@pytest.mark.parametrize(("machine", "load"), [("two_mass", "pendulums"), ("network", "balls"), ("rotor", "balls")])
+def test_averaged_is_the_mean_of_the_full_equations_over_a_turn(machine, load):
+    """Loads of different speeds and phases, and 1e-6 of their mass: what is left of the difference is of that order."""
+    s = rotor(0.093, stiffness=(1.1e6, 0.8e6)) if machine == "rotor" else scene(machine, load)
+    light = eqx.tree_at(
+        lambda x: (x.loads.mass, x.loads.inertia),
+        s,
+        (s.loads.mass * 1e-6, None if s.loads.inertia is None else s.loads.inertia * 1e-6),
+        is_leaf=lambda x: x is None,
+    )
+    rng, nd, n = np.random.default_rng(3), s.machine.carrier().mass.shape[0], s.loads.count
+    y, v = (1e-3 * scale * jnp.asarray(rng.normal(size=(2, nd)).T @ [1.0, 1j]) for scale in (1.0, 25.0))
+    phase = rng.uniform(0.0, 6.0, n)
+    slow = jv.Amplitudes(y, v, jnp.asarray(rng.uniform(20.0, 30.0, n)), jnp.asarray(phase - np.mean(phase)))
+    angles = jnp.arange(16) * 2.0 * jnp.pi / 16
+
+    @jax.jit
+    def derivatives():
+        def at(theta):
+            wave = jnp.exp(1j * theta)
+            state = jv.State((y * wave).real, (v * wave).real, (slow.phase + theta,), (slow.rate,))
+            return jv.vector_field(light)(0.0, state)
+
+        return jv.averaged_field(light)(jnp.zeros(()), slow), jax.vmap(at)(angles)
+
+    change, full = derivatives()
+    loads, omega = light.loads, jnp.mean(slow.rate)
+    free = loads.drag * (light.drive.speed - slow.rate) / (loads.inertia_factor() * loads.mass)
+    np.testing.assert_allclose(change.rate - free, jnp.mean(full.rate[0], axis=0) - free, rtol=1e-6)
+    acceleration = 2.0 * jnp.mean(full.velocity * jnp.exp(-1j * angles)[:, None], axis=0)
+    size = float(jnp.max(jnp.abs(acceleration)))
+    np.testing.assert_allclose(change.velocity + 1j * omega * v, acceleration, atol=1e-6 * size)
+    np.testing.assert_allclose(change.displacement + 1j * omega * y, v, rtol=1e-12)
+    np.testing.assert_allclose(change.phase, slow.rate - omega, rtol=1e-12)
+
+
+@pytest.mark.parametrize("machine", machines())
+def test_equilibria_are_the_leading_order_jams(machine):
+    """Nothing changes where `jam_rotor_speed` says that the loads jam."""
+    s = scene(machine, "balls")
+
+    @jax.jit
+    def at(omega):
+        jammed = eqx.tree_at(lambda x: x.drive.speed, s, jv.jam_rotor_speed(s, omega))
+        y = jv.steady_displacement(s, omega)
+        state = jv.Amplitudes(y, 1j * omega * y, jnp.full((3,), omega), jnp.zeros(3))
+        field = jv.averaged_field(jammed)
+        free = jnp.max(field.drag * (jammed.drive.speed - omega) / field.inertia)
+        return field(jnp.zeros(()), state), omega**2 * jnp.max(jnp.abs(y)), free
+
+    for omega in (9.0, 31.0, 75.0):
+        change, acceleration, free = at(omega)
+        assert float(jnp.max(jnp.abs(change.displacement))) < 1e-12 * float(acceleration)
+        assert float(jnp.max(jnp.abs(change.velocity))) < 1e-11 * float(acceleration)
+        assert float(jnp.max(jnp.abs(change.rate))) < 1e-10 * float(free)
+
+
+@jax.jit
+def slope_at(s, jam):
+    """The Jacobian of the averaged equations of two platforms and one load."""
+
+    def right(z):
+        y0, y1, v0, v1, rate, phase = jnp.split(z, [2, 4, 6, 8, 9])
+        return numbers(jv.averaged_field(s)(jnp.zeros(()), jv.Amplitudes(y0 + 1j * y1, v0 + 1j * v1, rate, phase)))
+
+    return jax.jacfwd(right)(numbers(at_jam(jam)))
+
+
+def test_small_motions_about_a_jam_are_those_of_the_exact_orbit():
+    """Each Floquet exponent is an eigenvalue of the averaged equations, up to the first order in the loads' mass."""
+    worst = []
+    for eps in (2e-3, 1e-3):
+        s = published(speed=0.6, eps=eps, damping=0.01).scene()
+        orders, modes = [], jv.jam_modes(s)
+        for k in (1, 2):
+            orbit = jv.jam_orbit(s, mode=k)
+            values = np.linalg.eigvals(slope_at(s, modes.select(k)))
+            period = 2.0 * np.pi / float(orbit.omega)
+            apart = np.abs(np.exp(values * period)[None, :] - np.asarray(orbit.multipliers)[:, None])
+            orders.append(np.max(np.min(apart, axis=1)))
+            assert (np.max(values.real) > 1e-6) == (not bool(orbit.stable)) == (k == 2)
+        worst.append(orders)
+    np.testing.assert_allclose(np.asarray(worst[0]) / np.asarray(worst[1]), 2.0, rtol=0.1)
+    assert np.max(worst) < 1e-2
+
+
+def test_a_state_and_its_amplitudes_are_the_same_motion():
+    """A platform that vibrates with the loads, and one that rings while they rest: with the energy that the state has."""
+    s = scene("two_mass", "balls")
+    omega, theta = 75.0, 0.8
+    y = jv.steady_displacement(s, omega)
+    back = jax.jit(lambda state: amplitudes_of(s, state))
+    z = y * jnp.exp(1j * theta)
+    turning = jv.State(z.real, -omega * z.imag, (jnp.asarray([0.3, 0.9, 1.2]),), (jnp.full(3, omega),))
+    slow = back(turning)
+    np.testing.assert_allclose(slow.displacement, y, rtol=1e-12)
+    np.testing.assert_allclose(slow.velocity, 1j * omega * y, rtol=1e-12)
+    np.testing.assert_allclose(slow.phase, [-0.5, 0.1, 0.4], atol=1e-12)
+
+    resting = eqx.tree_at(lambda x: x.rate, turning, (jnp.zeros(3),))
+    slow = back(resting)
+    q, v = slow.displacement * jnp.exp(1j * theta), slow.velocity * jnp.exp(1j * theta)
+    np.testing.assert_allclose(q.real, resting.displacement, rtol=1e-12)
+    np.testing.assert_allclose(v.real, resting.velocity, rtol=1e-12)
+    mass, stiffness = loaded_mass(s), s.machine.carrier().stiffness
+    np.testing.assert_allclose(v.imag @ mass @ v.imag, q.real @ stiffness @ q.real, rtol=1e-9)
+    np.testing.assert_allclose(q.imag @ stiffness @ q.imag, v.real @ mass @ v.real, rtol=1e-9)

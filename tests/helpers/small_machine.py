@@ -1,0 +1,20 @@
+"""A machine whose motion is of order 1 in 20 s."""
+
+import jax.numpy as jnp
+
+import jaxvib as jv
+
+GRAVITY = 9.81
+
+
+def small_machine(effects=(), drive=None):
+    """A machine whose motion is of order 1 in 20 s: three different pendulums shake two platforms hard."""
+    machine = jv.two_mass(mass=(2.0, 1.5), stiffness=(3.0, 2.0), damping=(0.1, 0.05), link_stiffness=4.0, link_damping=0.2)
+    pendulums = jv.pendulums(count=3, mass=[0.1, 0.12, 0.15], radius=0.5, drag=[0.2, 0.25, 0.3], inertia=[0.001, 0.002, 0.003])
+    return jv.Scene(machine, pendulums, drive or jv.ConstantSpeed(3.0), effects)
+
+
+def small_start():
+    return jv.State(
+        jnp.asarray([0.05, -0.03]), jnp.asarray([0.1, 0.2]), (jnp.asarray([0.3, -1.0, 2.0]),), (jnp.asarray([1.0, 0.5, -0.5]),)
+    )

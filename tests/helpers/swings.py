@@ -1,0 +1,40 @@
+"""Swings of a rod by SciPy, with noise."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import jaxvib as jv
+
+T = 0.05 * np.arange(400)
+"""The times of most records: one length, so that the fit is compiled once."""
+
+
+ROD = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)
+
+
+def scipy_swing(rod, times, angle, rate, viscous, dry=0.0):
+    """The swing with the sharp sign of sliding, half a swing at a time, and when dry friction stops it (NaN: never)."""
+    m, l, j, d, g = (float(x) for x in (rod.mass, rod.length, rod.total_inertia, rod.bearing, rod.g))
+    out, t, y = np.full(len(times), np.nan), times[0], np.array([angle, rate])
+    while True:
+        sign = np.sign(y[1]) if y[1] != 0.0 else -np.sign(y[0])
+        if y[1] == 0.0 and abs(np.tan(y[0])) < dry * d / (2.0 * l):
+            out[times >= t] = y[0]
+            return out, t
+
+        def rhs(t, y, sign=sign):
+            load = abs(m * l * y[1] ** 2 + m * g * np.cos(y[0]))
+            return [y[1], (-m * g * l * np.sin(y[0]) - viscous * y[1] - dry * load * d / 2.0 * sign) / j]
+
+        turns = lambda t, y: y[1]  # noqa: E731
+        turns.terminal, turns.direction = dry > 0.0, -sign
+        found = solve_ivp(rhs, (t, times[-1]), y, "DOP853", rtol=1e-9, atol=1e-12, events=turns, dense_output=True)
+        inside = (times >= t) & (times <= found.t[-1])
+        out[inside] = found.sol(times[inside])[0]
+        if found.status == 0:
+            return out, np.nan
+        t, y = found.t[-1], np.array([found.y[0, -1], 0.0])
+
+
+def noisy(clean, noise, seed):
+    return clean + noise * np.random.default_rng(seed).normal(size=clean.size)

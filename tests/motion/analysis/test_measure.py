@@ -1,0 +1,80 @@
+"""Amplitudes, speeds and forces read from samples of a motion."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scenes import scene
+from scipy.optimize import brentq
+from small_machine import small_machine, small_start
+
+import jaxvib as jv
+from jaxvib.motion.analysis.measure import measure
+
+
+def test_measure_reads_a_known_motion():
+    """Samples miss the extrema and the whole turns: both are read off between them."""
+    s = scene("two_mass", "balls")
+    w, n = 7.0, 3
+    a, c = jnp.asarray([2e-3, 5e-3]), jnp.asarray([0.3, 1.1])
+    t = jnp.linspace(1.0, 6.0, 301)
+    angle, phase = w * t[:, None], c[None, :]
+    states = jv.State(
+        a[None, :] * jnp.cos(angle + phase) + 0.7,
+        -w * a[None, :] * jnp.sin(angle + phase),
+        (jnp.broadcast_to(angle, (301, n)) + jnp.asarray([0.0, 0.4, 2.0])[None, :],),
+        (jnp.full((301, n), w),),
+    )
+
+    def field(_, y):
+        return jv.State(y.velocity, -(w**2) * (y.displacement - 0.7), y.rate, (jnp.zeros(n),))
+
+    measured = measure(s, field, t, states)
+    force = np.abs(np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * a * np.exp(1j * c)))
+    np.testing.assert_allclose(measured.amplitude, a, rtol=1e-6)
+    np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-6)
+    np.testing.assert_allclose(measured.omega, w, rtol=1e-9)
+    np.testing.assert_allclose(measured.load_speed, w, rtol=1e-9)
+    assert bool(measured.settled)
+
+
+def test_derivatives_of_an_amplitude_move_its_extrema_along():
+    """x = cos wt + p cos(2wt + 0.3): slope and curvature in p of half of peak to peak, against extrema found by bisection."""
+    s, w = scene("one_mass", "balls"), 7.0
+    t = jnp.linspace(0.0, 4.0, 512)
+
+    def moving(p, t):
+        return jnp.cos(w * t) + p * jnp.cos(2.0 * w * t + 0.3)
+
+    def amplitude(p):
+        rate, bend = jax.grad(moving, 1), jax.grad(jax.grad(moving, 1), 1)
+        at = lambda f: jax.vmap(f, in_axes=(None, 0))(p, t)[:, None]  # noqa: E731
+        states = jv.State(at(moving), at(rate), (jnp.zeros((512, 3)),), (jnp.full((512, 3), w),))
+
+        def field(p, t, y):
+            return jv.State(y.velocity, bend(p, t)[None], y.rate, (jnp.zeros(3),))
+
+        return measure(s, jax.tree_util.Partial(field, p), t, states).amplitude[0]
+
+    def exactly(p):
+        ends = []
+        for low, high in ((-0.2, 0.2), (np.pi - 0.9, np.pi + 0.9)):
+            slope = lambda u: -np.sin(u) - 2.0 * p * np.sin(2.0 * u + 0.3)  # noqa: E731
+            u = brentq(slope, low, high, xtol=1e-15, rtol=1e-15)
+            ends.append((u, np.cos(u) + p * np.cos(2.0 * u + 0.3)))
+        value = (ends[0][1] - ends[1][1]) / 2.0
+        # By the implicit function theorem: dV/dp is that at a fixed place, d2V/dp2 = -(d2x/dp du)^2/(d2x/du2).
+        first = [np.cos(2.0 * u + 0.3) for u, _ in ends]
+        second = [-((-2.0 * np.sin(2.0 * u + 0.3)) ** 2) / (-np.cos(u) - 4.0 * p * np.cos(2.0 * u + 0.3)) for u, _ in ends]
+        return value, (first[0] - first[1]) / 2.0, (second[0] - second[1]) / 2.0
+
+    p = 0.12
+    value, slope, curvature = exactly(p)
+    np.testing.assert_allclose(amplitude(p), value, rtol=1e-7)
+    for way in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(way(amplitude))(p), slope, rtol=1e-5)
+        np.testing.assert_allclose(jax.jit(jax.jacfwd(way(amplitude)))(p), curvature, rtol=1e-3)
+
+
+def test_a_growing_motion_is_not_settled():
+    run = jv.simulate(small_machine(), 5.0, start=small_start())
+    assert not bool(run.settled) and "not settled" in run.summary()

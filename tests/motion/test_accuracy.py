@@ -1,0 +1,82 @@
+"""Steps, estimates of the error and the accuracy asked for."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scenes import published, some_state
+
+import jaxvib as jv
+
+
+def test_equal_steps_are_of_order_8():
+    s = published(speed=1.5, eps=0.05).scene()
+    start = jv.initial_state(s, "jam", mode=3)
+    ends = [ravel_pytree(jax.tree.map(lambda x: x[-1], run.window.state))[0] for run in _runs(s, start, (60, 90, 135, 600))]
+    error = [float(jnp.max(jnp.abs(end - ends[-1]))) for end in ends[:-1]]
+    orders = np.log(np.array(error[:-1]) / np.array(error[1:])) / np.log(1.5)
+    assert np.all(orders > 7.0), (error, orders)
+
+
+def _runs(s, start, steps):
+    return [jv.simulate(s, 40.0, start=start, steps=n, save="window", estimate=False) for n in steps]
+
+
+def test_the_estimate_is_above_the_error_and_near_it():
+    s = published(speed=5.0, eps=0.05).scene()
+    start = some_state(s)
+    best = jv.simulate(s, 60.0, start=start, tolerance=1e-13, save="window").window.state
+
+    def apart(run):
+        a, b = run.window.state, best
+        pairs = ((a.displacement, b.displacement), (a.velocity, b.velocity))
+        parts = [float(jnp.max(jnp.abs(x - y)) / jnp.max(jnp.abs(y))) for x, y in pairs]
+        return max(
+            *parts, float(jnp.max(jnp.abs(a.angle[0] - b.angle[0]))), float(jnp.max(jnp.abs(a.rate[0] - b.rate[0]))) / 5.0
+        )
+
+    for tolerance in (1e-5, 1e-7, 1e-9, 1e-11):
+        run = jv.simulate(s, 60.0, start=start, tolerance=tolerance, save="window")
+        assert apart(run) <= float(run.error) <= 300.0 * apart(run), (tolerance, apart(run), float(run.error))
+        alone = jv.simulate(s, 60.0, start=start, tolerance=tolerance, save="window", estimate=False)
+        assert int(alone.evaluations) == 13 * int(alone.steps) == 13 * int(run.steps) and np.isnan(alone.error)
+        # What the estimate cost is counted: the run with larger steps takes at least half as many, at most all.
+        assert 1.5 * int(alone.evaluations) < int(run.evaluations) < 2 * int(alone.evaluations)
+        assert float(run.seconds) > 0.0
+    for accuracy in (1e-3, 1e-8):
+        run = jv.simulate(s, 60.0, start=start, accuracy=accuracy, save="window")
+        assert bool(run.status == jv.RunStatus.done) and apart(run) <= float(run.error) <= accuracy
+
+
+def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
+    s = published(speed=5.0, eps=0.05).scene()
+    monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)
+    asked = dict(start=some_state(s), save="window", accuracy=1e-12)
+    # So long that rounding alone makes more than this error.
+    run = jv.simulate(s, 400.0, **asked, throw=False)
+    assert bool(run.status == jv.RunStatus.not_accurate) and float(run.error) > 1e-12
+    with pytest.raises(jv.ComputationError, match=r"asked for 1\.0e-12") as caught:
+        jv.simulate(s, 400.0, **asked)
+    assert caught.value.status == "not_accurate"
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (dict(accuracy=1e-4, tolerance=1e-6), "accuracy is given together with tolerance; give one of them"),
+        (dict(accuracy=1e-14), "accuracy is 1e-14; in float64 it must be at least 2e-13"),
+        (dict(steps=0), "steps is 0"),
+    ],
+)
+def test_ways_to_choose_steps_that_cannot_be(given, says):
+    with pytest.raises(jv.InputError) as caught:
+        jv.simulate(published().scene(), 1.0, **given)
+    assert says in str(caught.value)
+
+
+def test_accuracy_looks_at_numbers():
+    s = published().scene()
+    with pytest.raises(jv.InputError, match="under a JAX transformation give a tolerance"):
+        jax.jit(lambda n: jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 1.0, accuracy=1e-4).omega)(jnp.asarray(2.0))

@@ -1,0 +1,45 @@
+"""Long runs and single precision."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published
+
+import jaxvib as jv
+
+
+def test_a_long_run_keeps_its_phase():
+    """Angles grow to a thousand turns; were their tolerance relative, so would their error."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    free = jv.Scene(machine, jv.pendulums(count=1, mass=1e-9, radius=0.1, drag=1e-9), jv.ConstantSpeed(100.0))
+    start = eqx.tree_at(lambda y: (y.angle, y.rate), jv.initial_state(free), ((jnp.zeros(1),), (jnp.full(1, 100.0),)))
+    run = jv.simulate(free, 63.0, start=start, samples=2, tolerance=1e-7)
+    assert abs(float(run.trajectory.state.angle[0][-1, 0]) - 6300.0) < 1e-5
+
+
+def test_what_float32_cannot_deliver_is_refused():
+    with jax.enable_x64(False), pytest.raises(jv.InputError, match=r"in float32 .* switch JAX to float64"):
+        jv.simulate(published().scene(), 10.0, tolerance=1e-8)
+
+
+def test_single_precision_keeps_its_phase():
+    """A load that turns with its rotor for 1e5 turns: an angle of 6e5 rad would be good to 0.06 only, and each step would round
+    it anew; so the only error is that of the time itself."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    with jax.enable_x64(False):
+        free = jv.Scene(machine32(machine), jv.pendulums(count=1, mass=1e-6, radius=0.1, drag=1e-4), jv.ConstantSpeed(100.0))
+        start = eqx.tree_at(lambda y: (y.angle, y.rate), jv.initial_state(free), ((jnp.zeros(1),), (jnp.full(1, 100.0),)))
+        run = jv.simulate(free, 6283.185, start=start, save="window", tolerance=1e-5, estimate=False)
+        phase = np.asarray(run.window.state.angle[0][:, 0], float) - 100.0 * np.asarray(run.window.time, float)
+        assert run.amplitude.dtype == jnp.float32
+        # A mean speed is an angle over a time between two samples, each of whose times is rounded by up to a spacing.
+        times = np.asarray(run.window.time)
+        bound = 2.0 * float(np.spacing(times[-1])) / float(times[-1] - times[0])
+        np.testing.assert_allclose(float(run.omega), 100.0, rtol=bound)
+    assert np.max(np.abs((phase + np.pi) % (2.0 * np.pi) - np.pi)) < 100.0 * float(np.spacing(times[-1]))
+
+
+def machine32(machine):
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), machine)

@@ -1,0 +1,61 @@
+"""What a run can do."""
+
+import jax
+import numpy as np
+import pytest
+from small_machine import small_machine, small_start
+
+import jaxvib as jv
+
+
+@pytest.fixture(scope="module")
+def run():
+    return jv.simulate(small_machine((jv.Gravity(),)), 20.0, start=small_start(), samples=101)
+
+
+def same(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+        assert x.dtype == y.dtype
+
+
+def test_a_saved_run_is_read_back_bit_for_bit(run, tmp_path):
+    again = jv.Run.load(run.save(tmp_path / "run"))
+    same(again, run)
+    assert again.summary() == run.summary()
+    short = jv.simulate(small_machine(), 2.0, start=small_start(), save="window")
+    back = jv.Run.load(short.save(tmp_path / "short.npz"))
+    assert back.trajectory is None
+    same(back, short)
+
+
+def test_reading_what_is_no_run_is_an_input_error(tmp_path):
+    with pytest.raises(jv.InputError, match="there is no such file"):
+        jv.Run.load(tmp_path / "missing.npz")
+    (tmp_path / "text.npz").write_text("no run")
+    np.savez(tmp_path / "other.npz", x=np.zeros(2))
+    for name in ("text.npz", "other.npz"):
+        with pytest.raises(jv.InputError, match=r"it is no run written by Run\.save"):
+            jv.Run.load(tmp_path / name)
+
+
+def test_to_xarray_has_names_and_units(run):
+    data = run.to_xarray()
+    assert dict(data.sizes) == {"time": 101, "coordinate": 2, "load": 3, "direction": 1}
+    assert data["displacement"].attrs["units"] == "m" and data["time"].attrs["units"] == "s"
+    np.testing.assert_array_equal(data["displacement"].sel(coordinate="y2"), run.trajectory.state.displacement[:, 1])
+    assert data.attrs["status"] == "the run reached its end"
+
+
+def test_summary_and_plot_show_the_run(run):
+    assert run.summary().startswith("the run reached its end: 20 s") and "zero to peak: y1" in run.summary()
+    assert len(run.plot().axes) == 3
+
+
+def test_window_alone_measures_the_same(run):
+    window = jv.simulate(small_machine((jv.Gravity(),)), 20.0, start=small_start(), save="window")
+    assert window.trajectory is None and len(window.plot().axes) == 3
+    np.testing.assert_allclose(window.amplitude, run.amplitude, rtol=1e-12)
+    np.testing.assert_allclose(window.omega, run.omega, rtol=1e-12)
+    np.testing.assert_allclose(window.foundation_force, run.foundation_force, rtol=1e-12)

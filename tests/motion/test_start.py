@@ -1,0 +1,61 @@
+"""How a run begins: at rest, in a jam, spun up, or in a given state."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, scene
+from small_machine import small_machine
+
+import jaxvib as jv
+
+
+def test_a_mode_that_is_not_there_is_no_start():
+    with pytest.raises(jv.ComputationError, match="jam mode 1 does not exist at rotor speed 3 rad/s; there: 3, 4, 5"):
+        jv.simulate(published().scene(), 10.0, start="jam", mode=1)
+
+
+def test_spin_up_of_a_drive_that_spins_up_is_refused():
+    with pytest.raises(jv.InputError, match="the drive is 'spin_up' already"):
+        jv.simulate(small_machine(drive=jv.SpinUp(3.0, 2.0)), 5.0, start="spin_up")
+
+
+def test_spin_up_starts_at_rest_and_ends_at_speed():
+    run = jv.simulate(small_machine(), 10.0, start="spin_up", spin_up=4.0, samples=11)
+    np.testing.assert_allclose(run.trajectory.rotor_speed[jnp.asarray([0, 2, 4, 10])], [0.0, 1.5, 3.0, 3.0], atol=1e-12)
+    assert float(jnp.max(jnp.abs(run.trajectory.state.rate[0][0]))) == 0.0
+
+
+def test_a_start_given_whole_takes_no_mode():
+    s = published(eps=1e-3).scene()
+    with pytest.raises(jv.InputError, match="leave it out"):
+        jv.simulate(s, 1.0, start=jv.initial_state(s), mode=3)
+
+
+def test_platforms_of_a_jam_start_with_the_loads_angle():
+    s = published(eps=1e-3).scene()
+    turned, plain = (jv.initial_state(s, "jam", mode=3, angles=a) for a in (2.0 * np.pi, 0.0))
+    np.testing.assert_allclose(turned.displacement, plain.displacement, rtol=1e-10)
+    quarter = jv.initial_state(s, "jam", mode=3, angles=np.pi / 2)
+    np.testing.assert_allclose(quarter.displacement, plain.velocity / jv.jam_modes(s).select(3).omega, rtol=1e-10)
+
+
+def test_a_state_of_another_machine_is_refused():
+    state = jv.initial_state(scene("one_mass", "rollers"))
+    with pytest.raises(jv.InputError, match=r"start.displacement has shape \(1,\); this scene needs \(2,\)"):
+        jv.simulate(published().scene(), 1.0, start=state)
+    with pytest.raises(jv.InputError, match=r"goes with|drive is 'spin_up'|starts at another speed"):
+        jv.initial_state(eqx.tree_at(lambda s: s.drive, published().scene(), jv.SpinUp(3.0, 1.0)), "jam", mode=3)
+
+
+def test_touching_loads_start_a_jam_side_by_side():
+    """A start in a jam lays touching loads side by side about the jam's angle."""
+    s = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15, own_radius=0.005),
+        jv.ConstantSpeed(60.0),
+        (jv.LoadContact(stiffness=1e5),),
+    )
+    start = jv.initial_state(s, "jam", mode=1)
+    np.testing.assert_allclose(np.diff(start.angle[0]), 2.0 * np.arcsin(0.05), rtol=1e-12)
+    np.testing.assert_allclose(jnp.mean(start.angle[0]), 0.0, atol=1e-12)

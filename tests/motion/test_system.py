@@ -1,0 +1,66 @@
+"""A scene as it is integrated: on single numbers or on arrays, with angles kept within a turn."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rotors import case, rotor_state
+from scenes import loads, machines, scene, some_state
+
+import jaxvib as jv
+from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8_loop import LoopDopri8
+
+
+@pytest.mark.parametrize("machine", ["one_mass", "two_mass", "three_mass"])
+@pytest.mark.parametrize("load", sorted(loads()))
+@pytest.mark.parametrize("effects", [(), (jv.Gravity(),)])
+def test_on_numbers_the_equations_are_the_same(machine, load, effects):
+    s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
+    state, field = some_state(s), jv.vector_field(s)
+    motion = PackedSystem(field, state)
+    assert motion.is_scalarized
+    rates = motion.term.vf(jnp.asarray(0.3), motion.pack(state), motion.args)
+    ours = motion.unpack(jax.tree.map(lambda x: x[None], rates))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(field(jnp.asarray(0.3), state)), strict=True):
+        np.testing.assert_allclose(a[0], b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("name", ["imbalance, spin-up", "imbalance, dc", "supports", "friction, run-up"])
+def test_equations_are_the_same_on_numbers(name):
+    """As they are integrated."""
+    s = case(name)
+    state, t = rotor_state(s, 5), jnp.asarray(0.7)
+    motion = PackedSystem(jv.vector_field(s), state)
+    assert motion.is_scalarized
+    rates = motion.term.vf(t, motion.pack(state), motion.args)
+    ours = motion.states(jax.tree.map(lambda x: x[None], rates))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jv.vector_field(s)(t, state)), strict=True):
+        np.testing.assert_allclose(a[0], b, rtol=1e-11, atol=1e-12 * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("name", ["friction, exact, dc", "contact"])
+def test_equations_that_are_many_or_cut_arrays_up_stay_on_arrays(name):
+    s = case(name)
+    state = rotor_state(s, 5)
+    motion = PackedSystem(jv.vector_field(s), state)
+    assert not motion.is_scalarized
+    assert motion.pack(state) is state
+
+
+def test_wrapping_counts_every_turn():
+    s = scene("one_mass", "balls")
+    state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
+    for together in (False, True):
+        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, together=together)
+        method = motion.method()
+        assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
+        held = method.wrap(motion.pack(state))
+        if not together:
+            assert float(jnp.max(jnp.abs(motion._angles(held[0])[0]))) <= np.pi
+        back = motion.unpack(jax.tree.map(lambda *x: jnp.stack(x), motion.pack(state), held))
+        np.testing.assert_allclose(back.angle[0], np.stack(2 * [state.angle[0]]), rtol=1e-14)
+        alone = motion.unpack(jax.tree.map(lambda x: x[None], held))
+        np.testing.assert_allclose(np.sin(alone.angle[0][0]), np.sin(state.angle[0]), atol=1e-13)

@@ -1,0 +1,30 @@
+"""Both forms of the step of order 8 against diffrax's."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, some_state
+
+import jaxvib as jv
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8_loop import LoopDopri8
+
+
+@pytest.mark.parametrize("method", [UnrolledDopri8(), UnrolledDopri8(lanes=True), LoopDopri8()])
+def test_the_step_is_diffraxs(method):
+    """Same method, another form: the same steps to rounding, dense output included."""
+    s = published(speed=3.0, eps=0.05).scene()
+    field, start = jv.vector_field(s), some_state(s)
+
+    def solve(solver):
+        term = diffrax.ODETerm(lambda t, y, args: args(t, y))
+        control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+        save = diffrax.SaveAt(ts=jnp.linspace(0.0, 5.0, 37))
+        return diffrax.diffeqsolve(term, solver, 0.0, 5.0, 0.01, start, field, saveat=save, stepsize_controller=control)
+
+    ours, theirs = solve(method), solve(diffrax.Dopri8())
+    assert int(ours.stats["num_steps"]) == int(theirs.stats["num_steps"])
+    for a, b in zip(jax.tree.leaves(ours.ys), jax.tree.leaves(theirs.ys), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,55 @@
+"""Turning points and the formula of ten periods."""
+
+import numpy as np
+import pytest
+from swings import ROD, noisy, scipy_swing
+
+import jaxvib as jv
+
+
+def test_turning_points_are_those_of_the_closed_form():
+    t = np.sort(np.random.default_rng(0).uniform(0.0, 9.0, 400))
+    turns = jv.turning_points(jv.Record(t, 0.4 + 0.1 * np.exp(-0.02 * t) * np.sin(3.0 * t)))
+    expected = (np.arctan(3.0 / 0.02) + np.pi * np.arange(9)) / 3.0
+    np.testing.assert_allclose(turns.time, expected[expected < t[-1] - 0.17], atol=2e-3)
+    np.testing.assert_allclose(turns.angle, 0.4 + 0.1 * np.exp(-0.02 * turns.time) * np.sin(3.0 * turns.time), atol=2e-5)
+
+
+def test_ten_periods_hold_mu1_in_their_interval():
+    """200 records of small swings; of 200 intervals of 95 %, 190 hold the number, give or take 3."""
+    t, rng, held, ratios = np.arange(0.0, 16.0, 0.04), np.random.default_rng(5), 0, []
+    for k in range(200):
+        mu1 = rng.uniform(1e-3, 3e-3)
+        n = mu1 / 0.05
+        w = np.sqrt(float(ROD.frequency) ** 2 - n**2)
+        clean = 0.05 * np.exp(-n * t) * np.cos(w * t + rng.uniform(0.0, 6.0)) + rng.normal()
+        found = jv.ten_periods(ROD, jv.Record(t, noisy(clean, 5e-4, k))).viscous
+        held += found.low < mu1 < found.high
+        ratios.append((found.value - mu1) / found.error)
+    assert 184 <= held <= 198
+    assert 0.85 < np.std(ratios) < 1.15
+
+
+def test_instruments_widen_the_interval():
+    t = np.arange(0.0, 15.0, 0.04)
+    record = jv.Record(t, scipy_swing(ROD, t, 0.05, 0.0, 1.5e-3)[0])
+    found = jv.ten_periods(ROD, record, instrument=0.03)
+    np.testing.assert_allclose(found.viscous.value, 1.5e-3, rtol=1e-3)
+    np.testing.assert_allclose((found.viscous.high - found.viscous.low) / 2.0, 0.03 * found.viscous.value, rtol=1e-3)
+    np.testing.assert_allclose(found.period, 2.0 * np.pi / float(ROD.frequency), rtol=1e-3)
+    assert found.scatter < 2e-3
+    with pytest.raises(jv.InputError, match=r"record has 12 periods between turning points; 20.5 are needed"):
+        jv.ten_periods(ROD, record, periods=20)
+
+
+@pytest.mark.parametrize("dry", [0.002, 0.01])
+def test_dry_friction_biases_the_formula_as_stated(dry):
+    """mu1 + 4 T_f/(pi w A), A between the first and the last swing of a pair; second order in the loss left out."""
+    t = np.arange(0.0, 14.0, 0.01)
+    clean, _ = scipy_swing(ROD, t, 0.1, 0.0, 1e-3, dry)
+    found = jv.ten_periods(ROD, jv.Record(t, clean))
+    torque, w = dry * 0.01 * 0.3 * 9.81, float(ROD.frequency)
+    last = jv.turning_points(jv.Record(t, clean)).amplitude[20]
+    middle = (0.1 - last) / np.log(0.1 / last)
+    bias = found.estimates[0] - 1e-3
+    np.testing.assert_allclose(bias, 4.0 * torque / (np.pi * w * middle), rtol=0.05)

@@ -1,0 +1,87 @@
+"""Records of swings as laboratories write them, and what is said about wrong ones."""
+
+import numpy as np
+import pytest
+from swings import ROD
+
+import jaxvib as jv
+
+
+def table(head, separator=",", comma=False, factor=1.0):
+    lines = [separator.join((f"{k / 10 * factor:.3f}", f"{0.1 * (-1) ** k:.3f}")) for k in range(20)]
+    return head + "".join((line.replace(".", ",") if comma else line) + "\n" for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "degrees"),
+    [
+        (table(""), False),
+        (table("# camera 3\n\ntime,angle\n"), False),
+        (table("time (s), angle (deg)\n"), True),
+        (table("t [ms];phi [°]\n", ";", True, 1000.0), True),
+        (table("time_s\tangle_deg\n", "\t"), True),
+        (table("Time;Angle\ns;deg\n", ";"), True),
+        (table('"time / s", "angle / mrad"\n'), None),
+        (table("", " "), False),
+        (table("clock, deflection\n"), False),
+    ],
+)
+def test_records_come_in_as_laboratories_write_them(tmp_path, text, degrees):
+    path = tmp_path / "swing.csv"
+    path.write_text(text, encoding="utf-8")
+    record = jv.read_record(path)
+    np.testing.assert_allclose(record.time, np.arange(20) / 10, rtol=1e-12)
+    unit = {True: np.pi / 180.0, False: 1.0, None: 1e-3}[degrees]
+    np.testing.assert_allclose(record.angle, 0.1 * unit * (-1.0) ** np.arange(20), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "holds no lines of numbers; it needs two columns"),
+        ("time, angle\n", "holds no lines of numbers below its header"),
+        (table("").replace("0.300,-0.100", "0.300,oops"), "line 4 has 'oops' where the angle should be"),
+        (table("").replace("0.300,-0.100", "0.300,nan"), "line 4 has 'nan' where the angle should be; a finite number"),
+        (table("# a\ntime,angle\n").replace("0.300,-0.100", "0.300"), "line 6 has 1 columns; the lines above have 2"),
+        (table("").replace("0.300,", "0.100,"), "line 4 has the time 0.1 s after 0.2 s; times must ascend"),
+        ("0.1\n0.2\n", "has one column; two are needed"),
+        ("1,2,3\n", "has 3 columns and no line of names"),
+        ("time, x, y\n1,2,3\n", "has no column 'angle' for the angle; its columns are time, x, y"),
+        (table("time (s), angle (kg)\n"), "unit of angle is '1 kg', which is not in rad"),
+        ("0,1\n1,2\n", "has 2 samples; a swing needs at least 16"),
+        (table("").replace("0.100\n", "25.0\n"), "more than a full turn; if these are degrees, say so"),
+    ],
+)
+def test_wrong_tables_say_which_line(tmp_path, text, says):
+    path = tmp_path / "swing.csv"
+    path.write_text(text)
+    with pytest.raises(jv.InputError) as error:
+        jv.read_record(path)
+    assert says in str(error.value) and str(error.value).startswith(str(path))
+
+
+def test_wrong_records(tmp_path):
+    t = np.arange(20.0)
+    wrong = [
+        ((t, t[:5]), r"has shapes time \(20,\), angle \(5,\)"),
+        ((t, ["a"] * 20), "has entries that are no numbers"),
+        ((t, np.where(t == 3, np.inf, 0.0)), "has angle inf at sample 4"),
+        ((np.where(t == 3, 1.0, t), t), "has the time 1 s after 2 s at sample 4"),
+    ]
+    for given, says in wrong:
+        with pytest.raises(jv.InputError, match=says):
+            jv.Record(*given)
+    with pytest.raises(jv.InputError, match="has 3 samples from 1 s to 3 s; it goes from 0 s to 19 s"):
+        jv.Record(t, 0.01 * t).between(1.0, 3.0)
+    with pytest.raises(jv.InputError, match="cannot be read"):
+        jv.read_record(tmp_path / "none.csv")
+    with pytest.raises(jv.InputError, match="turns 0 times; at least 3 turning points"):
+        jv.identify(ROD, jv.Record(t, 0.01 * t))
+    with pytest.raises(jv.InputError, match=r"has \d samples about the turning point at .* s; 5 are needed"):
+        jv.identify(ROD, jv.Record(t, 0.1 * np.cos(np.pi * t / 3.0)))
+    with pytest.raises(jv.InputError, match=r"record is tuple; it must be a Record"):
+        jv.identify(ROD, (t, t))
+    with pytest.raises(jv.InputError, match=r"instrument is 2.0; the relative uncertainty of J"):
+        jv.identify(ROD, jv.Record(t, 0.01 * t), instrument=2.0)
+    with pytest.raises(jv.InputError, match=r"pendulum.bearing is missing"):
+        jv.identify(jv.BearingPendulum(0.3, 0.2), jv.Record(t, 0.01 * t), dry=True)
