@@ -26,6 +26,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.results.files import load
 from jaxvib.runtime.cpu import prepare_cpu
 from jaxvib.steady.balance.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
@@ -167,6 +168,7 @@ __all__ = [
     "jam_modes",
     "jam_orbit",
     "jam_rotor_speed",
+    "load",
     "load_scene",
     "natural_frequencies",
     "network",

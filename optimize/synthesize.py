@@ -7,15 +7,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.units import count
 from optimize.quantities import Pair, Quantity, between, force_per_amplitude
@@ -65,8 +70,7 @@ class Outcome:
         }
 
 
-@dataclass(frozen=True)
-class Synthesis:
+class Synthesis(Result):
     """What a search found.
 
     **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
@@ -77,7 +81,9 @@ class Synthesis:
     starts) of the objective; `objective` and `unit` its name and unit.
     """
 
-    scene: Scene
+    status = Computed.done
+
+    scene: Scene = eqx.field(metadata=SCENE)
     before: Outcome
     after: Outcome
     verified: Outcome | None
@@ -87,10 +93,10 @@ class Synthesis:
     drawn: int
     converged: int
     same: int
-    designs: np.ndarray
-    values: np.ndarray
-    done: np.ndarray
-    history: np.ndarray
+    designs: np.ndarray = eqx.field(metadata=in_unit("", "start", "parameter"))
+    values: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    done: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    history: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
     objective: str
     unit: str
 

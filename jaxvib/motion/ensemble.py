@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -19,13 +19,19 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
 from jaxvib.motion.start import initial_state
 from jaxvib.motion.system import PackedSystem
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
 from jaxvib.units import Number, count, number, traced
 
-__all__ = ["Ensemble", "ensemble"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
 _PARTS = 4
 """Into so many parts a run is cut; over the last one mean speeds are taken."""
@@ -34,7 +40,14 @@ _LANES = 64
 """Runs that advance together on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
 
 
-class Ensemble(eqx.Module):
+class EnsembleStatus(eqx.Enumeration):
+    """How a run of an ensemble ended; the members are the sentences a user reads."""
+
+    done = "the run reached its end"
+    not_finite = "the motion grew beyond all bounds"
+
+
+class Ensemble(Result):
     """Where many runs ended.
 
     **Attributes** (B runs): `state` a `State` whose arrays have a leading axis over the runs, at the end, in single precision
@@ -45,12 +58,33 @@ class Ensemble(eqx.Module):
     compiling included where a program was new, NaN under a JAX transformation.
     """
 
-    state: State
-    load_speed: Array
-    error: Array
-    finite: Array
-    steps: Array
-    seconds: Array
+    state: State = eqx.field(metadata=part("run", fields=STATE))
+    load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
+    error: Array = eqx.field(metadata=in_unit("", "run"))
+    finite: Array = eqx.field(metadata=in_unit("", "run"))
+    steps: Array = eqx.field(metadata=in_unit(""))
+    seconds: Array = eqx.field(metadata=in_unit("s"))
+
+    @property
+    def status(self) -> EnsembleStatus:
+        """How each run ended, an `EnsembleStatus` for each."""
+        return jax.vmap(lambda ok: EnsembleStatus.where(ok, EnsembleStatus.done, EnsembleStatus.not_finite))(self.finite)
+
+    def summary(self) -> str:
+        """How the runs ended, at which speeds of their loads, with which errors, for a person to read."""
+        finite = np.asarray(self.finite)
+        head = f"{self.message}; {int(self.steps)} steps each, {float(self.seconds):.3g} s in all"
+        if not np.any(finite):
+            return head
+        speeds, error = np.asarray(self.load_speed)[finite], np.asarray(self.error)[finite]
+        worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
+        return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
+
+    def plot(self) -> Figure:
+        """The mean speed of each load, over the runs. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
+
+        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s")
 
 
 def ensemble(

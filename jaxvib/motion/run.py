@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import zipfile
-from pathlib import Path
-from typing import TYPE_CHECKING
+import itertools
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
-from jaxvib.machine.files import scene_from_toml, scene_to_toml
+from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, Trajectory
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
 from jaxvib.motion.analysis.regime import Regime, regime
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import member
 
 if TYPE_CHECKING:
-    import xarray
     from matplotlib.figure import Figure
 
 __all__ = ["Run", "RunStatus"]
@@ -40,8 +41,8 @@ class RunStatus(eqx.Enumeration):
     no_start = "the state to start from does not exist or is not finite"
 
 
-class Run(Measured):
-    """A run of a scene: what was measured over its last turns (see `Measured`), and the motion itself.
+class Run(AbstractMeasured, Result):
+    """A run of a scene: what was measured over its last turns (see `AbstractMeasured`), and the motion itself.
 
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
@@ -56,19 +57,14 @@ class Run(Measured):
     """
 
     status: RunStatus
-    trajectory: Trajectory | None
-    window: Trajectory
-    error: Array
-    steps: Array
-    rejected: Array
-    evaluations: Array
-    seconds: Array
-    scene: Scene
-
-    @property
-    def message(self) -> str:
-        """How the run ended, a sentence."""
-        return RunStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+    trajectory: Trajectory | None = eqx.field(metadata=part())
+    window: Trajectory = eqx.field(metadata=part(prefix="window_"))
+    error: Array = eqx.field(metadata=in_unit(""))
+    steps: Array = eqx.field(metadata=in_unit(""))
+    rejected: Array = eqx.field(metadata=in_unit(""))
+    evaluations: Array = eqx.field(metadata=in_unit(""))
+    seconds: Array = eqx.field(metadata=in_unit("s"))
+    scene: Scene = eqx.field(metadata=SCENE)
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
@@ -92,9 +88,6 @@ class Run(Measured):
         """What kind of motion the run has come to, see `Regime`."""
         return _named(self.scene, self.window)
 
-    def _kept(self) -> Trajectory:
-        return self.window if self.trajectory is None else self.trajectory
-
     def plot(self) -> Figure:
         """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.
 
@@ -102,7 +95,7 @@ class Run(Measured):
         """
         from jaxvib.draw.charts import time_histories  # slow to import: only who draws pays
 
-        kept = self._kept()
+        kept = self.window if self.trajectory is None else self.trajectory
         return time_histories(
             np.asarray(kept.time),
             np.asarray(kept.state.displacement),
@@ -113,78 +106,25 @@ class Run(Measured):
             units=self.scene.machine.structure().units,
         )
 
-    def to_xarray(self) -> xarray.Dataset:
-        """The kept motion as a labelled dataset, with units as attributes (needs the extra `jaxvib[xarray]`)."""
-        try:
-            import xarray as xr
-        except ImportError as error:
-            raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
-        kept = self._kept()
-        structure = self.scene.machine.structure()
-        loads = range(1, self.scene.loads.count + 1)
 
-        def column(value: Array, dimension: str, unit: str) -> tuple[tuple[str, str], np.ndarray, dict[str, str]]:
-            return ("time", dimension), np.asarray(value), {"units": unit}
+_FIRST_STATUSES = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")
+"""The names of statuses in the order of their numbers in the first format."""
 
-        return xr.Dataset(
-            {
-                "displacement": column(kept.state.displacement, "coordinate", " or ".join(dict.fromkeys(structure.units))),
-                "velocity": column(
-                    kept.state.velocity, "coordinate", " or ".join(f"{u}/s" for u in dict.fromkeys(structure.units))
-                ),
-                "angle": column(kept.state.angle[0], "load", "rad"),
-                "rate": column(kept.state.rate[0], "load", "rad/s"),
-                "foundation_force": column(kept.foundation_force, "direction", "N"),
-                "rotor_speed": ("time", np.asarray(kept.rotor_speed), {"units": "rad/s"}),
-            },
-            coords={
-                "time": ("time", np.asarray(kept.time), {"units": "s"}),
-                "coordinate": list(structure.coordinates),
-                "unit": ("coordinate", list(structure.units)),
-                "load": list(loads),
-                "direction": list(range(1, kept.foundation_force.shape[1] + 1)),
-            },
-            attrs={
-                "status": self.message,
-                "omega": float(self.omega),
-                "amplitude": np.asarray(self.amplitude).tolist(),
-                "foundation_force_amplitude": float(self.foundation_force),
-                "error": float(self.error),
-                "steps": int(self.steps),
-            },
-        )
 
-    def save(self, path: str | Path) -> Path:
-        """Writes the run, scene included, to a NumPy archive (".npz"); `Run.load` reads it back bit for bit.
+def from_first_format(archive: Mapping[str, Any]) -> Run:
+    """The run in an archive that has no layout, but its arrays numbered in the order of the fields."""
+    scene = scene_from_toml(str(archive["scene"]))
+    leaves = (jnp.asarray(archive[f"leaf{k}"]) for k in itertools.count())
 
-        **Returns** the path written to.
-        """
-        arrays = {f"leaf{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(eqx.filter(self, eqx.is_array)))}
-        path = Path(path)
-        path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-        arrays |= {"scene": np.asarray(scene_to_toml(self.scene)), "kept_all": np.asarray(self.trajectory is not None)}
-        np.savez(path, allow_pickle=False, **arrays)
-        return path
+    def motion() -> Trajectory:
+        time, displacement, velocity, angle, rate = (next(leaves) for _ in range(5))
+        rotor = (next(leaves), next(leaves)) if not scene.drive.ideal else None
+        state = State(displacement, velocity, (angle,), (rate,), rotor)
+        return Trajectory(time, state, *(next(leaves) for _ in range(3)))
 
-    @classmethod
-    def load(cls, path: str | Path) -> Run:
-        """Reads a run written by `save`.
-
-        **Raises** `InputError` for a file that is missing or was not written by `save`.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                scene = scene_from_toml(str(archive["scene"]))
-                kept_all = bool(archive["kept_all"])
-                leaves = [jnp.asarray(archive[f"leaf{i}"]) for i in range(len(archive.files) - 2)]
-                zero = jnp.zeros(())
-                rotor = None if scene.drive.ideal else (zero, zero)
-                motion = Trajectory(zero, State(zero, zero, (zero,), (zero,), rotor), zero, zero, zero)
-                kept = motion if kept_all else None
-                shape = cls(zero, zero, zero, zero, zero, RunStatus.done, kept, motion, zero, zero, zero, zero, zero, scene)
-                dynamic, static = eqx.partition(shape, eqx.is_array)
-                return eqx.combine(jax.tree.unflatten(jax.tree.structure(dynamic), leaves), static)
-        except FileNotFoundError as error:
-            raise InputError("path", f"is {str(path)!r}; there is no such file") from error
-        except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError("path", f"is {str(path)!r}; it is no run written by Run.save") from error
+    measured = {name: next(leaves) for name in ("omega", "load_speed", "amplitude", "foundation_force", "drift")}
+    status = member(RunStatus, _FIRST_STATUSES[int(next(leaves))])
+    trajectory = motion() if bool(archive["kept_all"]) else None
+    window = motion()
+    cost = {name: next(leaves) for name in ("error", "steps", "rejected", "evaluations", "seconds")}
+    return Run(**measured, status=status, trajectory=trajectory, window=window, **cost, scene=scene)

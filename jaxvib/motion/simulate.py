@@ -16,13 +16,14 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
 from jaxvib.ode.dopri8_loop import LoopDopri8
+from jaxvib.results.status import failure, status_name
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -319,11 +320,9 @@ def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
     if bool(run.status == RunStatus.done):
         return
     require_numbers(run.scene)
-    names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_accurate")
-    name = next(name for name in names if bool(run.status == getattr(RunStatus, name)))
+    name, hint = status_name(run.status), ""
     kept = run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
-    hint = run.message
     if not bool(np.all(finite)) and bool(np.any(finite)):
         hint += f", after t = {times[finite][-1]:.6g} s"
     if name == "no_step":
@@ -332,4 +331,4 @@ def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
         hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
     if name == "not_accurate":
         hint += f" ({float(run.error):.1e}, asked for {accuracy:.1e}); give a larger accuracy, or a shorter run"
-    raise ComputationError(name, hint)
+    raise failure(run.status, hint)

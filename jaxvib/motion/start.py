@@ -61,8 +61,10 @@ def initial_state(
     def phases(value: float | Array) -> Array:
         if angles is not None:
             return numbers(angles, "rad", "angles", n)
-        touching = any(effect.couples_loads for effect in scene.effects) and isinstance(scene.loads, CircularLoads)
-        return value + (scene.loads.offsets() if touching else jnp.zeros((n,), zero.dtype))
+        touching = any(effect.couples_loads for effect in scene.effects)
+        if touching and isinstance(scene.loads, CircularLoads):
+            return value + scene.loads.offsets()
+        return value + jnp.zeros((n,), zero.dtype)
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])

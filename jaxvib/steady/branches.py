@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal, overload
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +14,12 @@ from jax import Array
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, fold_points
-from jaxvib.steady.jams.jam import Jam, branch_points
-from jaxvib.steady.jams.picture import picture
+from jaxvib.steady.jams.jam import AbstractJam, Jam, branch_points
+from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
@@ -27,15 +30,24 @@ if TYPE_CHECKING:
 __all__ = ["Branches", "branches"]
 
 
-class Branches(Jam):
-    """The branch diagram: the arrays of `Jam` along the load speed Omega, ascending, with a leading axis over the points.
+class Branches(AbstractJam):
+    """The branch diagram: the arrays of `AbstractJam` along the load speed Omega, ascending, a leading axis over the points.
 
     Adds `resonances` (nd,) rad/s, the `folds`, and the `scene`.
     """
 
-    resonances: Array
-    folds: Folds
-    scene: Scene
+    outer_axes = ("point",)
+
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    folds: Folds = eqx.field(metadata=part(prefix="fold_"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    def summary(self) -> str:
+        """The ranges of the branch, its resonances and its folds, for a person to read."""
+        folds = zip(
+            *(np.asarray(x)[np.asarray(self.folds.exists)] for x in (self.folds.omega, self.folds.rotor_speed)), strict=True
+        )
+        return branch_summary(self, [("fold", w, n) for w, n in folds])
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.

@@ -16,6 +16,9 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.units import Number, numbers, traced
 
 if TYPE_CHECKING:
@@ -29,18 +32,33 @@ _TIE = 1e-9
 """Size of the coupling that tells two whirls of one speed apart, relative to the machine's own matrices."""
 
 
-class CriticalSpeeds(eqx.Module):
+class CriticalSpeeds(Result):
     """Rotor speeds at which a whirl turns as fast as the rotor, no damping.
 
     **Attributes**: `speed` (nd,) rad/s, ascending, inf where there is none (a thin disc has no second forward one); `forward`
     (nd,) whether the whirl goes round with the rotor; only then does an imbalance excite it where supports are alike both ways.
     """
 
-    speed: Array
-    forward: Array
+    status = Computed.done
+
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "whirl"))
+    forward: Array = eqx.field(metadata=in_unit("", "whirl"))
+
+    def summary(self) -> str:
+        """A line for each speed, for a person to read."""
+        pairs = zip(np.asarray(self.speed), np.asarray(self.forward), strict=True)
+        lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
+        return "\n".join(lines) or "no critical speed"
+
+    def plot(self) -> Figure:
+        """Forward and backward critical speeds, on a line each. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+
+        speed, forward = np.asarray(self.speed), np.asarray(self.forward)
+        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])])
 
 
-class Whirl(eqx.Module):
+class Whirl(Result):
     """Natural motions of a turning rotor over rotor speeds: the Campbell diagram.
 
     **Attributes** (ns rotor speeds, nd natural motions each, ascending): `rotor_speed` (ns,) rad/s; `speed` (ns, nd) rad/s
@@ -48,11 +66,21 @@ class Whirl(eqx.Module):
     (ns, nd) whether it goes round with the rotor; `critical` the synchronous speeds.
     """
 
-    rotor_speed: Array
-    speed: Array
-    decay: Array
-    forward: Array
-    critical: CriticalSpeeds
+    status = Computed.done
+
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "rotor_speed"))
+    speed: Array = eqx.field(metadata=in_unit("rad/s", "rotor_speed", "whirl"))
+    decay: Array = eqx.field(metadata=in_unit("1/s", "rotor_speed", "whirl"))
+    forward: Array = eqx.field(metadata=in_unit("", "rotor_speed", "whirl"))
+    critical: CriticalSpeeds = eqx.field(metadata=part(prefix="critical_"))
+
+    def summary(self) -> str:
+        """The whirls at each rotor speed, and the critical speeds, for a person to read."""
+        lines = []
+        for n, *whirls in zip(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), strict=True):
+            shown = ", ".join(f"{w:.6g} {'forward' if f else 'backward'}" for w, f in zip(*whirls, strict=True))
+            lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
+        return "\n".join([*lines, self.critical.summary()])
 
     def plot(self) -> Figure:
         """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line."""

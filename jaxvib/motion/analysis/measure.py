@@ -14,8 +14,17 @@ from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_fi
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import _extremum, _places
+from jaxvib.results.fields import in_unit, part
 
-__all__ = ["Measured", "Trajectory", "measure"]
+__all__ = ["STATE", "AbstractMeasured", "Measured", "Trajectory", "measure"]
+
+STATE = {
+    "displacement": in_unit("m or rad", "coordinate"),
+    "velocity": in_unit("m/s or rad/s", "coordinate"),
+    "angle": in_unit("rad", "load"),
+    "rate": in_unit("rad/s", "load"),
+}
+"""Units and axes of the fields of a `State`; the rotor's angle and speed stand beside it where they count."""
 
 
 class Trajectory(eqx.Module):
@@ -26,14 +35,14 @@ class Trajectory(eqx.Module):
     for whole turns, and `rotor_speed` (nt,) rad/s.
     """
 
-    time: Array
-    state: State
-    foundation_force: Array
-    rotor_angle: Array
-    rotor_speed: Array
+    time: Array = eqx.field(metadata=in_unit("s", "time"))
+    state: State = eqx.field(metadata=part("time", fields=STATE))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "time", "direction"))
+    rotor_angle: Array = eqx.field(metadata=in_unit("rad", "time"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "time"))
 
 
-class Measured(eqx.Module):
+class AbstractMeasured(eqx.Module):
     """A motion in numbers, over the last turns of a run.
 
     **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
@@ -42,11 +51,11 @@ class Measured(eqx.Module):
     of those turns, relative to the largest amplitude, or of `omega` where that is more; `settled` whether it is below 1e-3.
     """
 
-    omega: Array
-    load_speed: Array
-    amplitude: Array
-    foundation_force: Array
-    drift: Array
+    omega: Array = eqx.field(metadata=in_unit("rad/s"))
+    load_speed: Array = eqx.field(metadata=in_unit("rad/s", "load"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", name="foundation_force_amplitude"))
+    drift: Array = eqx.field(metadata=in_unit(""))
 
     @property
     def settled(self) -> Array:
@@ -59,6 +68,10 @@ class Measured(eqx.Module):
         named = zip(structure.coordinates, self.amplitude, structure.units, strict=True)
         amplitude = ", ".join(f"{name} {float(a):.4g} {unit}" for name, a, unit in named)
         return f"amplitude, zero to peak: {amplitude}; foundation force {float(self.foundation_force):.4g} N"
+
+
+class Measured(AbstractMeasured):
+    """What `measure` reads off a motion, see `AbstractMeasured`."""
 
 
 def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, _mean_speed
-from jaxvib.steady.jams.patterns import PhasePattern, pattern_word, phase_pattern
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import member_names, sentence, status_name
+from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
 
@@ -36,11 +45,11 @@ class RegimeName(eqx.Enumeration):
     unsettled = "the loads have not come to a steady motion"
 
 
-REGIMES = ("swinging", "jammed", "unbalanced", "balanced", "parted", "unsettled")
+REGIMES = member_names(RegimeName)
 """The words for the members of `RegimeName`, in their order."""
 
 
-class Regime(eqx.Module):
+class Regime(Result):
     """The kind of motion over a stretch, and what it was judged by.
 
     **Attributes**
@@ -60,31 +69,35 @@ class Regime(eqx.Module):
 
     name: RegimeName
     pattern: PhasePattern
-    load_speed: Array
-    rotor_speed: Array
-    ripple: Array
-    phase: Array
-    unbalance: Array
-    resonance: Array
-    resonance_speed: Array
-    mode: Array
-    caught: Array
-    change: Array
+    load_speed: Array = eqx.field(metadata=in_unit("rad/s", "load"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    ripple: Array = eqx.field(metadata=in_unit("rad/s"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "load"))
+    unbalance: Array = eqx.field(metadata=in_unit(""))
+    resonance: Array = eqx.field(metadata=in_unit(""))
+    resonance_speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    mode: Array = eqx.field(metadata=in_unit(""))
+    caught: Array = eqx.field(metadata=in_unit(""))
+    change: Array = eqx.field(metadata=in_unit(""))
+
+    @property
+    def status(self) -> RegimeName:
+        """The `name`: what is known of the motion is what kind it is."""
+        return self.name
 
     @property
     def label(self) -> str:
         """The name's own word: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
-        return next(word for word in REGIMES if bool(self.name == getattr(RegimeName, word)))
+        return status_name(self.name)
 
     @property
     def pattern_label(self) -> str:
-        """The pattern's own word, see `pattern_word`."""
-        return pattern_word(self.pattern)
+        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        return status_name(self.pattern)
 
     def summary(self) -> str:
         """The name and its evidence, for a person to read."""
-        sentence = RegimeName[self.name]  # pyright: ignore[reportInvalidTypeArguments]
-        pattern = PhasePattern[self.pattern]  # pyright: ignore[reportInvalidTypeArguments]
+        pattern = sentence(self.pattern)
         speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
         evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
         if bool(self.name == RegimeName.jammed):
@@ -97,7 +110,13 @@ class Regime(eqx.Module):
         if bool(self.caught):
             evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
         evidence.append(f"speeds change by {float(self.change):.1e}")
-        return f"{sentence} ({'; '.join(evidence)})"
+        return f"{self.message} ({'; '.join(evidence)})"
+
+    def plot(self) -> Figure:
+        """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor."""
+        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+
+        return phase_circles([(self.label, np.asarray(self.phase))])
 
 
 def regime(scene: Scene, stretch: Trajectory) -> Regime:

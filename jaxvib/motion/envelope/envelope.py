@@ -15,7 +15,7 @@ from jax.extend import core
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
@@ -26,6 +26,7 @@ from jaxvib.ode.control import WrappedController, moved_on
 from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
+from jaxvib.results.status import failure, status_name
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -329,11 +330,9 @@ def _raise_if_failed(run: Envelope, max_steps: int) -> None:
     if bool(run.status == EnvelopeStatus.done):
         return
     require_numbers(run.scene)
-    names = ("max_steps_reached", "not_finite", "no_step", "no_start", "not_turning")
-    name = next(name for name in names if bool(run.status == getattr(EnvelopeStatus, name)))
     hint = {
         "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
         "no_step": "; give a smaller tolerance, or leave the solver out",
         "not_turning": "; integrate the full equations with simulate",
     }
-    raise ComputationError(name, run.message + hint.get(name, ""))
+    raise failure(run.status, hint.get(status_name(run.status), ""))

@@ -10,7 +10,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.motion.analysis.measure import AbstractMeasured
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,39 +41,34 @@ class Envelopes(eqx.Module):
     `rotor_speed` (nt,) rad/s; `ripple` (nt, count) rad, see `Envelope`.
     """
 
-    time: Array
-    displacement: Array
-    velocity: Array
-    amplitude: Array
-    foundation_force: Array
-    omega: Array
-    load_speed: Array
-    phase: Array
-    rotor_speed: Array
-    ripple: Array
+    time: Array = eqx.field(metadata=in_unit("s", "time"))
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "time", "coordinate"))
+    velocity: Array = eqx.field(metadata=in_unit("m/s or rad/s", "time", "coordinate"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "time", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "time", "direction"))
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "time"))
+    load_speed: Array = eqx.field(metadata=in_unit("rad/s", "time", "load"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "time", "load"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "time"))
+    ripple: Array = eqx.field(metadata=in_unit("rad", "time", "load"))
 
 
-class Envelope(Measured):
-    """An averaged run of a scene: the quantities of `Measured` over the last turns, and the averaged motion.
+class Envelope(AbstractMeasured, Result):
+    """An averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
-    **Attributes**: those of `Measured`; `status` an `EnvelopeStatus`; `ripple` (count,) rad, by how much the vibration that
-    averaging leaves out shakes each load's angle, largest over the window: amplitudes and speeds are off by a share of about
-    this size; `trajectory` and `window` as `Envelopes`, the former None where only the window was asked for; `steps`,
+    **Attributes**: those of `AbstractMeasured`; `status` an `EnvelopeStatus`; `ripple` (count,) rad, by how much the vibration
+    that averaging leaves out shakes each load's angle, largest over the window: amplitudes and speeds are off by a share of
+    about this size; `trajectory` and `window` as `Envelopes`, the former None where only the window was asked for; `steps`,
     `rejected`; `scene`.
     """
 
-    ripple: Array
+    ripple: Array = eqx.field(metadata=in_unit("rad", "load"))
     status: EnvelopeStatus
-    trajectory: Envelopes | None
-    window: Envelopes
-    steps: Array
-    rejected: Array
-    scene: Scene
-
-    @property
-    def message(self) -> str:
-        """How the run ended, a sentence."""
-        return EnvelopeStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+    trajectory: Envelopes | None = eqx.field(metadata=part(prefix="trajectory_"))
+    window: Envelopes = eqx.field(metadata=part(prefix="window_"))
+    steps: Array = eqx.field(metadata=in_unit(""))
+    rejected: Array = eqx.field(metadata=in_unit(""))
+    scene: Scene = eqx.field(metadata=SCENE)
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,19 +11,17 @@ from jax import Array
 
 from jaxvib.equations.linear import circular_loads, turning
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, characteristic_speeds, port_receptance
 
-__all__ = ["Criterion", "CriterionStatus", "criterion", "criterion_functional", "criterion_table"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
-
-class CriterionStatus(eqx.Enumeration):
-    """What is known of a machine that was judged; the members are the sentences a user reads."""
-
-    judged = "every rotor speed is judged"
-    free = "no support holds the machine against one of its motions: its lowest resonance is 0, and it can drift"
+__all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
 
 
-class Criterion(eqx.Module):
+class Criterion(Result):
     """The criterion's answer for one machine with its loads.
 
     **Attributes**: `status` a `CriterionStatus`; `speeds` the `CharacteristicSpeeds`; intervals of rotor speed, rows
@@ -33,11 +31,11 @@ class Criterion(eqx.Module):
     """
 
     status: CriterionStatus
-    speeds: CharacteristicSpeeds
-    balancing: Array
-    gathering: Array
-    undamped_balancing: Array
-    undamped_gathering: Array
+    speeds: CharacteristicSpeeds = eqx.field(metadata=part())
+    balancing: Array = eqx.field(metadata=in_unit("rad/s", "interval", "end"))
+    gathering: Array = eqx.field(metadata=in_unit("rad/s", "interval", "end"))
+    undamped_balancing: Array = eqx.field(metadata=in_unit("rad/s", "interval", "end"))
+    undamped_gathering: Array = eqx.field(metadata=in_unit("rad/s", "interval", "end"))
 
     @property
     def resonances(self) -> Array:
@@ -64,6 +62,14 @@ class Criterion(eqx.Module):
         lines = [f"{table['status']}", self.speeds.summary()]
         lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
         return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Characteristic speeds with damping, and the intervals between them. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+
+        rows = [("resonances", self.speeds.damped_resonances), ("additional", self.speeds.damped_additional)]
+        spans = [("balancing", self.balancing), ("gathering", self.gathering)]
+        return speeds_chart(*([(label, np.asarray(values)) for label, values in group] for group in (rows, spans)))
 
 
 def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:
@@ -111,7 +117,7 @@ def criterion(scene: Scene) -> Criterion:
     """
     speeds = characteristic_speeds(scene)
     return Criterion(
-        status=CriterionStatus.where(speeds.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged),
+        status=speeds.status,
         speeds=speeds,
         balancing=_balancing(speeds.damped_resonances, speeds.damped_additional),
         gathering=_gathering(speeds.damped_resonances, speeds.damped_additional),
@@ -155,7 +161,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
         name: _joined(np.asarray(getattr(result, name)))
         for name in ("balancing", "gathering", "undamped_balancing", "undamped_gathering")
     }
-    return {"status": CriterionStatus[result.status], **lists, **intervals}
+    return {"status": result.message, **lists, **intervals}
 
 
 def _joined(rows: np.ndarray) -> list[list[float | None]]:

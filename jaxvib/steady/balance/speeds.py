@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,15 +15,27 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.numerics.roots import bracketed_root
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
 from jaxvib.units import traced
 
-__all__ = ["CharacteristicSpeeds", "characteristic_speeds", "port_receptance"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
 
 _POINTS = 24
 """Grid points on each side of each resonance, where sign changes of the damped machine are looked for."""
 
 
-class CharacteristicSpeeds(eqx.Module):
+class CriterionStatus(eqx.Enumeration):
+    """What is known of a machine that was judged; the members are the sentences a user reads."""
+
+    judged = "every rotor speed is judged"
+    free = "no support holds the machine against one of its motions: its lowest resonance is 0, and it can drift"
+
+
+class CharacteristicSpeeds(Result):
     """Speeds at which the real part of the port's receptance changes sign, ascending, rad/s; NaN where there is none.
 
     **Attributes** (nd coordinates)
@@ -35,12 +49,17 @@ class CharacteristicSpeeds(eqx.Module):
     A mode that does not move the port has its resonance among the additional speeds too: nothing changes sign there.
     """
 
-    resonances: Array
-    additional: Array
-    shapes: Array
-    damped_resonances: Array
-    damped_additional: Array
-    coordinates: tuple[str, ...] = eqx.field(static=True)
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    additional: Array = eqx.field(metadata=in_unit("rad/s", "zero"))
+    shapes: Array = eqx.field(metadata=in_unit("", "coordinate", "resonance"))
+    damped_resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    damped_additional: Array = eqx.field(metadata=in_unit("rad/s", "zero"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="coordinate"))
+
+    @property
+    def status(self) -> CriterionStatus:
+        """Whether supports hold the machine, a `CriterionStatus`."""
+        return CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
         """Every speed with its label ("resonance 1", "additional 1", ...), ascending."""
@@ -64,6 +83,14 @@ class CharacteristicSpeeds(eqx.Module):
                 line += "  " + ", ".join(f"{x:.3g}" for x in (shape / largest).tolist())
             lines.append(line)
         return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """Resonances and additional speeds, without and with damping, on a line each. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
+
+        rows = [("resonances", self.resonances), ("additional", self.additional)]
+        rows += [("damped resonances", self.damped_resonances), ("damped additional", self.damped_additional)]
+        return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows])
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,15 +13,22 @@ from jax.typing import ArrayLike
 
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import failure
 from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "BalanceStatus",
     "BalancedStability",
     "BalancedStates",
+    "StabilityStatus",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -39,7 +48,7 @@ class BalanceStatus(eqx.Enumeration):
     outweighed = "one load's m R, or the rotor's imbalance, is larger than all others together: nothing can cancel it"
 
 
-class BalancedStates(eqx.Module):
+class BalancedStates(Result):
     """How a set of loads can cancel each other and the rotor's imbalance, in the frame of the rotor.
 
     **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
@@ -52,16 +61,22 @@ class BalancedStates(eqx.Module):
     """
 
     status: BalanceStatus
-    angles: np.ndarray
-    dimension: int
-    neutral: list[np.ndarray]
-    names: tuple[str, ...]
+    angles: np.ndarray = eqx.field(metadata=in_unit("rad", "arrangement", "load"))
+    dimension: int = eqx.field(metadata=in_unit(""))
+    neutral: list[np.ndarray] = eqx.field(metadata=in_unit("", "arrangement", "load", "neutral_direction"))
+    names: tuple[str, ...] = eqx.field(metadata=in_unit("", "neutral_direction", name="neutral_direction"))
 
     def summary(self) -> str:
         """A table a person can read."""
         rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
-        return "\n".join([BalanceStatus[self.status], *rows, directions])
+        return "\n".join([self.message, *rows, directions])
+
+    def plot(self) -> Figure:
+        """The arrangements in the frame of the rotor, a circle each. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+
+        return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)])
 
 
 def balanced_states(scene: Scene) -> BalancedStates:
@@ -187,7 +202,14 @@ def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np
     return np.concatenate([common, basis[:, size > 0.5]], axis=1)
 
 
-class BalancedStability(eqx.Module):
+class StabilityStatus(eqx.Enumeration):
+    """Whether a balanced motion is stable; the members are the sentences a user reads."""
+
+    stable = "errors of the balanced motion die out"
+    unstable = "errors of the balanced motion grow"
+
+
+class BalancedStability(Result):
     """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
 
     **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
@@ -196,11 +218,30 @@ class BalancedStability(eqx.Module):
     estimated from half the number of steps.
     """
 
-    stable: bool
-    growth: float
-    multipliers: np.ndarray
-    neutral: int
-    error: float
+    stable: bool = eqx.field(metadata=in_unit(""))
+    growth: float = eqx.field(metadata=in_unit("1/s"))
+    multipliers: np.ndarray = eqx.field(metadata=in_unit("", "floquet"))
+    neutral: int = eqx.field(metadata=in_unit(""))
+    error: float = eqx.field(metadata=in_unit(""))
+
+    @property
+    def status(self) -> StabilityStatus:
+        """Whether it is stable, a `StabilityStatus`."""
+        return StabilityStatus.stable if self.stable else StabilityStatus.unstable
+
+    def summary(self) -> str:
+        """Whether it is stable and how fast errors change, for a person to read."""
+        largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
+        return (
+            f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
+            f"known to {self.error:.1e}"
+        )
+
+    def plot(self) -> Figure:
+        """The multipliers in the complex plane, and the unit circle. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
+
+        return multiplier_chart(np.asarray(self.multipliers))
 
 
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
@@ -329,7 +370,7 @@ def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, in
     if angles is None:
         states = balanced_states(scene)
         if not len(states.angles):
-            raise ComputationError(_name(states.status), BalanceStatus[states.status])
+            raise failure(states.status)
         angles = states.angles[0]
     angles = np.broadcast_to(np.asarray(angles, dtype=float), sides.shape)
     if abs(np.sum(sides * np.exp(1j * angles)) + imbalance) > 1e-9 * sides.sum():
@@ -343,10 +384,6 @@ def _growth_rate(multipliers: np.ndarray, speed: float | np.ndarray, neutral: in
     nearest = np.argsort(np.abs(multipliers - 1.0), axis=-1)
     others = np.take_along_axis(multipliers, nearest[..., neutral:], -1)
     return np.log(np.max(np.abs(others), axis=-1)) * np.asarray(speed) / (2.0 * np.pi)
-
-
-def _name(status: BalanceStatus) -> str:
-    return next(name for name in ("unique", "family", "alone", "outweighed") if getattr(BalanceStatus, name) == status)
 
 
 def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:

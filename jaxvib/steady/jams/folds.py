@@ -16,6 +16,7 @@ from jaxvib.equations.collected import light_friction
 from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, turning
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.roots import bracketed_root
+from jaxvib.results.fields import in_unit
 
 __all__ = ["Folds", "jam_rotor_speed", "rotor_speed_at"]
 
@@ -30,9 +31,9 @@ class Folds(eqx.Module):
     `rotor_speed` rad/s; `exists`.
     """
 
-    omega: Array
-    rotor_speed: Array
-    exists: Array
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "fold"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "fold"))
+    exists: Array = eqx.field(metadata=in_unit("", "fold"))
 
 
 def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,11 +15,16 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, rotor_speed_at
 from jaxvib.units import traced
 
-__all__ = ["Jam", "JamModes", "JamStatus", "jam_modes"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["AbstractJam", "Jam", "JamModes", "JamStatus", "jam_modes"]
 
 
 class JamStatus(eqx.Enumeration):
@@ -29,8 +36,8 @@ class JamStatus(eqx.Enumeration):
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
 
 
-class Jam(eqx.Module):
-    """One jam mode of a scene.
+class AbstractJam(Result):
+    """Jam modes of a scene, one or several.
 
     **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
     the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude`
@@ -38,23 +45,36 @@ class Jam(eqx.Module):
     squares of their peaks (sqrt 2 times the force of a circular whirl).
     """
 
-    mode: Array
+    mode: Array = eqx.field(metadata=in_unit("", "*"))
     status: JamStatus
-    omega: Array
-    rotor_speed: Array
-    stable: Array
-    slope: Array
-    displacement: Array
-    amplitude: Array
-    foundation_force: Array
-
-    @property
-    def message(self) -> str:
-        """What is known of this mode, a sentence."""
-        return JamStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    stable: Array = eqx.field(metadata=in_unit("", "*"))
+    slope: Array = eqx.field(metadata=in_unit("", "*"))
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
 
 
-class JamModes(Jam):
+class Jam(AbstractJam):
+    """One jam mode of a scene, see `AbstractJam`."""
+
+    def summary(self) -> str:
+        """A line a person can read; amplitude zero to peak."""
+        if not np.isfinite(self.omega):
+            return f"mode {int(self.mode)}: {self.message}"
+        amplitude = ", ".join(f"{float(a):.4g}" for a in self.amplitude)
+        return (
+            f"mode {int(self.mode)}: Omega {float(self.omega):.6g} rad/s, {'stable' if self.stable else 'unstable'}, "
+            f"amplitude {amplitude} m, foundation force {float(self.foundation_force):.4g} N"
+        )
+
+    def plot(self) -> Figure:
+        """The speed of the loads and the amplitudes. **Returns** a matplotlib figure."""
+        return _modes_chart(jax.tree.map(lambda leaf: leaf[None], self), None)
+
+
+class JamModes(AbstractJam):
     """All jam modes at one rotor speed: the arrays of `Jam` with a leading axis over the modes 1 .. 2 nd + 1.
 
     A mode that does not exist holds NaN and the status `absent`; one without a bound has NaN amplitudes and says `unbounded`.
@@ -62,8 +82,10 @@ class JamModes(Jam):
     does not spoil those of a batch: ask the status, not the gradient.
     """
 
-    resonances: Array
-    folds: Folds
+    outer_axes = ("mode",)
+
+    resonances: Array = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    folds: Folds = eqx.field(metadata=part(prefix="fold_"))
 
     @property
     def exists(self) -> Array:
@@ -97,14 +119,18 @@ class JamModes(Jam):
         """A table a person can read; amplitudes zero to peak."""
         lines = [f"rotor speed {float(self.rotor_speed[0]):.6g} rad/s, resonances "]
         lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
-        for k in self.mode_numbers():
-            jam = self.select(k)
-            amplitude = ", ".join(f"{float(a):.4g}" for a in jam.amplitude)
-            lines.append(
-                f"  mode {k}: Omega {float(jam.omega):.6g} rad/s, {'stable' if jam.stable else 'unstable'}, "
-                f"amplitude {amplitude} m, foundation force {float(jam.foundation_force):.4g} N"
-            )
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers())])
+
+    def plot(self) -> Figure:
+        """Speeds of the loads among the resonances, and amplitudes, by mode. **Returns** a matplotlib figure."""
+        return _modes_chart(self, self.resonances)
+
+
+def _modes_chart(jams: AbstractJam, resonances: Array | None) -> Figure:
+    from jaxvib.draw.results import modes_chart  # slow to import: only who draws pays
+
+    mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
+    return modes_chart(mode, omega, stable, amplitude, None if resonances is None else np.asarray(resonances))
 
 
 def jam_modes(scene: Scene) -> JamModes:

@@ -18,12 +18,6 @@ class PhasePattern(eqx.Enumeration):
     other = "at other phases"
 
 
-def pattern_word(pattern: PhasePattern) -> str:
-    """The pattern's own word: "together", "opposite", "spread" or "other"."""
-    words = ("together", "opposite", "spread", "other")
-    return next(word for word in words if bool(pattern == getattr(PhasePattern, word)))
-
-
 def phase_pattern(phase: Array) -> PhasePattern:
     """The pattern of phases (count,) rad: by their resultants |mean exp(i k phase)| for k = 1 and 2.
 

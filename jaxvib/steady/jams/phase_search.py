@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import equinox as eqx
 import jax
@@ -13,9 +13,12 @@ from jax import Array
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
-from jaxvib.steady.jams.patterns import PhasePattern
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
 from jaxvib.steady.jams.phases import (
+    AbstractPhaseJam,
     Parts,
     PhaseJam,
     PhaseStatus,
@@ -49,12 +52,14 @@ _HALVINGS = 6
 """Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
 
 
-class PhaseJams(PhaseJam):
-    """Every jam that was found: the arrays of `PhaseJam` with a leading axis, by falling speed of the loads, stable ones first
-    where speeds are equal; `starts` (n,): how many of the starts led to each; and the `scene`."""
+class PhaseJams(AbstractPhaseJam):
+    """Every jam that was found: the arrays of `AbstractPhaseJam` with a leading axis, by falling speed of the loads, stable
+    ones first where speeds are equal; `starts` (n,): how many of the starts led to each; and the `scene`."""
 
-    starts: Array
-    scene: Scene
+    outer_axes = ("jam",)
+
+    starts: Array = eqx.field(metadata=in_unit("", "jam"))
+    scene: Scene = eqx.field(metadata=SCENE)
 
     def select(self, index: int) -> PhaseJam:
         """The jam of that place, counted from 0. **Raises** `InputError` where there are not so many."""
@@ -66,14 +71,7 @@ class PhaseJams(PhaseJam):
 
     def summary(self) -> str:
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
-        lines = []
-        for k in range(self.omega.shape[0]):
-            jam = self.select(k)
-            phases = ", ".join(f"{np.rad2deg(float(a)):.4g}" for a in jam.phase)
-            name = PhasePattern[jam.pattern]  # pyright: ignore[reportInvalidTypeArguments]
-            stable = "stable" if bool(jam.stable) else "unstable"
-            lines.append(f"Omega {float(jam.omega):.6g} rad/s, {stable} ({float(jam.growth):.3g} 1/s), {name}: {phases} deg")
-        return "\n".join(lines) or "no jam"
+        return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
         """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
@@ -250,7 +248,7 @@ def _phases(parts: Parts, influence: Array, omega: Array, start: Array) -> tuple
     return each[0], jnp.concatenate([jnp.zeros(1, x.dtype), x]), good
 
 
-class PhaseBranch(NamedTuple):
+class PhaseBranch(Result):
     """One phase pattern over the loads' speed, at a given rotor speed.
 
     **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): at how many times the scene's drag the loads jam there,
@@ -258,13 +256,32 @@ class PhaseBranch(NamedTuple):
     `rotor_speed` rad/s, and `drag` (count,) N s/m that the factor multiplies.
     """
 
-    omega: Array
-    drag_factor: Array
-    phase: Array
-    growth: Array
-    stable: Array
-    rotor_speed: Array
-    drag: Array
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))
+    drag_factor: Array = eqx.field(metadata=in_unit("", "omega"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "omega", "load"))
+    growth: Array = eqx.field(metadata=in_unit("1/s", "omega"))
+    stable: Array = eqx.field(metadata=in_unit("", "omega"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    drag: Array = eqx.field(metadata=in_unit("N s/m", "load"))
+
+    @property
+    def status(self) -> PhaseStatus:
+        """At each load speed whether the pattern was found there, a `PhaseStatus`."""
+        return jax.vmap(lambda f: PhaseStatus.where(jnp.isnan(f), PhaseStatus.not_converged, PhaseStatus.found))(
+            self.drag_factor
+        )
+
+    def summary(self) -> str:
+        """The ranges of load speed and drag, for a person to read."""
+        factor, omega = np.asarray(self.drag_factor), np.asarray(self.omega)
+        there = np.isfinite(factor)
+        if not np.any(there):
+            return f"no jam from {omega[0]:.6g} to {omega[-1]:.6g} rad/s"
+        return (
+            f"{np.sum(there)} of {omega.size} load speeds have a jam, {np.sum(np.asarray(self.stable))} a stable one, from "
+            f"{np.min(omega[there]):.6g} to {np.max(omega[there]):.6g} rad/s, at {np.min(factor[there]):.4g} to "
+            f"{np.max(factor[there]):.4g} times the scene's drag"
+        )
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
         """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable

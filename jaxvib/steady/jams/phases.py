@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,10 +17,16 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude
-from jaxvib.steady.jams.patterns import PhasePattern, pattern_word, phase_pattern
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import sentence, status_name
+from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.units import traced
 
-__all__ = ["PhaseJam", "PhaseStatus", "phase_jam", "phase_torques"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "phase_jam", "phase_torques"]
 
 
 class PhaseStatus(eqx.Enumeration):
@@ -30,8 +38,8 @@ class PhaseStatus(eqx.Enumeration):
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
 
 
-class PhaseJam(eqx.Module):
-    """A jam whose loads need not stand at one angle: phi_j = Omega t + phase_j.
+class AbstractPhaseJam(Result):
+    """Jams whose loads need not stand at one angle, phi_j = Omega t + phase_j, one or several.
 
     **Attributes**: `status` a `PhaseStatus`; `omega`, `rotor_speed` rad/s; `phase` (count,) rad, of the first load 0;
     `pattern` a `PhasePattern`; `growth` 1/s, of the fastest growing small disturbance, and `stable` where it is negative;
@@ -42,22 +50,40 @@ class PhaseJam(eqx.Module):
     """
 
     status: PhaseStatus
-    omega: Array
-    rotor_speed: Array
-    phase: Array
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "*"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "*", "load"))
     pattern: PhasePattern
-    growth: Array
-    stable: Array
-    displacement: Array
-    amplitude: Array
-    foundation_force: Array
-    torque: Array
-    residual: Array
+    growth: Array = eqx.field(metadata=in_unit("1/s", "*"))
+    stable: Array = eqx.field(metadata=in_unit("", "*"))
+    displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
+    torque: Array = eqx.field(metadata=in_unit("N m", "*", "load"))
+    residual: Array = eqx.field(metadata=in_unit("", "*"))
+
+
+class PhaseJam(AbstractPhaseJam):
+    """A jam whose loads need not stand at one angle, see `AbstractPhaseJam`."""
 
     @property
     def pattern_label(self) -> str:
         """The pattern's own word: "together", "opposite", "spread" or "other"."""
-        return pattern_word(self.pattern)
+        return status_name(self.pattern)
+
+    def summary(self) -> str:
+        """A line a person can read; phases in degrees."""
+        if not np.isfinite(self.omega):
+            return self.message
+        phases = ", ".join(f"{np.rad2deg(float(a)):.4g}" for a in self.phase)
+        stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
+        return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
+
+    def plot(self) -> Figure:
+        """Where the loads stand, on a circle. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
+
+        return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))])
 
 
 class Parts(eqx.Module):

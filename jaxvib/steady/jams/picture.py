@@ -14,7 +14,7 @@ from jaxvib.machine.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["picture"]
+__all__ = ["branch_summary", "picture"]
 
 
 class _Branch(Protocol):
@@ -26,6 +26,18 @@ class _Branch(Protocol):
     amplitude: Array
     foundation_force: Array
     scene: Scene
+
+
+def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]]) -> str:
+    """The ranges of a branch and its special points (kind, load speed, rotor speed), for a person to read."""
+    omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
+    natural = ", ".join(f"{float(w):.6g}" for w in natural_frequencies(branch.scene))
+    lines = [
+        f"{omega.size} points from {np.min(omega):.6g} to {np.max(omega):.6g} rad/s, {np.mean(stable):.1%} of them stable; "
+        f"resonances {natural} rad/s"
+    ]
+    names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
+    return "\n".join([*lines, *(f"  {kind}: Omega {w:.6g} rad/s, rotor {n:.6g} rad/s" for kind, w, n in names)])
 
 
 def picture(

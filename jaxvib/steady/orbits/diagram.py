@@ -15,8 +15,11 @@ from jaxvib.equations.collected import has_half_turn
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
 from jaxvib.steady.jams.folds import fold_points
-from jaxvib.steady.jams.picture import picture
+from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, steps_for
 from jaxvib.steady.orbits.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.units import Number, count, number
@@ -41,7 +44,7 @@ class SpecialPoint(NamedTuple):
     rotor_speed: float
 
 
-class ExactBranches(eqx.Module):
+class ExactBranches(Result):
     """The branch n(Omega) of exact jams, ascending in Omega, a leading axis over its P points.
 
     **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m, of tilts rad, and
@@ -50,20 +53,26 @@ class ExactBranches(eqx.Module):
     Omega; `scene`.
     """
 
+    outer_axes = ("point",)
+
     status: OrbitStatus
-    omega: Array
-    rotor_speed: Array
-    slope: Array
-    amplitude: Array
-    foundation_force: Array
-    power: Array
-    stable: Array
-    multiplier: Array
-    multipliers: Array
-    residual: Array
-    error: Array
-    scene: Scene
-    special: tuple[SpecialPoint, ...] = eqx.field(static=True)
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "point"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "point"))
+    slope: Array = eqx.field(metadata=in_unit("", "point"))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "point", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N", "point"))
+    power: Array = eqx.field(metadata=in_unit("W", "point"))
+    stable: Array = eqx.field(metadata=in_unit("", "point"))
+    multiplier: Array = eqx.field(metadata=in_unit("", "point"))
+    multipliers: Array = eqx.field(metadata=in_unit("", "point", "floquet"))
+    residual: Array = eqx.field(metadata=in_unit("", "point"))
+    error: Array = eqx.field(metadata=in_unit("", "point"))
+    scene: Scene = eqx.field(metadata=SCENE)
+    special: tuple[SpecialPoint, ...] = eqx.field(static=True, metadata=in_unit("", "special_point"))
+
+    def summary(self) -> str:
+        """The ranges of the branch, its resonances and its special points, for a person to read."""
+        return f"{branch_summary(self, list(self.special))}\n{self.message}"
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""

@@ -10,9 +10,10 @@ from jax import Array
 
 from jaxvib.equations.collected import has_half_turn
 from jaxvib.equations.linear import jammed_loads, linear_model
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.results.status import failure, status_name
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
@@ -146,10 +147,8 @@ def jam_orbit(
             found = attempt()
     if found is None or differentiated:
         found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy, settle)
-    elif throw:
-        for status in ("absent", "not_converged"):
-            if bool(found.status == getattr(OrbitStatus, status)):
-                raise ComputationError(status, OrbitStatus[getattr(OrbitStatus, status)])
+    elif throw and status_name(found.status) in ("absent", "not_converged"):
+        raise failure(found.status)
     return found
 
 

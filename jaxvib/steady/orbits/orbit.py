@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,8 @@ from jaxvib.equations.collected import bodies, circle, each_load, has_half_turn,
 from jaxvib.equations.linear import LinearModel, jammed_loads
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
 from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.orbits.collocation import (
     Harmonics,
@@ -22,6 +26,9 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
 
@@ -37,7 +44,7 @@ class OrbitStatus(eqx.Enumeration):
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
 
 
-class Orbit(eqx.Module):
+class Orbit(Result):
     """An exact jam: phi = theta + psi(theta), theta = Omega t, psi periodic with mean 0; everything else follows it.
 
     Numbers are NaN where the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
@@ -60,30 +67,25 @@ class Orbit(eqx.Module):
     """
 
     status: OrbitStatus
-    omega: Array
-    rotor_speed: Array
-    slope: Array
-    stable: Array
-    multiplier: Array
-    multipliers: Array
-    trivial: Array
-    amplitude: Array
-    foundation_force: Array
-    power: Array
-    residual: Array
-    error: Array
-    deviation_harmonics: Array
-    displacement_harmonics: Array
-    force_harmonics: Array
-    offsets: Array
-    deviation_orders: tuple[int, ...] = eqx.field(static=True)
-    orders: tuple[int, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
-
-    @property
-    def message(self) -> str:
-        """What is known of this motion, a sentence."""
-        return OrbitStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
+    omega: Array = eqx.field(metadata=in_unit("rad/s"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    slope: Array = eqx.field(metadata=in_unit(""))
+    stable: Array = eqx.field(metadata=in_unit(""))
+    multiplier: Array = eqx.field(metadata=in_unit(""))
+    multipliers: Array = eqx.field(metadata=in_unit("", "floquet"))
+    trivial: Array = eqx.field(metadata=in_unit(""))
+    amplitude: Array = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    foundation_force: Array = eqx.field(metadata=in_unit("N"))
+    power: Array = eqx.field(metadata=in_unit("W"))
+    residual: Array = eqx.field(metadata=in_unit(""))
+    error: Array = eqx.field(metadata=in_unit(""))
+    deviation_harmonics: Array = eqx.field(metadata=in_unit("rad", "group", "deviation_orders"))
+    displacement_harmonics: Array = eqx.field(metadata=in_unit("m or rad", "coordinate", "orders"))
+    force_harmonics: Array = eqx.field(metadata=in_unit("N", "direction", "orders"))
+    offsets: Array = eqx.field(metadata=in_unit("rad", "load"))
+    deviation_orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "deviation_orders"))
+    orders: tuple[int, ...] = eqx.field(static=True, metadata=in_unit("", "orders"))
+    units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
 
     @property
     def harmonics(self) -> int:
@@ -120,6 +122,21 @@ class Orbit(eqx.Module):
             f"power {float(self.power):.6g} W\n"
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )
+
+    def plot(self) -> Figure:
+        """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed."""
+        from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
+
+        theta = np.linspace(0.0, 2.0 * np.pi, 721)
+
+        def signal(harmonics: Array, orders: tuple[int, ...]) -> np.ndarray:
+            return np.real(np.asarray(harmonics) @ np.exp(1j * np.asarray(orders)[:, None] * theta)).T
+
+        motion = signal(self.displacement_harmonics, self.orders)
+        panels = [(f"displacement, {' or '.join(dict.fromkeys(self.units))}", motion)]
+        panels += [("deviation of the loads, rad", signal(self.deviation_harmonics, self.deviation_orders))]
+        panels += [("force on the bed, N", signal(self.force_harmonics, self.orders))]
+        return signals_chart(np.rad2deg(theta), panels, across="load angle Omega t, deg")
 
 
 def light_rotor_speed(model: LinearModel, omega: Array) -> Array:

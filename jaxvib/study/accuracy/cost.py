@@ -6,8 +6,13 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
+
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,14 +39,16 @@ class CostRow(NamedTuple):
     compile: float
 
 
-class Cost(NamedTuple):
+class Cost(Result):
     """What a quantity costs: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
     (`reference_error`, relative), the `rows`, and which tiers are `left_out`, a sentence with the reason for each."""
 
+    status = Computed.done
+
     quantity: str
-    reference: list[float]
-    reference_error: float
-    rows: list[CostRow]
+    reference: list[float] = eqx.field(metadata=in_unit("", "entry"))
+    reference_error: float = eqx.field(metadata=in_unit(""))
+    rows: list[CostRow] = eqx.field(metadata=in_unit("", "way", name="way"))
     left_out: tuple[str, ...] = ()
 
     def cheapest(self, error: float) -> CostRow | None:
@@ -50,6 +57,15 @@ class Cost(NamedTuple):
             return None
         able = [row for row in self.rows if row.error + self.reference_error <= error]
         return min(able, key=lambda row: row.seconds, default=None)
+
+    def summary(self) -> str:
+        """The cheapest way to each of the errors `WANTED`, and what is left out, for a person to read."""
+        lines = [f"{self.quantity.replace('_', ' ')}: {len(self.rows)} ways, reference known to {self.reference_error:.1e}"]
+        for wanted in WANTED:
+            row = self.cheapest(wanted)
+            way = "none here" if row is None else f"{', '.join(x for x in row[:4] if x)}: {row.seconds:.3g} s"
+            lines.append(f"  to {wanted:.0e}: {way}")
+        return "\n".join([*lines, *(f"  {reason}" for reason in self.left_out)])
 
     def plot(self) -> Figure:
         """Error against seconds, a line for each method; see `cost_figure`. **Returns** a matplotlib figure."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -18,6 +18,9 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
 from jaxvib.steady.orbits.orbit import light_rotor_speed
 from jaxvib.units import Number, number
@@ -28,15 +31,22 @@ if TYPE_CHECKING:
 __all__ = ["HarmonicConvergence", "harmonic_convergence"]
 
 
-class HarmonicConvergence(NamedTuple):
+class HarmonicConvergence(Result):
     """What the number of harmonics leaves: `harmonics` (n,) highest one of the carrier; of the jams at `omega` (w,) rad/s the
     relative `error` (n, w) of the rotor speed against twice as many points as the last, and the estimate of it that each jam
     comes with, `known` (n, w)."""
 
-    omega: np.ndarray
-    harmonics: np.ndarray
-    error: np.ndarray
-    known: np.ndarray
+    status = Computed.done
+
+    omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "omega"))
+    harmonics: np.ndarray = eqx.field(metadata=in_unit("", "harmonics"))
+    error: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
+    known: np.ndarray = eqx.field(metadata=in_unit("", "harmonics", "omega"))
+
+    def summary(self) -> str:
+        """A line for each number of harmonics: the largest error and the largest estimate of it, for a person to read."""
+        rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.known, axis=1), strict=True)
+        return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {known:.1e}" for n, error, known in rows)
 
     def plot(self) -> Figure:
         """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ import numpy as np
 
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import Jam, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
@@ -21,23 +24,36 @@ if TYPE_CHECKING:
 __all__ = ["Tier", "Tiers", "compare_tiers"]
 
 
-class Tier(NamedTuple):
+class Tier(eqx.Module):
     """One tier's answers, NaN where it has none: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
     `stable` (n,); `message` (n sentences) says of each whether it is there, or why not."""
 
-    omega: np.ndarray
-    amplitude: np.ndarray
-    foundation_force: np.ndarray
-    stable: np.ndarray
-    message: tuple[str, ...]
+    omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass"))
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "mass", "coordinate"))
+    foundation_force: np.ndarray = eqx.field(metadata=in_unit("N", "mass"))
+    stable: np.ndarray = eqx.field(metadata=in_unit("", "mass"))
+    message: tuple[str, ...] = eqx.field(metadata=in_unit("", "mass"))
 
 
-class Tiers(NamedTuple):
+class Tiers(Result):
     """Two tiers over the mass of one load: `mass` (n,) kg (its mean, where loads differ), `leading` and `exact` the answers."""
 
-    mass: np.ndarray
-    leading: Tier
-    exact: Tier
+    status = Computed.done
+
+    mass: np.ndarray = eqx.field(metadata=in_unit("kg", "mass"))
+    leading: Tier = eqx.field(metadata=part(prefix="leading_"))
+    exact: Tier = eqx.field(metadata=part(prefix="exact_"))
+
+    def summary(self) -> str:
+        """A line for each mass: the load speed by both tiers, or why there is none, for a person to read."""
+        lines = []
+        for k, mass in enumerate(self.mass):
+            light, exact = (
+                f"{tier.omega[k]:.9g} rad/s" if np.isfinite(tier.omega[k]) else tier.message[k]
+                for tier in (self.leading, self.exact)
+            )
+            lines.append(f"load of {mass:.4g} kg: leading order {light}, exact {exact}")
+        return "\n".join(lines)
 
     def plot(self) -> Figure:
         """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable."""
@@ -84,7 +100,8 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
 
     def tier(which: int) -> Tier:
         jams = [answer[which] for answer in answers]
-        numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in Tier._fields[:-1])
+        names = ("omega", "amplitude", "foundation_force", "stable")
+        numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in names)
         return Tier(*numbers, message=tuple(jam.message for jam in jams))
 
     return Tiers(float(jnp.mean(loads.mass)) * np.asarray(factors, dtype=float), tier(0), tier(1))

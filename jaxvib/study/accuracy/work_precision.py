@@ -205,7 +205,7 @@ def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
             rows.append(leading(_single(scene), "float32"))
     else:
         start = State(*jam.fine.at(jnp.zeros(())))
-        left_out.append(f"leading order: {JamStatus[light.status]}; runs start on the exact motion in its place")  # pyright: ignore
+        left_out.append(f"leading order: {light.message}; runs start on the exact motion in its place")
     for few in _POINTS:
         points = _whole(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
@@ -337,9 +337,9 @@ def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
         ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
     ]
     left_out: list[str] = []
-    light = jam_modes(scene).select(mode, throw=False).status
-    if not bool(light == JamStatus.found):
-        left_out = [f"leading order, full, which starts from it: {JamStatus[light]}"]  # pyright: ignore
+    light = jam_modes(scene).select(mode, throw=False)
+    if not bool(light.status == JamStatus.found):
+        left_out = [f"leading order, full, which starts from it: {light.message}"]
     else:
         ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
         if not bool(jam.fine.stable):

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import count
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_points"]
 
@@ -38,7 +45,7 @@ class TurningPoints(NamedTuple):
         return np.abs(np.diff(self.angle)) / 2.0
 
 
-class Decrement(NamedTuple):
+class Decrement(Result):
     """The formula of ten periods, on every pair of swings that a record has.
 
     **Attributes**: `viscous` mu1, N m s, an `Estimate`; `estimates` (n,) N m s, one a pair, first to last; `amplitude` (n,) rad
@@ -46,13 +53,28 @@ class Decrement(NamedTuple):
     the last pair's mu1 is above the first's; `period` s; `periods` between the two of a pair.
     """
 
-    viscous: Estimate
-    estimates: np.ndarray
-    amplitude: np.ndarray
-    scatter: float
-    drift: float
-    period: float
-    periods: int
+    status = Computed.done
+
+    viscous: Estimate = eqx.field(metadata=in_unit("N m s"))
+    estimates: np.ndarray = eqx.field(metadata=in_unit("N m s", "pair"))
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("rad", "pair"))
+    scatter: float = eqx.field(metadata=in_unit(""))
+    drift: float = eqx.field(metadata=in_unit(""))
+    period: float = eqx.field(metadata=in_unit("s"))
+    periods: int = eqx.field(metadata=in_unit(""))
+
+    def summary(self) -> str:
+        """The number with its interval, for a person to read."""
+        return (
+            f"by {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
+            f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
+        )
+
+    def plot(self) -> Figure:
+        """mu1 of each pair of swings, first to last. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
+
+        return points_chart(self.estimates[:, None], across="pair of swings", up="mu1, N m s")
 
 
 def turning_points(record: Record) -> TurningPoints:

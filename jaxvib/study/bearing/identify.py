@@ -16,6 +16,8 @@ from jax import Array
 
 from jaxvib.draw.record import record_chart
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
 from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, interval, ten_periods, turning_points
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, swing_states
@@ -62,7 +64,7 @@ class Fit(NamedTuple):
     converged: Array
 
 
-class Identified(NamedTuple):
+class Identified(Result):
     """A bearing's friction and how well it is known.
 
     **Attributes**
@@ -81,33 +83,22 @@ class Identified(NamedTuple):
 
     status: IdentifyStatus
     notes: tuple[str, ...]
-    viscous: Estimate
-    dry: Estimate | None
-    correlation: float
-    frequency: Estimate
-    offset: Estimate
-    angle: Estimate
-    rate: Estimate
-    inertia: float
-    noise: float
-    pattern: float
-    fitted: np.ndarray
-    stopped_at: float
-    width: float
-    decrement: Decrement | None
-    record: Record
+    viscous: Estimate = eqx.field(metadata=in_unit("N m s"))
+    dry: Estimate | None = eqx.field(metadata=in_unit(""))
+    correlation: float = eqx.field(metadata=in_unit(""))
+    frequency: Estimate = eqx.field(metadata=in_unit("rad/s"))
+    offset: Estimate = eqx.field(metadata=in_unit("rad"))
+    angle: Estimate = eqx.field(metadata=in_unit("rad"))
+    rate: Estimate = eqx.field(metadata=in_unit("rad/s"))
+    inertia: float = eqx.field(metadata=in_unit("kg m^2"))
+    noise: float = eqx.field(metadata=in_unit("rad"))
+    pattern: float = eqx.field(metadata=in_unit(""))
+    fitted: np.ndarray = eqx.field(metadata=in_unit("rad", "time"))
+    stopped_at: float = eqx.field(metadata=in_unit("s"))
+    width: float = eqx.field(metadata=in_unit("rad/s"))
+    decrement: Decrement | None = eqx.field(metadata=part(prefix="decrement_"))
+    record: Record = eqx.field(metadata=part())
     pendulum: BearingPendulum
-
-    @property
-    def message(self) -> str:
-        """What the fit is worth, a sentence."""
-        return IdentifyStatus[self.status]  # pyright: ignore[reportInvalidTypeArguments]
-
-    @property
-    def status_name(self) -> str:
-        """The status's own name, such as "found"."""
-        names = ("found", "patterned", "undetermined", "not_converged")
-        return next(name for name in names if bool(self.status == getattr(IdentifyStatus, name)))
 
     def summary(self) -> str:
         """The numbers with their intervals, for a person to read."""

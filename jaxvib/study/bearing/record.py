@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.results.fields import in_unit
 from jaxvib.units import to_float
 
 __all__ = ["Record", "read_record"]
@@ -21,7 +23,7 @@ _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi",
 _HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[]\s*(?P<unit>[^)\]]*?)\s*[)\]]|/\s*(?P<per>\S+)|_(?P<tail>s|ms|rad|mrad|deg))?$")
 
 
-class Record:
+class Record(eqx.Module):
     """A swing as it was recorded.
 
     **Arguments**: `time` (n,) s, ascending, steps need not be equal; `angle` (n,) rad, from any zero; `name` for messages.
@@ -35,9 +37,9 @@ class Record:
     250
     """
 
-    time: np.ndarray
-    angle: np.ndarray
-    name: str
+    time: np.ndarray = eqx.field(metadata=in_unit("s", "time"))
+    angle: np.ndarray = eqx.field(metadata=in_unit("rad", "time", name="recorded"))
+    name: str = eqx.field(static=True)
 
     def __init__(self, time: Any, angle: Any, name: str = "record"):
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -13,9 +13,15 @@ import numpy as np
 import optimistix as optx
 from jax import Array
 
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import failure
 from jaxvib.units import Number, count, number, numbers, traced
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
 
@@ -82,7 +88,7 @@ class SwingStatus(eqx.Enumeration):
     no_start = "the swing does not exist: a number of it is not finite, or the pendulum would not hang"
 
 
-class Swing(eqx.Module):
+class Swing(Result):
     """A decaying swing.
 
     **Attributes**: `status` a `SwingStatus`; `time` (n,) s; `angle` (n,) rad from hanging and `rate` (n,) rad/s; `stopped_at`
@@ -90,12 +96,27 @@ class Swing(eqx.Module):
     """
 
     status: SwingStatus
-    time: Array
-    angle: Array
-    rate: Array
-    stopped_at: Array
-    width: Array
-    steps: Array
+    time: Array = eqx.field(metadata=in_unit("s", "time"))
+    angle: Array = eqx.field(metadata=in_unit("rad", "time"))
+    rate: Array = eqx.field(metadata=in_unit("rad/s", "time"))
+    stopped_at: Array = eqx.field(metadata=in_unit("s"))
+    width: Array = eqx.field(metadata=in_unit("rad/s"))
+    steps: Array = eqx.field(metadata=in_unit(""))
+
+    def summary(self) -> str:
+        """How the swing ended, for a person to read."""
+        when = f" at {float(self.stopped_at):.6g} s" if np.isfinite(self.stopped_at) else ""
+        first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
+        return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"
+
+    def plot(self) -> Figure:
+        """Angle and rate over time. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
+
+        angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))
+        return signals_chart(
+            np.asarray(self.time), [("angle, deg", np.rad2deg(angle)), ("rate, rad/s", rate)], across="time, s"
+        )
 
 
 def swing(
@@ -165,7 +186,7 @@ def swing(
         count(max_steps, "max_steps"),
     )
     if throw and not traced(run.steps) and bool(run.status == SwingStatus.max_steps_reached):
-        raise ComputationError("max_steps_reached", f"{SwingStatus[run.status]} ({max_steps}); give a larger max_steps")
+        raise failure(run.status, f" ({max_steps}); give a larger max_steps")
     return run
 
 

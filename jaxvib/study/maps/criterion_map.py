@@ -13,6 +13,9 @@ import numpy as np
 from jaxvib.equations.linear import circular_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["CriterionMap", "criterion_map"]
 
 
-class CriterionMap(eqx.Module):
+class CriterionMap(Result):
     """The criterion against exact stability for a machine with lighter or heavier loads and weaker or stronger drag.
 
     **Attributes** (D drags, M masses, S speeds, B boundaries 2 nd - 1)
@@ -36,14 +39,16 @@ class CriterionMap(eqx.Module):
       the criterion's; NaN where there is none in the range of speeds
     """
 
-    speeds: np.ndarray
-    mass_factor: np.ndarray
-    drag_factor: np.ndarray
-    predicted: np.ndarray
-    growth: np.ndarray
-    right: np.ndarray
-    boundary: np.ndarray
-    shift: np.ndarray
+    status = Computed.done
+
+    speeds: np.ndarray = eqx.field(metadata=in_unit("rad/s", "speeds"))
+    mass_factor: np.ndarray = eqx.field(metadata=in_unit("", "mass_factor"))
+    drag_factor: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor"))
+    predicted: np.ndarray = eqx.field(metadata=in_unit("", "mass_factor", "speeds"))
+    growth: np.ndarray = eqx.field(metadata=in_unit("1/s", "drag_factor", "mass_factor", "speeds"))
+    right: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor"))
+    boundary: np.ndarray = eqx.field(metadata=in_unit("rad/s", "mass_factor", "end"))
+    shift: np.ndarray = eqx.field(metadata=in_unit("", "drag_factor", "mass_factor", "end"))
 
     def summary(self) -> str:
         """A table a person can read: share of speeds judged right, mean size of the boundaries' shift."""

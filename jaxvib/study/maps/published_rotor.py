@@ -13,7 +13,8 @@ from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.loads import pendulums
 from jaxvib.machine.rotor import rotor
 from jaxvib.machine.scene import Scene
-from jaxvib.steady.jams.patterns import pattern_word, phase_pattern
+from jaxvib.results.status import status_name
+from jaxvib.steady.jams.patterns import phase_pattern
 from jaxvib.study.maps.run_ups import RunUps, run_ups
 
 __all__ = ["VARIANTS", "RotorRegimes", "published_rotor", "rotor_regimes"]
@@ -85,7 +86,7 @@ class RotorRegimes(NamedTuple):
         found = self.computed[variant]
         kind = str(found.kind[k, 0])
         if kind == "jammed":
-            pattern = pattern_word(phase_pattern(found.regime.phase[k, 0]))
+            pattern = status_name(phase_pattern(found.regime.phase[k, 0]))
             return f"jammed at {found.omega[k, 0]:.1f}, ripple {float(found.regime.ripple[k, 0]):.1f}, {pattern}"
         if kind in ("unsettled", "parted"):
             return f"{kind}, mean {found.omega[k, 0]:.1f}"

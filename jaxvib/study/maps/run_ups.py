@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 
 import equinox as eqx
 import jax
@@ -19,6 +19,9 @@ from jaxvib.motion.analysis.regime import REGIMES, Regime, RegimeName
 from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.results.fields import in_unit, part
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.units import Number, count, number, numbers
 
 if TYPE_CHECKING:
@@ -36,7 +39,7 @@ _FEWEST = 2**20
 """Steps that a run may take at least, so that run-ups of any usual length share one program."""
 
 
-class RunUps(NamedTuple):
+class RunUps(Result):
     """What became of run-ups over nd drags and ns starts.
 
     **Attributes**: `drag` (nd,) b_W N s/m; `angle` (ns, count) rad, where the loads started; `regime` a `Regime` whose arrays
@@ -44,12 +47,14 @@ class RunUps(NamedTuple):
     (nd, ns) mean speed of the loads, rad/s, NaN where it failed; `finished` (nd, ns) whether it reached its end.
     """
 
-    drag: np.ndarray
-    angle: np.ndarray
-    regime: Regime
-    kind: np.ndarray
-    omega: np.ndarray
-    finished: np.ndarray
+    status = Computed.done
+
+    drag: np.ndarray = eqx.field(metadata=in_unit("N s/m", "drag"))
+    angle: np.ndarray = eqx.field(metadata=in_unit("rad", "start", "load"))
+    regime: Regime = eqx.field(metadata=part("drag", "start", prefix="regime_"))
+    kind: np.ndarray = eqx.field(metadata=in_unit("", "drag", "start"))
+    omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "drag", "start"))
+    finished: np.ndarray = eqx.field(metadata=in_unit("", "drag", "start"))
 
     def fraction(self, kind: str) -> np.ndarray:
         """Share of the starts (nd,) that came to a `kind` of motion, or whose runs "failed".

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+import equinox as eqx
 import numpy as np
 
 from jaxvib.draw.comparison import stability_chart
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
 from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
 
 if TYPE_CHECKING:
@@ -18,14 +22,24 @@ if TYPE_CHECKING:
 __all__ = ["StabilityMap", "stability_map", "stability_onset"]
 
 
-class StabilityMap(NamedTuple):
+class StabilityMap(Result):
     """Exact jams over a design number x: `value` (n,) x; `omega` (n, P) load speeds rad/s, `stable` (n, P) whether every load
     keeps to the jam there; `special` (n,) the special points of each diagram."""
 
-    value: np.ndarray
-    omega: np.ndarray
-    stable: np.ndarray
+    status = Computed.done
+
+    value: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    omega: np.ndarray = eqx.field(metadata=in_unit("rad/s", "value", "point"))
+    stable: np.ndarray = eqx.field(metadata=in_unit("", "value", "point"))
     special: tuple[tuple[SpecialPoint, ...], ...]
+
+    def summary(self) -> str:
+        """A line for each value: how much of the range is stable, and the special points, for a person to read."""
+        lines = []
+        for x, stable, points in zip(self.value, self.stable, self.special, strict=True):
+            kinds = ", ".join(f"{point.kind.replace('_', ' ')} at {point.omega:.6g} rad/s" for point in points)
+            lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
+        return "\n".join(lines)
 
     def plot(self, *, label: str = "x") -> Figure:
         """Stable jams shaded over the load speed and x, special points as marks by kind; `label` names x on its axis."""

@@ -1,0 +1,179 @@
+"""What the fields of a result hold: units and axes as metadata, and from them plain and labelled data."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.results.status import is_status, sentence, status_names
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["as_dict", "as_text", "in_unit", "is_named_tuple", "part", "to_xarray"]
+
+EACH = "*"
+"""Stands for the `outer_axes` of the class that a field is in."""
+
+Metadata = Mapping[str, Any]
+
+
+def in_unit(unit: str, *axes: str, name: str = "") -> dict[str, Any]:
+    """Metadata of a field that holds numbers: their unit ("" for none) and the names of their axes in order.
+
+    **Arguments**: `unit`, of numbers that are a length for one coordinate and an angle for another "m or rad" and so on;
+    `axes`, where "*" stands for the class's `outer_axes`; `name` in labelled data, the field's own if left out.
+
+    >>> in_unit("rad/s", "load")
+    {'unit': 'rad/s', 'axes': ('load',), 'name': ''}
+    """
+    return {"unit": unit, "axes": axes, "name": name}
+
+
+def part(*axes: str, prefix: str = "", fields: Mapping[str, Metadata] | None = None) -> dict[str, Any]:
+    """Metadata of a field that holds another tree of numbers, each of them with these axes before its own.
+
+    **Arguments**: `prefix` of its names in labelled data; `fields` the metadata of its fields where its class has none.
+    """
+    return {"part": axes, "prefix": prefix, "fields": fields}
+
+
+def as_text(
+    write: Callable[[Any], str], read: Callable[[str], Any], labels: Callable[[Any], Mapping[str, Sequence[Any]]]
+) -> dict[str, Any]:
+    """Metadata of a field that files and plain data hold as text; `labels` of axes that it knows, by the axis's name."""
+    return {"write": write, "read": read, "labels": labels}
+
+
+def is_named_tuple(value: Any) -> bool:
+    """Whether a value is a tuple whose entries have names."""
+    return isinstance(value, tuple) and hasattr(value, "_fields")
+
+
+def as_dict(result: eqx.Module) -> dict[str, Any]:
+    """A result as plain Python values, ready for JSON: SI units, statuses by name, None for what is no finite number.
+
+    Complex numbers are pairs [real, imaginary]. Beside the fields stand the `status` and the `message`.
+    """
+    status = getattr(result, "status", None)
+    head = {} if status is None else {"status": _plain(status), "message": sentence(status)}
+    return {**head, **_plain(result)}
+
+
+def _plain(value: Any) -> Any:
+    if is_status(value):
+        return status_names(value).tolist()
+    if dataclasses.is_dataclass(value):
+        return {field.name: _plain_field(field, getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if is_named_tuple(value):
+        return {name: _plain(getattr(value, name)) for name in value._fields}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, (jax.Array, np.ndarray, np.generic)):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, (tuple, list)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, complex):
+        return [_plain(value.real), _plain(value.imag)]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _plain_field(field: dataclasses.Field[Any], value: Any) -> Any:
+    return field.metadata["write"](value) if "write" in field.metadata else _plain(value)
+
+
+def to_xarray(result: eqx.Module) -> xarray.Dataset:
+    """The numbers of a result as a labelled dataset, units in the attribute "units" (needs the extra `jaxvib[xarray]`).
+
+    Axes that only an outer `vmap` made are called "batch", from the outermost one "batch_1", "batch_2" where there are several.
+
+    **Raises** `InputError` where xarray is not installed.
+    """
+    try:
+        import xarray as xr
+    except ImportError as error:
+        raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
+    labels = _labels(result)
+    variables = {}
+    for name, axes, value, unit in _columns(result, None, "", (), {}):
+        extra = value.ndim - len(axes)
+        batch = ("batch",) if extra == 1 else tuple(f"batch_{k + 1}" for k in range(extra))
+        attributes = {"units": _one_unit(unit, labels.get("unit", ()))} if unit else {}
+        variables[name] = ((*batch, *axes), value, attributes)
+    data = xr.Dataset(variables)
+    known = {axis: list(names) for axis, names in labels.items() if data.sizes.get(axis) == len(names) and axis not in data}
+    data = data.assign_coords(known)
+    if "unit" in labels and data.sizes.get("coordinate") == len(labels["unit"]):
+        data = data.assign_coords(unit=("coordinate", list(labels["unit"])))
+    status = getattr(result, "status", None)
+    return data if status is None else data.assign_attrs(result=type(result).__name__, message=sentence(status))
+
+
+def _labels(result: Any) -> dict[str, Sequence[Any]]:
+    """Labels of axes by the axis's name, of "unit" those of the coordinates."""
+    labels: dict[str, Sequence[Any]] = {}
+    for field in dataclasses.fields(result):
+        if "labels" in field.metadata and getattr(result, field.name) is not None:
+            labels |= field.metadata["labels"](getattr(result, field.name))
+    return labels
+
+
+def _one_unit(unit: str, units: Sequence[str]) -> str:
+    """Of "m or rad" the unit that all coordinates have, where they are alike."""
+    choices = unit.split(" or ")
+    alike = len(choices) == 2 and len(set(units)) == 1
+    return choices[("m", "rad").index(units[0])] if alike else unit
+
+
+Column = tuple[str, tuple[str, ...], np.ndarray, str]
+
+
+def _columns(
+    tree: Any, fields: Mapping[str, Metadata] | None, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]
+) -> Iterator[Column]:
+    """Every array of a tree: its name, its axes, its values, its unit."""
+    outer_axes = getattr(tree, "outer_axes", ())
+    for field in dataclasses.fields(tree):
+        value, metadata = getattr(tree, field.name), field.metadata if fields is None else fields.get(field.name, {})
+
+        def axes(own: tuple[str, ...]) -> tuple[str, ...]:
+            every = [axis for name in own for axis in (outer_axes if name == EACH else (name,))]
+            return (*outer, *(renamed.get(axis, axis) for axis in every))
+
+        if value is None:
+            continue
+        if "part" in metadata:
+            before = prefix + metadata["prefix"]
+            inner = dict(renamed)
+            if metadata["prefix"]:
+                own = [each.name for each in dataclasses.fields(value) if each.metadata.get("axes") == (each.name,)]
+                inner |= {axis: before + axis for axis in own}
+            yield from _columns(value, metadata["fields"], before, axes(metadata["part"]), inner)
+        elif "unit" in metadata:
+            name = prefix + (metadata["name"] or field.name)
+            yield from _column(name, axes(metadata["axes"]), value, metadata["unit"])
+        elif is_status(value):
+            yield from _column(prefix + field.name, axes((EACH,)), value, "")
+
+
+def _column(name: str, axes: tuple[str, ...], value: Any, unit: str) -> Iterator[Column]:
+    if is_status(value):
+        yield name, axes, status_names(value), ""
+    elif is_named_tuple(value):
+        for entry in value._fields:
+            yield f"{name}_{entry}", axes, np.asarray(getattr(value, entry)), unit
+    elif isinstance(value, (tuple, list)) and value and is_named_tuple(value[0]):
+        for entry in value[0]._fields:
+            yield f"{name}_{entry}", axes, np.asarray([getattr(row, entry) for row in value]), unit
+    elif isinstance(value, tuple) and value and isinstance(value[0], (jax.Array, np.ndarray)):
+        for k, entry in enumerate(value):
+            yield name if len(value) == 1 else f"{name}_{k + 1}", axes, np.asarray(entry), unit
+    elif not (isinstance(value, (tuple, list)) and not value):
+        yield name, axes, np.asarray(value), unit

@@ -1,0 +1,256 @@
+"""Every result: status, sentence, text, figure, plain and labelled data, files and back."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import jaxvib as jv
+from jaxvib.motion.run import RunStatus
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed, failure, member, member_names, sentence, status_name, status_names
+from jaxvib.steady.balance.speeds import characteristic_speeds
+from jaxvib.steady.orbits.diagram import SpecialPoint
+from jaxvib.study.accuracy.harmonics import HarmonicConvergence
+from jaxvib.study.accuracy.tiers import Tier, Tiers
+from jaxvib.study.maps.run_ups import RunUps
+from jaxvib.study.maps.stability_onset import StabilityMap
+from optimize.synthesize import Outcome, Synthesis
+
+DATA = pathlib.Path(__file__).parent / "data"
+MACHINE = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+SCENE = jv.Scene(MACHINE, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
+ROTOR = jv.Scene(
+    jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0),
+    jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04),
+    jv.ConstantSpeed(460.0),
+)
+ROD = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
+
+
+def swung():
+    return jv.swing(ROD, np.arange(0.0, 15.0, 0.04), angle="25 deg", viscous=1.5e-3)
+
+
+def identified():
+    run = swung()
+    noise = 0.002 * np.random.default_rng(0).normal(size=run.time.size)
+    return jv.identify(ROD, jv.Record(run.time, np.asarray(run.angle) + noise))
+
+
+def run_ups():
+    regime = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 3, *leaf.shape)), RESULTS["Run"]().regime)
+    kind = np.asarray([["jammed"] * 3, ["failed", "jammed", "balanced"]])
+    return RunUps(np.array([0.1, 1.0]), np.zeros((3, 2)), regime, kind, np.full((2, 3), 5.0), kind != "failed")
+
+
+def tiers():
+    light = Tier(np.array([5.0, np.nan]), np.ones((2, 1)), np.ones(2), np.array([True, False]), ("there", "absent"))
+    return Tiers(np.array([0.1, 1.0]), light, eqx.tree_at(lambda t: t.omega, light, np.array([5.1, 5.2])))
+
+
+def synthesis():
+    outcome = Outcome({"machine.stiffness": [4e4]}, True, 27.0, (1e-3,), 100.0, 1e5)
+    rest = dict(unverified="not asked for", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
+    found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]), history=np.ones((3, 2)))
+    return Synthesis(scene=SCENE, before=outcome, after=outcome, verified=None, run=None, **rest, **found)
+
+
+def cached(make):
+    made = []
+
+    def one():
+        return made[0] if made else made.append(make()) or made[0]
+
+    return one
+
+
+RESULTS = {
+    "Run": cached(lambda: jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=32)),
+    "Regime": lambda: RESULTS["Run"]().regime,
+    "Ensemble": lambda: jv.ensemble(
+        lambda n: eqx.tree_at(lambda s: s.drive.speed, SCENE, n), jnp.linspace(40.0, 80.0, 3), 1.0, steps=64
+    ),
+    "Envelope": lambda: jv.envelope(SCENE, 2.0, samples=16),
+    "JamModes": cached(lambda: jv.jam_modes(SCENE)),
+    "Jam": lambda: RESULTS["JamModes"]().select(1),
+    "Branches": lambda: jv.branches(SCENE, points=50),
+    "ExactBranches": lambda: jv.branches(SCENE, exact=True, points=20),
+    "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
+    "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
+    "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
+    "PhaseBranch": lambda: jv.phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
+    "CharacteristicSpeeds": lambda: characteristic_speeds(SCENE),
+    "Criterion": lambda: jv.criterion(SCENE),
+    "CriterionMap": lambda: jv.criterion_map(SCENE, speeds=[20.0, 60.0], mass=[0.1, 2.0], drag=[1.0], steps=24),
+    "BalancedStates": lambda: jv.balanced_states(SCENE),
+    "BalancedStability": lambda: jv.balanced_stability(SCENE),
+    "Whirl": lambda: jv.whirl(ROTOR, [100.0, 460.0]),
+    "CriticalSpeeds": lambda: jv.critical_speeds(ROTOR),
+    "Swing": swung,
+    "Identified": cached(identified),
+    "Decrement": lambda: RESULTS["Identified"]().decrement,
+    "RunUps": run_ups,
+    "Tiers": tiers,
+    "HarmonicConvergence": lambda: HarmonicConvergence(
+        np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])
+    ),
+    "StabilityMap": lambda: StabilityMap(
+        np.array([0.1, 0.2]), np.ones((2, 3)), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
+    ),
+    "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [jv.CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
+    "Synthesis": synthesis,
+}
+
+
+@pytest.fixture(scope="module", params=list(RESULTS))
+def result(request):
+    return RESULTS[request.param]()
+
+
+def alike(one, other):
+    """The same tree of the same leaves, bit for bit."""
+    (ours, shape), (theirs, again) = (jax.tree.flatten(tree) for tree in (one, other))
+    assert len(ours) == len(theirs) and type(one) is type(other)
+    for mine, its in zip(ours, theirs, strict=True):
+        if isinstance(mine, (jax.Array, np.ndarray, np.generic)):
+            assert np.asarray(mine).dtype == np.asarray(its).dtype
+            np.testing.assert_array_equal(np.asarray(mine), np.asarray(its))
+        else:
+            assert type(mine) is type(its) and (mine == its or mine != mine)
+    if not any(isinstance(leaf, np.ndarray) for leaf in ours):
+        assert shape == again
+
+
+def test_speaks(result):
+    assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
+    assert result.summary().strip() and "Array(" not in result.summary()
+    assert isinstance(result.plot(), Figure)
+
+
+def test_plain_data_is_json(result):
+    plain = json.loads(json.dumps(result.as_dict(), allow_nan=False))
+    assert plain["message"] == result.message
+    assert set(plain) >= set(type(result).__dataclass_fields__)
+
+
+def test_labelled_data_has_units_and_names(result):
+    data = result.to_xarray()
+    assert data.sizes and data.attrs["result"] == type(result).__name__ and data.attrs["message"] == result.message
+    assert not [axis for axis in data.dims if str(axis).startswith("batch")]
+    for field in type(result).__dataclass_fields__.values():
+        value = getattr(result, field.name)
+        if field.metadata.get("unit") and isinstance(value, (jax.Array, np.ndarray)):
+            name = field.metadata["name"] or field.name
+            assert data[name].attrs["units"] in [*field.metadata["unit"].split(" or "), field.metadata["unit"]]
+            np.testing.assert_array_equal(data[name].values, np.asarray(value))
+
+
+def test_file_and_back_is_bit_for_bit(result, tmp_path):
+    path = result.save(tmp_path / "answer")
+    assert path.suffix == ".npz"
+    alike(jv.load(path), result)
+    alike(type(result).load(path), result)
+    with pytest.raises(jv.InputError, match="it is no Jam but holds a|no result" if type(result) is not jv.Jam else "no Orbit"):
+        (jv.Orbit if type(result) is jv.Jam else jv.Jam).load(path)
+
+
+def test_every_result_class_is_final_and_is_in_this_file():
+    def below(kind):
+        return {kind, *(each for sub in kind.__subclasses__() for each in below(sub))}
+
+    concrete = {kind for kind in below(Result) if not kind.__abstractmethods__}
+    own = {kind for kind in concrete if kind.__module__.split(".")[0] in ("jaxvib", "optimize")}
+    assert {kind.__name__ for kind in own} == set(RESULTS)
+    assert not [kind for kind in own if set(kind.__mro__[1:]) & own]
+
+
+def test_units_of_coordinates_and_labels():
+    data = RESULTS["JamModes"]().to_xarray()
+    assert data.amplitude.dims == ("mode", "coordinate") and data.amplitude.attrs["units"] == "m or rad"
+    assert data.mode.values.tolist() == [1, 2, 3] and data.fold_omega.dims == ("fold",)
+    data = RESULTS["Run"]().to_xarray()
+    assert data.displacement.attrs["units"] == "m" and data.displacement.dims == ("time", "coordinate")
+    assert data.coordinate.values.tolist() == ["y"] and data.unit.values.tolist() == ["m"]
+    assert data.window_displacement.sizes["window_time"] == 4096 and data.foundation_force_amplitude.dims == ()
+    many = jax.vmap(jv.jam_modes)(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), SCENE))
+    assert many.to_xarray().amplitude.dims == ("batch", "mode", "coordinate")
+    assert RESULTS["JamModes"]().message.count(" of 3)") >= 1
+
+
+def test_plain_data_of_statuses_complex_and_infinite_numbers():
+    plain = RESULTS["JamModes"]().as_dict()
+    assert set(plain["status"]) <= set(member_names(jv.JamStatus)) and len(plain["status"]) == 3
+    real, imaginary = plain["displacement"][0][0]
+    assert complex(real, imaginary) == RESULTS["JamModes"]().displacement[0, 0]
+    assert RESULTS["Criterion"]().as_dict()["balancing"][-1][1] is None
+    assert RESULTS["Run"]().as_dict()["scene"].startswith("[machine]")
+
+
+def test_names_of_statuses():
+    assert member_names(RunStatus)[:2] == ("done", "max_steps_reached"), "equinox keeps names elsewhere now: see status.py"
+    assert status_name(RunStatus.no_step) == "no_step" and sentence(Computed.done) == "the answer was computed"
+    several = member(RunStatus, [["done", "no_start"], ["done", "done"]])
+    assert status_names(several).tolist() == [["done", "no_start"], ["done", "done"]]
+    assert sentence(several) == f"{RunStatus[RunStatus.done]} (3 of 4); {RunStatus[RunStatus.no_start]} (1 of 4)"
+    assert str(failure(RunStatus.no_start, "; look")) == f"no_start: {RunStatus[RunStatus.no_start]}; look"
+    with pytest.raises(TypeError, match="has no name yet"):
+        jax.jit(lambda x: status_name(RunStatus.where(x, RunStatus.done, RunStatus.no_start)))(True)
+
+
+def test_runs_of_the_first_format():
+    run = jv.load(DATA / "run_0_1.npz")
+    assert type(run) is jv.Run and run.status_name == "done" and int(run.steps) == 59
+    assert float(run.omega) == 26.198174990667866 and run.trajectory.time.shape == (4,) and run.window.time.shape == (3,)
+    assert float(run.scene.drive.speed) == 60.0 and run.window.state.rotor is None
+    np.testing.assert_array_equal(run.window.rotor_speed, 60.0)
+    assert "the run reached its end" in run.summary()
+    motor = jv.Run.load(DATA / "run_0_1_motor.npz")
+    assert motor.status_name == "max_steps_reached" and motor.trajectory is None
+    np.testing.assert_allclose(motor.window.state.rotor[1], [16.31837549, 16.32160004, 16.32482427], rtol=1e-9)
+
+
+def test_a_file_alone_is_enough(tmp_path):
+    path = RESULTS["JamModes"]().save(tmp_path / "modes.npz")
+    code = f"import jaxvib as jv; print(type(jv.load({str(path)!r})).__name__)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "JamModes"
+
+
+@pytest.mark.parametrize(
+    ("layout", "says"),
+    [
+        ('{"class": "os:path", "fields": {}}', "it is no result written by save"),
+        ('{"class": "jaxvib.motion.run:simulate", "fields": {}}', "it is no result written by save"),
+        ('{"class": "jaxvib.motion.run:np", "fields": {}}', "it is no result written by save"),
+        ('{"class": "jaxvib.steady.jams.jam:JamModes", "fields": {}}', "it is no result written by save"),
+        ('{"array": "gone", "kind": "jax"}', "it is no result written by save"),
+        ("{", "it is no result written by save"),
+    ],
+)
+def test_files_that_hold_something_else(tmp_path, layout, says):
+    np.savez(tmp_path / "other.npz", result=np.asarray(layout))
+    with pytest.raises(jv.InputError, match=says):
+        jv.load(tmp_path / "other.npz")
+
+
+def test_a_class_that_moved_is_found_by_its_public_name(tmp_path):
+    path = RESULTS["JamModes"]().save(tmp_path / "modes")
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    arrays["result"] = np.asarray(str(arrays["result"]).replace("jaxvib.steady.jams.jam:", "jaxvib.steady.elsewhere:"))
+    np.savez(path, **arrays)
+    alike(jv.load(path), RESULTS["JamModes"]())
+
+
+def test_what_no_file_can_hold():
+    odd = eqx.tree_at(lambda cost: cost.quantity, RESULTS["Cost"](), print)
+    with pytest.raises(jv.InputError, match="which no file can hold"):
+        odd.save("never_written")
