@@ -26,6 +26,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.steps import Accuracy, EqualSteps, Tolerance
 from jaxvib.results.files import load
 from jaxvib.runtime.cpu import prepare_cpu
 from jaxvib.steady.balance.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
@@ -62,6 +63,7 @@ from jaxvib.study.maps.run_ups import RunUps, run_ups
 from jaxvib.study.maps.stability_onset import StabilityMap, stability_map, stability_onset
 
 __all__ = [
+    "Accuracy",
     "Amplitudes",
     "Averaged",
     "BalanceStatus",
@@ -92,6 +94,7 @@ __all__ = [
     "Envelope",
     "EnvelopeStatus",
     "Envelopes",
+    "EqualSteps",
     "Estimate",
     "ExactBranches",
     "Folds",
@@ -140,6 +143,7 @@ __all__ = [
     "Swing",
     "SwingStatus",
     "Tiers",
+    "Tolerance",
     "Trajectory",
     "TurningPoints",
     "Whirl",

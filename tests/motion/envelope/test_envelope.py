@@ -35,8 +35,8 @@ def test_a_rotor_that_is_alike_in_all_directions_is_followed_exactly():
     )
     s = jv.Scene(machine, jv.pendulums(count=3, mass=0.2, radius=0.08, drag=5.0), jv.ConstantSpeed(300.0))
     start = jv.initial_state(s, "rest", angles=[0.0, 0.8, -1.5])
-    full = jv.simulate(s, 0.3, start=start, samples=16, tolerance=1e-10).trajectory
-    slow = jv.envelope(s, 0.3, start=start, samples=16, tolerance=1e-8).trajectory
+    full = jv.simulate(s, 0.3, start=start, samples=16, stepsize_controller=jv.Tolerance(1e-10)).trajectory
+    slow = jv.envelope(s, 0.3, start=start, samples=16, stepsize_controller=jv.Tolerance(1e-8)).trajectory
     (angle,), (rate,) = full.state.angle, full.state.rate
     mean = jnp.mean(angle, axis=1, keepdims=True)
     np.testing.assert_allclose(slow.phase, angle - mean, atol=1e-6)
@@ -51,7 +51,9 @@ def both(s, speed, end):
     """Brought up over the first 0.6 of the time: the full equations and the averaged ones."""
     s = spun_up(s, speed, 0.6 * end)
     given = dict(turns=4, samples=2**14, throw=False)
-    return jv.simulate(s, end, tolerance=1e-7, max_steps=2**18, **given), jv.envelope(s, end, tolerance=1e-6, **given)
+    return jv.simulate(s, end, stepsize_controller=jv.Tolerance(1e-7), max_steps=2**18, **given), jv.envelope(
+        s, end, stepsize_controller=jv.Tolerance(1e-6), **given
+    )
 
 
 def measured(run):
@@ -121,7 +123,7 @@ def test_gradients_by_three_routes():
             s,
             (m.stiffness * x[:2], m.damping * x[2:4], m.link_stiffness * x[4:5], s.loads.mass * x[5], s.loads.drag * x[6]),
         )
-        given = dict(save="window", tolerance=1e-9, max_steps=2**11, throw=False)
+        given = dict(save="window", stepsize_controller=jv.Tolerance(1e-9), max_steps=2**11, throw=False)
         run = jv.envelope(spun_up(moved, 1.5 * x[7], 300.0), 500.0, adjoint=adjoint, **given)
         return run.amplitude @ jnp.asarray([30.0, 50.0]) + 20.0 * run.foundation_force + run.omega
 
@@ -179,7 +181,9 @@ def test_gravity_averages_out_for_loads_that_turn_only(caught):
 
 @pytest.mark.slow
 def test_gravity_averages_out_of_the_full_equations_too(caught):
-    full = jv.simulate(small(effects=(jv.Gravity(),)), 60.0, start="spin_up", save="window", tolerance=1e-6)
+    full = jv.simulate(
+        small(effects=(jv.Gravity(),)), 60.0, start="spin_up", save="window", stepsize_controller=jv.Tolerance(1e-6)
+    )
     np.testing.assert_allclose(caught.amplitude, full.amplitude, rtol=1e-2)
     np.testing.assert_allclose(caught.omega, full.omega, rtol=1e-3)
 
@@ -204,7 +208,7 @@ class Wind(jv.Effect):
         (dict(mode=1), "goes with start='jam' only"),
         (dict(spin_up=1.0), "goes with start='spin_up' only"),
         (dict(start="spin_up", spin_up=50.0), "longer than the run"),
-        (dict(tolerance=0.0), "tolerance is 0.0; in float64 it must be at least"),
+        (dict(stepsize_controller=jv.Tolerance(0.0)), "tolerance is 0.0; in float64 it must be at least"),
         (dict(save="some"), "save is 'some'"),
         (dict(samples=1), "samples is 1"),
         (dict(max_steps=0), "max_steps is 0"),
