@@ -15,6 +15,7 @@ import numpy as np
 from common import best, best_in_turn, first, published, say, thrown
 
 import jaxvib as jv
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
 NAMES = ("stiffness", "damping", "link_stiffness", "link_damping")
 
@@ -83,7 +84,7 @@ def designs(quick: bool = False) -> None:
 
     def one(k: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.value_and_grad(
-            lambda k: jv.jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
+            lambda k: jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
         )(k)
 
     call = jax.jit(lambda k: jax.lax.map(jax.vmap(one), k.reshape(-1, 1000, 2)))

@@ -17,7 +17,10 @@ from jaxvib.motion.run import RunStatus
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed, failure, member, member_names, sentence, status_name, status_names
 from jaxvib.steady.balance.speeds import characteristic_speeds
+from jaxvib.steady.balance.states import balanced_stability
+from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.orbits.diagram import SpecialPoint
+from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tier, Tiers
 from jaxvib.study.maps.run_ups import RunUps
@@ -88,12 +91,12 @@ RESULTS = {
     "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
     "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
     "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
-    "PhaseBranch": lambda: jv.phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
+    "PhaseBranch": lambda: phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
     "CharacteristicSpeeds": lambda: characteristic_speeds(SCENE),
     "Criterion": lambda: jv.criterion(SCENE),
     "CriterionMap": lambda: jv.criterion_map(SCENE, speeds=[20.0, 60.0], mass=[0.1, 2.0], drag=[1.0], steps=24),
     "BalancedStates": lambda: jv.balanced_states(SCENE),
-    "BalancedStability": lambda: jv.balanced_stability(SCENE),
+    "BalancedStability": lambda: balanced_stability(SCENE),
     "Whirl": lambda: jv.whirl(ROTOR, [100.0, 460.0]),
     "CriticalSpeeds": lambda: jv.critical_speeds(ROTOR),
     "Swing": swung,
@@ -107,7 +110,7 @@ RESULTS = {
     "StabilityMap": lambda: StabilityMap(
         np.array([0.1, 0.2]), np.ones((2, 3)), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
     ),
-    "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [jv.CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
+    "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Synthesis": synthesis,
 }
 

@@ -398,5 +398,5 @@ def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
 
 
 def _unstable(tiers: str, jam: _Jam) -> str:
-    multiplier = float(jam.fine.multiplier)
-    return f"{tiers}: jam mode {jam.mode} is unstable (largest Floquet multiplier {multiplier:.4g}), a run leaves it"
+    largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
+    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

@@ -9,6 +9,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.study.maps.published_rotor import published_rotor
 
 TIME = jnp.linspace(0.0, 1.0, 801)
@@ -23,7 +24,7 @@ def made(phase, speed, *, wobble=0.0, slow=0.0, effects=()):
     angle = angle + slow * TIME[:, None] ** 2
     rate = speed[None] + (100.0 * wobble * jnp.cos(100.0 * TIME) + 2.0 * slow * TIME)[:, None]
     still = jnp.zeros((801, 4))
-    return s, jv.Trajectory(
+    return s, Trajectory(
         TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), 460.0 * TIME, jnp.full(801, 460.0)
     )
 

@@ -11,6 +11,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
 def one(eps, speed, damping=0.2):
@@ -102,7 +103,7 @@ def test_capture_and_passage_are_those_of_the_full_equations(make, passing):
         peak = jnp.max(jnp.abs(full.trajectory.state.displacement), axis=0)
         np.testing.assert_allclose(jnp.max(slow.trajectory.amplitude, axis=0), peak, rtol=1e-2)
         if caught:
-            np.testing.assert_allclose(jv.jam_rotor_speed(s, slow.omega), speed, rtol=1e-4)
+            np.testing.assert_allclose(jam_rotor_speed(s, slow.omega), speed, rtol=1e-4)
 
 
 def small(drag=0.5, speed=60.0, effects=()):
@@ -164,13 +165,13 @@ def test_a_batch_with_a_jam_that_is_absent_says_so():
     assert (runs.status == jv.EnvelopeStatus.done).tolist() == [True, False]
     assert (runs.status == jv.EnvelopeStatus.no_start).tolist() == [False, True]
     assert runs.trajectory is None and float(runs.drift[0]) < 1e-6
-    np.testing.assert_allclose(jv.jam_rotor_speed(s, runs.omega[0]), 0.6, rtol=1e-6)
+    np.testing.assert_allclose(jam_rotor_speed(s, runs.omega[0]), 0.6, rtol=1e-6)
     assert np.isfinite(runs.amplitude[0]).all() and np.isnan(runs.amplitude[1]).all()
 
 
 def test_gravity_averages_out_for_loads_that_turn_only(caught):
     """A ball of 0.05 kg weighs 0.49 N: drag below 0.49 N / 60 rad/s / 0.1 m never lifts it, 0.05 s do not turn it."""
-    np.testing.assert_allclose(jv.jam_rotor_speed(small(), caught.omega), 60.0, rtol=1e-6)
+    np.testing.assert_allclose(jam_rotor_speed(small(), caught.omega), 60.0, rtol=1e-6)
     for drag, end in ((1e-3, 60.0), (0.5, 0.05)):
         run = jv.envelope(small(drag, effects=(jv.Gravity(),)), end, start="spin_up", throw=False)
         assert bool(run.status == jv.EnvelopeStatus.not_turning)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.steady.jams.phases import phase_jam
 from jaxvib.study.maps.published_rotor import published_rotor, rotor_regimes
 
 
@@ -19,7 +20,7 @@ def test_published_rotor_at_three_frictions():
     np.testing.assert_allclose(found.regime.ripple[0, 0], 3.1, atol=0.1)
     # The torque balance at unequal phases, started from the phases of the run, gives the speed the run has locked to.
     for k, mu in enumerate(first.mu):
-        jam = jv.phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
+        jam = phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
         assert bool(jam.stable)
         np.testing.assert_allclose(jam.omega, found.omega[k, 0], atol=0.1)
     assert "together" in first.said("uncoupled, both dampers", 0)
