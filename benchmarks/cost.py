@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jaxvib as jv
+from jaxvib.study.accuracy.cost import CostRow, cost_figure
 
 jv.prepare_cpu()
 
@@ -75,7 +76,7 @@ def markdown(costs: dict[str, jv.Cost]) -> str:
     return "\n".join(lines)
 
 
-def way(row: jv.CostRow | None) -> str:
+def way(row: CostRow | None) -> str:
     if row is None:
         return "none"
     return ", ".join(part for part in (row.tier, row.method, row.dtype, row.setting) if part) + f": {1e3 * row.seconds:.2g} ms"
@@ -99,7 +100,7 @@ def main() -> None:
         documents = {title: cost_document(cost) for title, cost in costs.items()}
         (options.out / "cost.json").write_text(json.dumps(documents, indent=2), encoding="utf-8")
         # Gradients have their own table; their methods are others than those of the panels.
-        jv.cost_figure({title: cost for title, cost in costs.items() if cost.quantity != "gradient"} or costs).savefig(
+        cost_figure({title: cost for title, cost in costs.items() if cost.quantity != "gradient"} or costs).savefig(
             options.out / "cost.png"
         )
 

@@ -49,7 +49,7 @@ def peaks_of_run(run: jv.Run) -> np.ndarray:
 
 def full(scene: jv.Scene, until: float, solver: Any, tolerance: float, **given: Any) -> jv.Run:
     asked = dict(turns=1, max_steps=2**20, estimate=False, throw=False)
-    return jv.simulate(scene, until, solver=solver, tolerance=tolerance, **asked, **given)
+    return jv.simulate(scene, until, solver=solver, stepsize_controller=jv.Tolerance(tolerance), **asked, **given)
 
 
 def compare(name: str, scene: jv.Scene, until: float, rounds: int) -> None:
@@ -64,7 +64,7 @@ def compare(name: str, scene: jv.Scene, until: float, rounds: int) -> None:
 
     slow, off, tolerance = None, np.inf, np.nan
     for tolerance in TOLERANCES:
-        slow = jv.envelope(scene, until, tolerance=tolerance, samples=SAMPLES)
+        slow = jv.envelope(scene, until, stepsize_controller=jv.Tolerance(tolerance), samples=SAMPLES)
         assert slow.trajectory is not None
         off = error(peaks(np.asarray(slow.trajectory.amplitude), slow.amplitude))
         if off < ALLOWED:
@@ -80,7 +80,7 @@ def compare(name: str, scene: jv.Scene, until: float, rounds: int) -> None:
         timed.append((title, lambda: call(numbers), first(lambda: call(numbers)), off, note))
 
     note = f"tolerance {tolerance:.1e}, {turns / float(slow.steps):.1f} turns a step"
-    add("envelope", lambda s: jv.envelope(s, until, tolerance=tolerance, save="window"), off, note)
+    add("envelope", lambda s: jv.envelope(s, until, stepsize_controller=jv.Tolerance(tolerance), save="window"), off, note)
     for title, solver in (
         ("full, as simulate does it under jit", None),
         ("full, the step written out", UnrolledDopri8()),

@@ -32,7 +32,7 @@ def ensemble(quick: bool = False, error: float = 1e-5) -> None:
     values = jnp.asarray(speeds)
 
     def ours(steps: float) -> np.ndarray:
-        many = jv.ensemble(make, values, end, steps=int(steps), estimate=False)
+        many = jv.ensemble(make, values, end, stepsize_controller=jv.EqualSteps(int(steps)), estimate=False)
         return np.concatenate([np.asarray(leaf).reshape(runs, -1) for leaf in jax.tree.leaves(many.state)], axis=1)
 
     settings = [float(int(end * r)) for r in np.arange(3.0, 12.0, 0.5)]
@@ -41,7 +41,7 @@ def ensemble(quick: bool = False, error: float = 1e-5) -> None:
     steps = f"{chosen:g} steps"
     say(group, "native, vector instructions by hand (numba)", base, base, found, native_compile, steps)
     _, found, compiling = reach(ours, [chosen], exact, error)
-    seconds = best(lambda: jv.ensemble(make, values, end, steps=int(chosen), estimate=False).state)
+    seconds = best(lambda: jv.ensemble(make, values, end, stepsize_controller=jv.EqualSteps(int(chosen)), estimate=False).state)
     say(group, "jaxvib.ensemble", seconds, base, found, compiling, steps)
     _, found, compiling = reach(lambda n: scalar(y0, speeds, par, end, int(n)), [chosen], exact, error)
     seconds = best(lambda: scalar(y0, speeds, par, end, int(chosen)), 3)

@@ -20,6 +20,7 @@ from common import best, first, published, say
 from jax.flatten_util import ravel_pytree
 
 import jaxvib as jv
+from jaxvib.equations.linear import steady_displacement
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
@@ -210,7 +211,7 @@ def orbits(quick: bool = False) -> None:
             say(GROUP, name, each, base, error(call()[0]), compiling)
 
     def from_leading_order(w):
-        displacement = jv.steady_displacement(scene, w)
+        displacement = steady_displacement(scene, w)
         return jnp.concatenate([displacement.real, -w * displacement.imag, jnp.stack([w, jam_rotor_speed(scene, w)])])
 
     start = jax.vmap(from_leading_order)(omega)

@@ -196,7 +196,7 @@ def main() -> None:
         print(f"{'native loop':16} {tolerance:9.0e} {error:10.1e} {seconds:9.4f} {compiling:10.1f}")
 
         def run(tol: float = tolerance) -> Any:
-            found = jv.simulate(scene, END, start=start, tolerance=tol, samples=2, estimate=False)
+            found = jv.simulate(scene, END, start=start, stepsize_controller=jv.Tolerance(tol), samples=2, estimate=False)
             return jax.block_until_ready(found.trajectory.state.angle[0][-1])  # pyright: ignore[reportOptionalMemberAccess]
 
         compiling, seconds, angle = timed(run)

@@ -81,7 +81,7 @@ def single(quick: bool = False, error: float = 1e-6) -> None:
         calls.append(lambda run=run, c=chosen: run(scene, end, c))
 
     def whole(tolerance: float) -> np.ndarray:
-        run = jv.simulate(scene, end, start=start, save="window", tolerance=tolerance, estimate=False)
+        run = jv.simulate(scene, end, start=start, save="window", stepsize_controller=jv.Tolerance(tolerance), estimate=False)
         return flat(jax.tree.map(lambda leaf: leaf[-1], run.window.state))
 
     chosen, found, compiling = reach(whole, TOLERANCES, exact, error)

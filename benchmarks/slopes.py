@@ -15,6 +15,7 @@ import numpy as np
 from common import best, best_in_turn, first, published, say, thrown
 
 import jaxvib as jv
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
 NAMES = ("stiffness", "damping", "link_stiffness", "link_damping")
 
@@ -25,15 +26,16 @@ def gradient(quick: bool = False) -> None:
     scene, start = published(), thrown()
     values = jnp.concatenate([getattr(scene.machine, name) for name in NAMES])
 
-    def value(x: jax.Array, adjoint: Any = None, **steps: Any) -> jax.Array:
+    def value(x: jax.Array, adjoint: Any = None, steps: Any = None) -> jax.Array:
         moved = eqx.tree_at(lambda s: [getattr(s.machine, name) for name in NAMES], scene, [x[:2], x[2:4], x[4:5], x[5:6]])
-        run = jv.simulate(moved, end, start=start, save="window", adjoint=adjoint, max_steps=2**13, **steps)
+        given = dict(start=start, save="window", max_steps=2**13)
+        run = jv.simulate(moved, end, stepsize_controller=steps, adjoint=adjoint, **given)
         return run.window.state.displacement[-1, 1]
 
-    for how, steps in (("tolerance 1e-8", dict(tolerance=1e-8)), ("equal steps", dict(steps=int(5 * end)))):
+    for how, steps in (("tolerance 1e-8", jv.Tolerance(1e-8)), ("equal steps", jv.EqualSteps(int(5 * end)))):
         group = f"gradient, {how}"
         print(f"{group}: the end state of simulate by 6 numbers, T = {end:g}")
-        run = jax.jit(lambda x, steps=steps: value(x, **steps))
+        run = jax.jit(lambda x, steps=steps: value(x, steps=steps))
 
         def differences(x: jax.Array, run: Any = run) -> jax.Array:
             moves = 1e-5 * jnp.diag(x)
@@ -62,7 +64,7 @@ def memory(quick: bool = False) -> None:
 
         def value(n: jax.Array, end: float = end, turns: int = turns) -> jax.Array:
             moved = eqx.tree_at(lambda s: s.drive.speed, scene, n)
-            asked = dict(start=start, save="window", tolerance=1e-6, max_steps=16 * turns)
+            asked = dict(start=start, save="window", stepsize_controller=jv.Tolerance(1e-6), max_steps=16 * turns)
             run = jv.simulate(moved, end, **asked)
             return run.window.state.displacement[-1, 1]
 
@@ -82,7 +84,7 @@ def designs(quick: bool = False) -> None:
 
     def one(k: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.value_and_grad(
-            lambda k: jv.jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
+            lambda k: jam_rotor_speed(eqx.tree_at(lambda s: s.machine.stiffness, scene, k), jnp.asarray(0.9))
         )(k)
 
     call = jax.jit(lambda k: jax.lax.map(jax.vmap(one), k.reshape(-1, 1000, 2)))

@@ -1,207 +1,199 @@
 """Differentiable simulation and design of vibration machines that work on the Sommerfeld effect."""
 
-from jaxvib.equations.averaged import Amplitudes, Averaged, averaged_field
-from jaxvib.equations.dynamics import Dynamics, State, vector_field
-from jaxvib.equations.forces import energy, foundation_force, power
-from jaxvib.equations.linear import natural_frequencies, steady_displacement
+# Errors, and the processor
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.runtime.cpu import prepare_cpu
+
+# Machines
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
+from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import planar_rotor, rotor
+
+# Loads
+from jaxvib.machine.loads import Loads, balls, pendulums, rollers
+
+# Drives
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
-from jaxvib.machine.effects.base import Effect, Friction, Gravity, Imbalance, MomentImbalance, StaticImbalance
+
+# Effects
+from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.supports import CubicSupport, Stop
+
+# Scenes, and their files
 from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_to_toml
-from jaxvib.machine.loads import CircularLoads, Loads, balls, pendulums, rollers
-from jaxvib.machine.platforms import Platforms, network, one_mass, three_mass, two_mass
-from jaxvib.machine.rotor import PlanarRotor, Rotor, planar_rotor, rotor
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, Trajectory
+
+# The equations
+from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.forces import energy, foundation_force, power
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.motion.start import initial_state
+
+# Jams of light loads
+from jaxvib.steady.branches import Branches, branches
+from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
+from jaxvib.steady.jams.patterns import PhasePattern
+from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
+from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
+
+# Exact jams
+from jaxvib.steady.orbits.diagram import ExactBranches
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus
+from jaxvib.study.maps.stability_onset import stability_map, stability_onset
+
+# Auto-balancing, whirl
+from jaxvib.steady.balance.criterion import Criterion, criterion
+from jaxvib.steady.balance.states import BalancedStates, balanced_states
+from jaxvib.steady.whirl import Whirl, critical_speeds, whirl
+from jaxvib.study.maps.criterion_map import criterion_map
+
+# Motion in time
 from jaxvib.motion.analysis.regime import Regime, RegimeName, regime
 from jaxvib.motion.ensemble import Ensemble, ensemble
 from jaxvib.motion.envelope.envelope import envelope
-from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
+from jaxvib.motion.envelope.result import Envelope, EnvelopeStatus
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import initial_state
-from jaxvib.results.files import load
-from jaxvib.runtime.cpu import prepare_cpu
-from jaxvib.steady.balance.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
-from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
-from jaxvib.steady.balance.states import (
-    BalancedStability,
-    BalancedStates,
-    BalanceStatus,
-    balanced_growth,
-    balanced_intervals,
-    balanced_stability,
-    balanced_states,
-)
-from jaxvib.steady.branches import Branches, branches
-from jaxvib.steady.jams.folds import Folds, jam_rotor_speed
-from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
-from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
-from jaxvib.steady.jams.phase_search import PhaseBranch, PhaseJams, phase_branch, phase_jams
-from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus, phase_jam, phase_torques
-from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint
-from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus
-from jaxvib.steady.whirl import CriticalSpeeds, Whirl, critical_speeds, whirl
-from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
-from jaxvib.study.accuracy.harmonics import HarmonicConvergence, harmonic_convergence
-from jaxvib.study.accuracy.tiers import Tiers, compare_tiers
+from jaxvib.motion.steps import Accuracy, EqualSteps, Tolerance
+from jaxvib.study.maps.run_ups import run_ups
+
+# What accuracy costs
+from jaxvib.study.accuracy.cost import Cost
+from jaxvib.study.accuracy.harmonics import harmonic_convergence
+from jaxvib.study.accuracy.tiers import compare_tiers
 from jaxvib.study.accuracy.work_precision import work_precision
-from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, ten_periods, turning_points
+
+# Friction of a bearing
+from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
-from jaxvib.study.maps.criterion_map import CriterionMap, criterion_map
-from jaxvib.study.maps.run_ups import RunUps, run_ups
-from jaxvib.study.maps.stability_onset import StabilityMap, stability_map, stability_onset
+
+# Results
+from jaxvib.results.files import load
+from jaxvib.results.result import Result
+
+__version__: str
 
 __all__ = [
-    "Amplitudes",
-    "Averaged",
-    "BalanceStatus",
-    "BalancedStability",
-    "BalancedStates",
-    "BearingPendulum",
-    "Branches",
-    "Carrier",
-    "CharacteristicSpeeds",
-    "CircularLoads",
-    "ComputationError",
-    "ConstantSpeed",
-    "Cost",
-    "CostRow",
-    "Criterion",
-    "CriterionMap",
-    "CriterionStatus",
-    "CriticalSpeeds",
-    "CubicSupport",
-    "DCMotor",
-    "Decrement",
-    "Dimensionless",
-    "Drive",
-    "DryFriction",
-    "Dynamics",
-    "Effect",
-    "Ensemble",
-    "Envelope",
-    "EnvelopeStatus",
-    "Envelopes",
-    "Estimate",
-    "ExactBranches",
-    "Folds",
-    "Friction",
-    "Gravity",
-    "HarmonicConvergence",
-    "IdealDrive",
-    "Identified",
-    "IdentifyStatus",
-    "Imbalance",
-    "InductionMotor",
+    # Errors, and the processor
     "InputError",
-    "Jam",
-    "JamModes",
-    "JamStatus",
-    "LoadContact",
-    "Loads",
-    "Machine",
-    "Measured",
-    "MomentImbalance",
-    "Motor",
-    "Orbit",
-    "OrbitStatus",
-    "PhaseBranch",
-    "PhaseJam",
-    "PhaseJams",
-    "PhasePattern",
-    "PhaseStatus",
-    "PlanarRotor",
-    "Platforms",
-    "Record",
-    "Regime",
-    "RegimeName",
-    "Rotor",
-    "Run",
-    "RunStatus",
-    "RunUp",
-    "RunUps",
-    "Scene",
-    "SpecialPoint",
-    "SpinUp",
-    "StabilityMap",
-    "State",
-    "StaticImbalance",
-    "Stop",
-    "Swing",
-    "SwingStatus",
-    "Tiers",
-    "Trajectory",
-    "TurningPoints",
-    "Whirl",
-    "averaged_field",
-    "balanced_growth",
-    "balanced_intervals",
-    "balanced_stability",
-    "balanced_states",
-    "balls",
-    "branches",
-    "characteristic_speeds",
-    "compare_tiers",
-    "cost_figure",
-    "criterion",
-    "criterion_functional",
-    "criterion_map",
-    "criterion_table",
-    "critical_speeds",
-    "energy",
-    "ensemble",
-    "envelope",
-    "foundation_force",
-    "harmonic_convergence",
-    "identify",
-    "initial_state",
-    "jam_modes",
-    "jam_orbit",
-    "jam_rotor_speed",
-    "load",
-    "load_scene",
-    "natural_frequencies",
-    "network",
-    "one_mass",
-    "pendulums",
-    "phase_branch",
-    "phase_jam",
-    "phase_jams",
-    "phase_pattern",
-    "phase_torques",
-    "planar_rotor",
-    "port_receptance",
-    "power",
+    "ComputationError",
     "prepare_cpu",
-    "read_record",
-    "regime",
-    "rollers",
+    # Machines
+    "Machine",
+    "Carrier",
+    "one_mass",
+    "two_mass",
+    "three_mass",
+    "network",
     "rotor",
-    "run_ups",
+    "planar_rotor",
+    "Dimensionless",
+    # Loads
+    "Loads",
+    "balls",
+    "rollers",
+    "pendulums",
+    # Drives
+    "Drive",
+    "IdealDrive",
+    "Motor",
+    "ConstantSpeed",
+    "SpinUp",
+    "RunUp",
+    "DCMotor",
+    "InductionMotor",
+    # Effects
+    "Effect",
+    "Gravity",
+    "DryFriction",
+    "StaticImbalance",
+    "MomentImbalance",
+    "CubicSupport",
+    "Stop",
+    "LoadContact",
+    # Scenes, and their files
+    "Scene",
+    "load_scene",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
-    "settle",
-    "simulate",
+    # The equations
+    "State",
+    "vector_field",
+    "initial_state",
+    "natural_frequencies",
+    "energy",
+    "power",
+    "foundation_force",
+    # Jams of light loads
+    "jam_modes",
+    "JamModes",
+    "Jam",
+    "JamStatus",
+    "branches",
+    "Branches",
+    "phase_jams",
+    "PhaseJams",
+    "PhaseJam",
+    "PhaseStatus",
+    "PhasePattern",
+    # Exact jams
+    "jam_orbit",
+    "Orbit",
+    "OrbitStatus",
+    "ExactBranches",
     "stability_map",
     "stability_onset",
-    "steady_displacement",
-    "swing",
-    "ten_periods",
-    "three_mass",
-    "turning_points",
-    "two_mass",
-    "vector_field",
+    # Auto-balancing, whirl
+    "criterion",
+    "Criterion",
+    "criterion_map",
+    "balanced_states",
+    "BalancedStates",
     "whirl",
+    "Whirl",
+    "critical_speeds",
+    # Motion in time
+    "simulate",
+    "settle",
+    "envelope",
+    "ensemble",
+    "run_ups",
+    "regime",
+    "Tolerance",
+    "Accuracy",
+    "EqualSteps",
+    "Run",
+    "RunStatus",
+    "Envelope",
+    "EnvelopeStatus",
+    "Ensemble",
+    "Regime",
+    "RegimeName",
+    # What accuracy costs
     "work_precision",
+    "compare_tiers",
+    "harmonic_convergence",
+    "Cost",
+    # Friction of a bearing
+    "BearingPendulum",
+    "swing",
+    "Swing",
+    "SwingStatus",
+    "Record",
+    "read_record",
+    "ten_periods",
+    "identify",
+    "Identified",
+    "IdentifyStatus",
+    # Results
+    "Result",
+    "load",
 ]

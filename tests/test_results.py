@@ -17,7 +17,10 @@ from jaxvib.motion.run import RunStatus
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed, failure, member, member_names, sentence, status_name, status_names
 from jaxvib.steady.balance.speeds import characteristic_speeds
+from jaxvib.steady.balance.states import balanced_stability
+from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.orbits.diagram import SpecialPoint
+from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tier, Tiers
 from jaxvib.study.maps.run_ups import RunUps
@@ -33,6 +36,10 @@ ROTOR = jv.Scene(
     jv.ConstantSpeed(460.0),
 )
 ROD = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625)
+
+
+def at_speed(n):
+    return eqx.tree_at(lambda s: s.drive.speed, SCENE, n)
 
 
 def swung():
@@ -75,9 +82,7 @@ def cached(make):
 RESULTS = {
     "Run": cached(lambda: jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=32)),
     "Regime": lambda: RESULTS["Run"]().regime,
-    "Ensemble": lambda: jv.ensemble(
-        lambda n: eqx.tree_at(lambda s: s.drive.speed, SCENE, n), jnp.linspace(40.0, 80.0, 3), 1.0, steps=64
-    ),
+    "Ensemble": lambda: jv.ensemble(at_speed, jnp.linspace(40.0, 80.0, 3), 1.0, stepsize_controller=jv.EqualSteps(64)),
     "Envelope": lambda: jv.envelope(SCENE, 2.0, samples=16),
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),
     "Jam": lambda: RESULTS["JamModes"]().select(1),
@@ -86,12 +91,12 @@ RESULTS = {
     "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
     "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
     "PhaseJam": lambda: RESULTS["PhaseJams"]().select(0),
-    "PhaseBranch": lambda: jv.phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
+    "PhaseBranch": lambda: phase_branch(ROTOR, RESULTS["PhaseJams"]().select(0), jnp.array([150.0, 172.0])),
     "CharacteristicSpeeds": lambda: characteristic_speeds(SCENE),
     "Criterion": lambda: jv.criterion(SCENE),
     "CriterionMap": lambda: jv.criterion_map(SCENE, speeds=[20.0, 60.0], mass=[0.1, 2.0], drag=[1.0], steps=24),
     "BalancedStates": lambda: jv.balanced_states(SCENE),
-    "BalancedStability": lambda: jv.balanced_stability(SCENE),
+    "BalancedStability": lambda: balanced_stability(SCENE),
     "Whirl": lambda: jv.whirl(ROTOR, [100.0, 460.0]),
     "CriticalSpeeds": lambda: jv.critical_speeds(ROTOR),
     "Swing": swung,
@@ -105,7 +110,7 @@ RESULTS = {
     "StabilityMap": lambda: StabilityMap(
         np.array([0.1, 0.2]), np.ones((2, 3)), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
     ),
-    "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [jv.CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
+    "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Synthesis": synthesis,
 }
 
@@ -149,7 +154,7 @@ def test_labelled_data_has_units_and_names(result):
         value = getattr(result, field.name)
         if field.metadata.get("unit") and isinstance(value, (jax.Array, np.ndarray)):
             name = field.metadata["name"] or field.name
-            assert data[name].attrs["units"] in [*field.metadata["unit"].split(" or "), field.metadata["unit"]]
+            assert data[name].attrs["units"] in (field.metadata["unit"], *field.metadata["unit"].split(" or "))
             np.testing.assert_array_equal(data[name].values, np.asarray(value))
 
 
@@ -166,6 +171,7 @@ def test_every_result_class_is_final_and_is_in_this_file():
     def below(kind):
         return {kind, *(each for sub in kind.__subclasses__() for each in below(sub))}
 
+    assert all(hasattr(jv, name) for name in jv.__all__)  # imports them
     concrete = {kind for kind in below(Result) if not kind.__abstractmethods__}
     own = {kind for kind in concrete if kind.__module__.split(".")[0] in ("jaxvib", "optimize")}
     assert {kind.__name__ for kind in own} == set(RESULTS)
@@ -178,7 +184,7 @@ def test_units_of_coordinates_and_labels():
     assert data.mode.values.tolist() == [1, 2, 3] and data.fold_omega.dims == ("fold",)
     data = RESULTS["Run"]().to_xarray()
     assert data.displacement.attrs["units"] == "m" and data.displacement.dims == ("time", "coordinate")
-    assert data.coordinate.values.tolist() == ["y"] and data.unit.values.tolist() == ["m"]
+    assert data.coordinate.values.tolist() == ["y1"] and data.unit.values.tolist() == ["m"]
     assert data.window_displacement.sizes["window_time"] == 4096 and data.foundation_force_amplitude.dims == ()
     many = jax.vmap(jv.jam_modes)(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), SCENE))
     assert many.to_xarray().amplitude.dims == ("batch", "mode", "coordinate")

@@ -12,6 +12,7 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.ode.progress import ProgressBar
 from jaxvib.units import number
 
 if TYPE_CHECKING:
@@ -71,11 +72,10 @@ def simulate(
         start=start,
         mode=mode,
         spin_up=spin_up,
-        tolerance=tolerance,
-        accuracy=accuracy,
+        stepsize_controller=_steps(tolerance, accuracy),
         max_steps=max_steps,
         save="window" if window else "all",
-        progress=sys.stderr.isatty() and _long(loaded, until),
+        progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
     picture, data = output.file("history.png"), output.file("run.npz")
     if picture is not None and data is not None:
@@ -103,6 +103,15 @@ def simulate(
         "seconds": float(run.seconds),
     }
     output.done(document, run.summary, "simulate")
+
+
+def _steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
+    """How steps are chosen. **Raises** `InputError` where both options are given."""
+    if tolerance is not None and accuracy is not None:
+        raise InputError("accuracy", "is given together with tolerance; give one of them")
+    if accuracy is not None:
+        return jv.Accuracy(accuracy)
+    return None if tolerance is None else jv.Tolerance(tolerance)
 
 
 def _long(scene: jv.Scene, until: str) -> bool:

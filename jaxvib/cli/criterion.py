@@ -12,6 +12,8 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
+from jaxvib.steady.balance.states import balanced_intervals
 
 _RPM = 30.0 / np.pi
 
@@ -24,12 +26,12 @@ def criterion(scene: Path, check: bool, output: Output) -> None:
     """Where collected loads of SCENE stay together and where they spread and balance the rotor, by the empirical criterion."""
     loaded = jv.load_scene(scene)
     judged = jv.criterion(loaded)
-    document = jv.criterion_table(judged)
+    document = criterion_table(judged)
     top = 1.5 * max([*document["resonances"], *document["damped_resonances"], float(loaded.drive.speed)])
     exact = None
     if check:
         lowest = min((w for w in document["resonances"] if w > 0.0), default=top)
-        exact = jv.balanced_intervals(loaded, 0.05 * lowest, top)
+        exact = balanced_intervals(loaded, 0.05 * lowest, top)
         document["exact_balancing"] = exact
         document["exact_up_to"] = top
     picture = output.file("criterion.png")
@@ -39,7 +41,7 @@ def criterion(scene: Path, check: bool, output: Output) -> None:
 
         crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
-        pull = jax.vmap(lambda w: jv.criterion_functional(loaded, w))(jnp.asarray(speeds))
+        pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1, size=(9.0, 4.0))
         pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
         figure.savefig(picture)

@@ -11,6 +11,7 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.machine.files import read_toml
+from jaxvib.study.bearing.decrement import Estimate
 from jaxvib.study.bearing.measurement import measurement_from_tables
 
 _NAMED = (
@@ -105,5 +106,5 @@ def identify(record: Path, output: Output, **given: Any) -> None:
     output.done(document, text, "identify")
 
 
-def _row(name: str, estimate: jv.Estimate) -> list[str]:
+def _row(name: str, estimate: Estimate) -> list[str]:
     return [name, f"{estimate.value:.6g}", f"{estimate.low:.6g}", f"{estimate.high:.6g}"]

@@ -181,8 +181,8 @@ def averaged_field(scene: Scene) -> Averaged:
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
     >>> jam = jv.jam_modes(scene).select(1)
-    >>> state = jv.Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
-    >>> bool(jnp.abs(jv.averaged_field(scene)(0.0, state).rate[0]) < 1e-10)     # a jam is an equilibrium
+    >>> state = Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
+    >>> bool(jnp.abs(averaged_field(scene)(0.0, state).rate[0]) < 1e-10)     # a jam is an equilibrium
     True
     """
     averaged_loads(scene)

@@ -118,7 +118,7 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    >>> print(abs(jv.steady_displacement(scene, 100.0)[0]))      # 0.1 100^2 / (50 100^2 - 4e4)
+    >>> print(abs(steady_displacement(scene, 100.0)[0]))      # 0.1 100^2 / (50 100^2 - 4e4)
     0.002173913...
 
     Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).

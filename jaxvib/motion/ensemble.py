@@ -23,6 +23,7 @@ from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -87,12 +88,13 @@ class Ensemble(Result):
         return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s")
 
 
+@refuse_former(steps=FORMER["steps"])
 def ensemble(
     make: Callable[..., Scene | tuple[Scene, State]],
     values: Any,
     until: Number,
     *,
-    steps: int | None = None,
+    stepsize_controller: EqualSteps | None = None,
     estimate: bool = True,
     lanes: int = _LANES,
 ) -> Ensemble:
@@ -111,8 +113,8 @@ def ensemble(
       as by `jax.jit`, so what it refers to besides must stay what it was at the first call
     - `values`: an array with a leading axis over the runs, or a tree of them
     - `until`: end time, s or text, of all runs
-    - `steps`: how many each run takes, rounded up to a multiple of 4; 4 for each radian of what moves fastest unless said
-      otherwise
+    - `stepsize_controller`: `EqualSteps(n)`, how many each run takes, rounded up to a multiple of 4; the default is 4 for each
+      radian of what moves fastest
     - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
     - `lanes`: how many runs advance together
 
@@ -143,9 +145,12 @@ def ensemble(
     shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
     leaves, rest = jax.tree.flatten(made)
     parts = [leaf[0] if same else leaf for leaf, same in zip(leaves, shared, strict=True)]
-    if steps is None:
-        if not known:
-            raise InputError("steps", "is missing; under a JAX transformation say how many steps each run takes")
+    require(stepsize_controller, EqualSteps)
+    if stepsize_controller is not None:
+        steps = stepsize_controller.number
+    elif not known:
+        raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
+    else:
         steps = max(16, math.ceil(4.0 * float(end) * float(np.max(np.asarray(_fastest(made[0]))))))
     each = -(-count(steps, "steps") // _PARTS)
     coarse = -(-each // 2)

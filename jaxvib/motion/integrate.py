@@ -17,7 +17,6 @@ from jaxvib.motion.analysis.measure import measure, trajectory
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.control import PIController
-from jaxvib.ode.progress import ProgressBar
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
@@ -104,7 +103,7 @@ def integrate(
     samples: int,
     turns: int,
     max_steps: int,
-    progress: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Run:
     """A run from 0 to `end`, measured over a window at its end; see `simulate` for the arguments."""
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
@@ -139,7 +138,7 @@ def integrate(
         controller=on_jumps(scene, controller),
         adjoint=adjoint,
         max_steps=max_steps,
-        progress=ProgressBar() if progress else None,
+        progress=progress_meter,
     )
     assert solution.ts is not None and solution.ys is not None
     times, states = solution.ts[0], motion.unpack(solution.ys[0])

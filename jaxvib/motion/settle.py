@@ -13,6 +13,7 @@ from jaxvib.motion.integrate import fastest_and_slowest, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
+from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import count
 
@@ -22,6 +23,7 @@ _APART = 0.05
 """How far from their middle the outermost loads start in a jam, rad."""
 
 
+@refuse_former(tolerance=FORMER["tolerance"])
 def settle(
     scene: Scene,
     *,
@@ -30,7 +32,7 @@ def settle(
     drift: float | None = None,
     periods: int = 100,
     stretches: int = 200,
-    tolerance: float | None = None,
+    stepsize_controller: StepChoice | None = None,
     throw: bool = True,
 ) -> Run:
     """Simulates a stretch after a stretch until amplitudes and speed no longer change.
@@ -40,7 +42,7 @@ def settle(
     - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
     - `drift`: the change that counts as none, see `Measured`; 1e-6 unless said otherwise, in single precision 1e-3
     - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
-    - `tolerance`: error a step may make, as `simulate`; 1e-9 unless said otherwise, in single precision 1e-5
+    - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
     - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
       where it failed
 
@@ -63,7 +65,7 @@ def settle(
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
     drift = (1e-6 if double else 1e-3) if drift is None else drift
-    tolerance = (1e-9 if double else 1e-5) if tolerance is None else tolerance
+    chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
     start = ("rest" if mode is None else "jam") if start is None else start
     if isinstance(start, State):
         state = whole_state(scene, start, mode)
@@ -72,12 +74,12 @@ def settle(
     _, slowest = fastest_and_slowest(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
-    run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
+    run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
     for _ in range(count(stretches, "stretches") - 1):
         if float(run.drift) < drift or not bool(run.status == RunStatus.done):
             break
         state = last_state(scene, run)
-        run = simulate(scene, stretch, start=state, save="window", tolerance=tolerance, estimate=False, throw=throw)
+        run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
     if throw and not float(run.drift) < drift:
         raise ComputationError(
             "not_settled",

@@ -22,6 +22,7 @@ from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turne
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
 from jaxvib.units import Number, count, number, traced
@@ -40,6 +41,7 @@ _STRETCH = 2.0e4
 """Turns after which single precision no longer resolves time; longer runs are cut into stretches."""
 
 
+@refuse_former(**FORMER)
 def simulate(
     scene: Scene,
     until: Number,
@@ -50,15 +52,12 @@ def simulate(
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
     turns: int = 20,
-    tolerance: float | None = None,
-    accuracy: float | None = None,
-    steps: int | None = None,
     estimate: bool | None = None,
     solver: diffrax.AbstractSolver | None = None,
-    controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: StepChoice | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int | None = None,
-    progress: bool = False,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,
 ) -> Run:
     """Integrates the full equations of motion of `scene` from 0 to `until` and measures what comes out.
@@ -72,22 +71,20 @@ def simulate(
       under a JAX transformation and 262144 at most); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
       and 256 turns of the rotor)
-    - `tolerance`: error a step may make, relative, and absolute in natural units: the throw S/M of the loads for
-      displacements, that times the rotor's speed for velocities, 1 rad for angles, whose error is never relative (1e-8 unless
-      said otherwise, in single precision 1e-5)
-    - `accuracy`: in place of a tolerance, the `error` the result may have; runs are repeated with smaller tolerances until
-      their estimated error is below it, 6 of them at most, or the run fails as `not_accurate`
-    - `steps`: in place of a tolerance, so many equal steps
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
-      unless said otherwise it is where numbers are known and tolerance or steps say how steps are chosen, and not under a JAX
-      transformation
-    - `solver`, `controller`, `adjoint`: diffrax's, passed through; unless said otherwise a PI controller to `tolerance`,
-      reverse derivatives of the very steps that were taken (over checkpoints), and Dormand and Prince's method of order 8 as
-      `UnrolledDopri8`, or where that takes too long to compile (large scenes, JAX transformations) as `LoopDopri8`.
-      For forward derivatives give `diffrax.ForwardMode()`: up to about ten parameters they take less time than reverse ones
+      the default is to do so where all numbers are known, that is not under a JAX transformation, and
+      steps are not chosen by a controller of diffrax
+    - `stepsize_controller`: how steps are chosen: `Tolerance(1e-8)` by the error that each may make (the default, in single
+      precision 1e-5); `Accuracy(1e-4)` by the `error` that the result may have: the run is repeated with smaller tolerances
+      until its estimated error is below it, 6 times at most, or fails as `not_accurate`; `EqualSteps(2000)` so many equal
+      ones; or a step size controller of diffrax
+    - `solver`, `adjoint`: diffrax's, passed through; the defaults are Dormand and Prince's method of order 8 as
+      `UnrolledDopri8`, or where that takes too long to compile (large scenes, JAX transformations) as `LoopDopri8`, and reverse
+      derivatives of the very steps that were taken (over checkpoints). For forward derivatives give `diffrax.ForwardMode()`: up
+      to about ten parameters they take less time than reverse ones
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
       transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
-    - `progress`: shows a bar on the error stream
+    - `progress_meter`: diffrax's, shows how much of the time is done
     - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
 
     **Returns** `Run`, which carries its estimated `error` and its cost. Gradients, forward and reverse, go through all of it;
@@ -114,7 +111,7 @@ def simulate(
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
     count(turns, "turns")
-    control = _control(end, tolerance, accuracy, steps, controller, estimate)
+    control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
     state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, throw=throw)
@@ -126,60 +123,52 @@ def simulate(
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
         solver = LoopDopri8(slopes=isinstance(adjoint, diffrax.ForwardMode))
 
-    def run(control: StepControl) -> Run:
-        chosen = control if controller is None else controller
+    def run(chosen: StepControl | diffrax.AbstractStepSizeController) -> Run:
         kept = samples if save == "all" else 0
         allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
         stretches = _stretches(scene, end, state, save)
         if stretches > 1:
             return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, turns, allowed)
         begun = time.perf_counter()
-        found = integrate(scene, end, state, solver, chosen, adjoint, kept, turns, allowed, progress)
+        found = integrate(scene, end, state, solver, chosen, adjoint, kept, turns, allowed, progress_meter)
         if traced(found.steps):
             return found
         jax.block_until_ready(found.steps)
         return _with(found, seconds=time.perf_counter() - begun)
 
-    if accuracy is not None:
+    if isinstance(stepsize_controller, Accuracy):
         if not known:
-            raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a tolerance")
-        found = _to_accuracy(scene, run, control, accuracy)
-    elif controller is not None or not (known if estimate is None else estimate):
+            raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
+        assert isinstance(control, StepControl)
+        found = _to_accuracy(scene, run, control, stepsize_controller.error)
+    elif not isinstance(control, StepControl) or not (known if estimate is None else estimate):
         found = run(control)
     else:
         coarse, found = run(_coarser(control)), run(control)
         found = _compared(scene, found, coarse, control, _coarser(control), [coarse])
     if throw and not traced(found.steps):
-        _raise_if_failed(found, max_steps, accuracy)
+        _raise_if_failed(found, max_steps, stepsize_controller)
     return found
 
 
-def _control(end: Array, tolerance: Any, accuracy: Any, steps: Any, controller: Any, estimate: bool | None) -> StepControl:
-    """What was asked for, checked: at most one of the ways to choose steps, and none the dtype cannot deliver."""
-    given = {"tolerance": tolerance, "accuracy": accuracy, "steps": steps, "controller": controller}
-    named = [name for name, value in given.items() if value is not None]
-    if len(named) > 1:
-        raise InputError(named[1], f"is given together with {named[0]}; give one of them")
-    if estimate and controller is not None:
-        raise InputError("estimate", "is True together with a controller, whose steps nobody can make larger; give a tolerance")
-    if estimate is False and accuracy is not None:
-        raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a tolerance")
+def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> StepControl | diffrax.AbstractStepSizeController:
+    """What was asked for, checked: nothing that the dtype cannot deliver."""
+    require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
+    if isinstance(chosen, diffrax.AbstractStepSizeController):
+        if estimate:
+            problem = "is True together with a controller, whose steps nobody can make larger; give a Tolerance"
+            raise InputError("estimate", problem)
+        return chosen
+    if isinstance(chosen, EqualSteps):
+        return StepControl(steps=jnp.asarray(count(chosen.number, "steps"), end.dtype))
     precision = float(jnp.finfo(end.dtype).eps)
-    for name, value, low in (("tolerance", tolerance, 10.0 * precision), ("accuracy", accuracy, 1e3 * precision)):
-        plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if value is not None and not (plain and low <= value < 1.0):
-            raise InputError(
-                name,
-                f"is {value!r}; in {end.dtype} it must be at least {low:.1g} and less than 1"
-                + ("" if plain else ", a number of Python's own such as 1e-6")
-                + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
-            )
-    if steps is not None:
-        return StepControl(steps=jnp.asarray(count(steps, "steps"), end.dtype))
-    if accuracy is not None:
-        tolerance = max(1e-2 * accuracy, 10.0 * precision)
-    if tolerance is None:
-        tolerance = 1e-8 if precision < 1e-10 else 1e-5
+    if isinstance(chosen, Accuracy):
+        if estimate is False:
+            raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a Tolerance")
+        accuracy = small_number(chosen.error, "accuracy", end, 1e3)
+        return StepControl(tolerance=jnp.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
+    default = 1e-8 if precision < 1e-10 else 1e-5
+    tolerance = default if chosen is None else small_number(chosen.tolerance, "tolerance", end, 10.0)
     return StepControl(tolerance=jnp.asarray(tolerance, end.dtype))
 
 
@@ -270,7 +259,7 @@ def _in_stretches(
     found = None
     for k in range(number):
         span = jnp.asarray(length if k < number - 1 else last, end.dtype)
-        found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, False)
+        found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, None)
         state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
         evaluations += int(found.evaluations)
@@ -316,7 +305,7 @@ def enough_steps(scene: Scene, end: Array) -> int:
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
 
-def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
+def _raise_if_failed(run: Run, max_steps: int, chosen: StepChoice | None) -> None:
     if bool(run.status == RunStatus.done):
         return
     require_numbers(run.scene)
@@ -329,6 +318,6 @@ def _raise_if_failed(run: Run, max_steps: int, accuracy: float | None) -> None:
         hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
         hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
-    if name == "not_accurate":
-        hint += f" ({float(run.error):.1e}, asked for {accuracy:.1e}); give a larger accuracy, or a shorter run"
+    if isinstance(chosen, Accuracy) and name == "not_accurate":
+        hint += f" ({float(run.error):.1e}, asked for {chosen.error:.1e}); give a larger accuracy, or a shorter run"
     raise failure(run.status, hint)

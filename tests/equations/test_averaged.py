@@ -9,12 +9,13 @@ from gyroscopic_rotor import rotor
 from scenes import machines, published, scene
 
 import jaxvib as jv
-from jaxvib.equations.averaged import amplitudes_of
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.averaged import Amplitudes, amplitudes_of, averaged_field
+from jaxvib.equations.linear import linear_model, steady_displacement
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
 def at_jam(jam):
-    return jv.Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
+    return Amplitudes(jam.displacement, 1j * jam.omega * jam.displacement, jam.omega[None], jnp.zeros(1))
 
 
 def numbers(state):
@@ -35,7 +36,7 @@ def test_averaged_is_the_mean_of_the_full_equations_over_a_turn(machine, load):
     rng, nd, n = np.random.default_rng(3), s.machine.carrier().mass.shape[0], s.loads.count
     y, v = (1e-3 * scale * jnp.asarray(rng.normal(size=(2, nd)).T @ [1.0, 1j]) for scale in (1.0, 25.0))
     phase = rng.uniform(0.0, 6.0, n)
-    slow = jv.Amplitudes(y, v, jnp.asarray(rng.uniform(20.0, 30.0, n)), jnp.asarray(phase - np.mean(phase)))
+    slow = Amplitudes(y, v, jnp.asarray(rng.uniform(20.0, 30.0, n)), jnp.asarray(phase - np.mean(phase)))
     angles = jnp.arange(16) * 2.0 * jnp.pi / 16
 
     @jax.jit
@@ -45,7 +46,7 @@ def test_averaged_is_the_mean_of_the_full_equations_over_a_turn(machine, load):
             state = jv.State((y * wave).real, (v * wave).real, (slow.phase + theta,), (slow.rate,))
             return jv.vector_field(light)(0.0, state)
 
-        return jv.averaged_field(light)(jnp.zeros(()), slow), jax.vmap(at)(angles)
+        return averaged_field(light)(jnp.zeros(()), slow), jax.vmap(at)(angles)
 
     change, full = derivatives()
     loads, omega = light.loads, jnp.mean(slow.rate)
@@ -65,10 +66,10 @@ def test_equilibria_are_the_leading_order_jams(machine):
 
     @jax.jit
     def at(omega):
-        jammed = eqx.tree_at(lambda x: x.drive.speed, s, jv.jam_rotor_speed(s, omega))
-        y = jv.steady_displacement(s, omega)
-        state = jv.Amplitudes(y, 1j * omega * y, jnp.full((3,), omega), jnp.zeros(3))
-        field = jv.averaged_field(jammed)
+        jammed = eqx.tree_at(lambda x: x.drive.speed, s, jam_rotor_speed(s, omega))
+        y = steady_displacement(s, omega)
+        state = Amplitudes(y, 1j * omega * y, jnp.full((3,), omega), jnp.zeros(3))
+        field = averaged_field(jammed)
         free = jnp.max(field.drag * (jammed.drive.speed - omega) / field.inertia)
         return field(jnp.zeros(()), state), omega**2 * jnp.max(jnp.abs(y)), free
 
@@ -85,7 +86,7 @@ def slope_at(s, jam):
 
     def right(z):
         y0, y1, v0, v1, rate, phase = jnp.split(z, [2, 4, 6, 8, 9])
-        return numbers(jv.averaged_field(s)(jnp.zeros(()), jv.Amplitudes(y0 + 1j * y1, v0 + 1j * v1, rate, phase)))
+        return numbers(averaged_field(s)(jnp.zeros(()), Amplitudes(y0 + 1j * y1, v0 + 1j * v1, rate, phase)))
 
     return jax.jacfwd(right)(numbers(at_jam(jam)))
 
@@ -112,7 +113,7 @@ def test_a_state_and_its_amplitudes_are_the_same_motion():
     """A platform that vibrates with the loads, and one that rings while they rest: with the energy that the state has."""
     s = scene("two_mass", "balls")
     omega, theta = 75.0, 0.8
-    y = jv.steady_displacement(s, omega)
+    y = steady_displacement(s, omega)
     back = jax.jit(lambda state: amplitudes_of(s, state))
     z = y * jnp.exp(1j * theta)
     turning = jv.State(z.real, -omega * z.imag, (jnp.asarray([0.3, 0.9, 1.2]),), (jnp.full(3, omega),))

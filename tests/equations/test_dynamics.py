@@ -10,6 +10,7 @@ import pytest
 from scenes import loads, machines, published, scene
 
 import jaxvib as jv
+from jaxvib.equations.dynamics import Dynamics
 
 
 def random_state(s, seed=0):
@@ -155,7 +156,7 @@ def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
         return str(jax.make_jaxpr(lambda t, y: jv.vector_field(s)(t, y))(0.0, state))
 
     whole = program()
-    dynamics = jv.Dynamics
+    dynamics = Dynamics
     monkeypatch.setattr(dynamics, "_friction", lambda self, state, speed: [])
     monkeypatch.setattr(dynamics, "_throw", lambda self, t, state: None)
     monkeypatch.setattr(dynamics, "_with_rotor", lambda self, part, throw, speed: (part.weight, part.reaction, None))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
+from jaxvib.machine.platforms import Platforms
 
 
 def residual(s, t, state, field):
@@ -14,7 +15,7 @@ def residual(s, t, state, field):
     """
     nd, n = state.displacement.shape[0], s.loads.count
     planar = nd == 2
-    vertical = isinstance(s.machine, jv.Platforms)
+    vertical = isinstance(s.machine, Platforms)
     motor = isinstance(s.drive, jv.Motor)
     m, r, drag = (float(getattr(s.loads, name)) for name in ("mass", "radius", "drag"))
     inertia = float(s.loads.inertia) if s.loads.kind == "pendulum" else 0.4 * m * r**2

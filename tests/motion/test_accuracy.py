@@ -21,13 +21,15 @@ def test_equal_steps_are_of_order_8():
 
 
 def _runs(s, start, steps):
-    return [jv.simulate(s, 40.0, start=start, steps=n, save="window", estimate=False) for n in steps]
+    return [
+        jv.simulate(s, 40.0, start=start, stepsize_controller=jv.EqualSteps(n), save="window", estimate=False) for n in steps
+    ]
 
 
 def test_the_estimate_is_above_the_error_and_near_it():
     s = published(speed=5.0, eps=0.05).scene()
     start = some_state(s)
-    best = jv.simulate(s, 60.0, start=start, tolerance=1e-13, save="window").window.state
+    best = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(1e-13), save="window").window.state
 
     def apart(run):
         a, b = run.window.state, best
@@ -38,22 +40,22 @@ def test_the_estimate_is_above_the_error_and_near_it():
         )
 
     for tolerance in (1e-5, 1e-7, 1e-9, 1e-11):
-        run = jv.simulate(s, 60.0, start=start, tolerance=tolerance, save="window")
+        run = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window")
         assert apart(run) <= float(run.error) <= 300.0 * apart(run), (tolerance, apart(run), float(run.error))
-        alone = jv.simulate(s, 60.0, start=start, tolerance=tolerance, save="window", estimate=False)
+        alone = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window", estimate=False)
         assert int(alone.evaluations) == 13 * int(alone.steps) == 13 * int(run.steps) and np.isnan(alone.error)
         # What the estimate cost is counted: the run with larger steps takes at least half as many, at most all.
         assert 1.5 * int(alone.evaluations) < int(run.evaluations) < 2 * int(alone.evaluations)
         assert float(run.seconds) > 0.0
     for accuracy in (1e-3, 1e-8):
-        run = jv.simulate(s, 60.0, start=start, accuracy=accuracy, save="window")
+        run = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Accuracy(accuracy), save="window")
         assert bool(run.status == jv.RunStatus.done) and apart(run) <= float(run.error) <= accuracy
 
 
 def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     s = published(speed=5.0, eps=0.05).scene()
     monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)
-    asked = dict(start=some_state(s), save="window", accuracy=1e-12)
+    asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12))
     # So long that rounding alone makes more than this error.
     run = jv.simulate(s, 400.0, **asked, throw=False)
     assert bool(run.status == jv.RunStatus.not_accurate) and float(run.error) > 1e-12
@@ -65,9 +67,13 @@ def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        (dict(accuracy=1e-4, tolerance=1e-6), "accuracy is given together with tolerance; give one of them"),
-        (dict(accuracy=1e-14), "accuracy is 1e-14; in float64 it must be at least 2e-13"),
-        (dict(steps=0), "steps is 0"),
+        (dict(tolerance=1e-6), "tolerance is no argument of simulate any more; write stepsize_controller=jv.Tolerance"),
+        (dict(steps=100), "steps is no argument of simulate any more; write stepsize_controller=jv.EqualSteps"),
+        (dict(accuracy=1e-4), "accuracy is no argument of simulate any more; write stepsize_controller=jv.Accuracy"),
+        (dict(progress=True), "progress is no argument of simulate any more; write progress_meter="),
+        (dict(stepsize_controller=1e-6), "stepsize_controller is 1e-06; it must be one of: Tolerance"),
+        (dict(stepsize_controller=jv.Accuracy(1e-14)), "accuracy is 1e-14; in float64 it must be at least 2e-13"),
+        (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),
     ],
 )
 def test_ways_to_choose_steps_that_cannot_be(given, says):
@@ -78,5 +84,9 @@ def test_ways_to_choose_steps_that_cannot_be(given, says):
 
 def test_accuracy_looks_at_numbers():
     s = published().scene()
-    with pytest.raises(jv.InputError, match="under a JAX transformation give a tolerance"):
-        jax.jit(lambda n: jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 1.0, accuracy=1e-4).omega)(jnp.asarray(2.0))
+
+    def omega(n):
+        return jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 1.0, stepsize_controller=jv.Accuracy(1e-4)).omega
+
+    with pytest.raises(jv.InputError, match="under a JAX transformation give a Tolerance"):
+        jax.jit(omega)(jnp.asarray(2.0))

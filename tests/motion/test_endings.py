@@ -96,19 +96,22 @@ def test_where_a_run_stopped_is_said():
 
 def test_an_error_that_cannot_be_told_is_infinite():
     s = published(eps=1e-3).scene()
-    assert float(jv.simulate(s, 0.1, steps=1).error) == np.inf
-    loose, looser = (jv.simulate(s, 20.0, tolerance=t) for t in (0.1, 0.5))
+    assert float(jv.simulate(s, 0.1, stepsize_controller=jv.EqualSteps(1)).error) == np.inf
+    loose, looser = (jv.simulate(s, 20.0, stepsize_controller=jv.Tolerance(t)) for t in (0.1, 0.5))
     assert 0.0 < float(loose.error) < np.inf and 0.0 < float(looser.error) < np.inf
-    failed = jv.simulate(s, 20.0, tolerance=1e-8, max_steps=10, throw=False)
+    failed = jv.simulate(s, 20.0, stepsize_controller=jv.Tolerance(1e-8), max_steps=10, throw=False)
     assert float(failed.error) == np.inf
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (dict(estimate=True, controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)), "estimate is True together with a contr"),
-        (dict(estimate=False, accuracy=1e-4), "estimate is False together with accuracy"),
-        (dict(tolerance=np.float32(1e-6)), "a number of Python's own such as 1e-6"),
+        (
+            dict(estimate=True, stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)),
+            "estimate is True together with a contr",
+        ),
+        (dict(estimate=False, stepsize_controller=jv.Accuracy(1e-4)), "estimate is False together with accuracy"),
+        (dict(stepsize_controller=jv.Tolerance(np.float32(1e-6))), "a number of Python's own such as 1e-6"),
     ],
 )
 def test_estimates_that_nobody_can_make_are_refused(change, says):

@@ -21,9 +21,11 @@ def test_an_ensemble_is_a_loop_of_runs():
     def make(n):
         return eqx.tree_at(lambda x: x.drive.speed, s, n), start
 
-    many = jv.ensemble(make, speeds, 20.0, steps=4000, lanes=3)
+    many = jv.ensemble(make, speeds, 20.0, stepsize_controller=jv.EqualSteps(4000), lanes=3)
     for k in (0, 3, 6):
-        run = jv.simulate(make(speeds[k])[0], 20.0, start=start, tolerance=1e-12, save="window", estimate=False)
+        run = jv.simulate(
+            make(speeds[k])[0], 20.0, start=start, stepsize_controller=jv.Tolerance(1e-12), save="window", estimate=False
+        )
         last = jax.tree.map(lambda x: x[-1], run.window.state)
         for a, b in zip(jax.tree.leaves(many.state), jax.tree.leaves(last), strict=True):
             np.testing.assert_allclose(a[k], b, atol=float(many.error[k]) * 100.0 + 1e-9)
@@ -54,8 +56,8 @@ def error_of(given, k, found, exact):
 
 
 def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():
-    whole = jv.ensemble(make, values(), 5.0, steps=200)
-    broken = jv.ensemble(make, values(displaced=(1.0, jnp.nan, 1.1)), 5.0, steps=200)
+    whole = jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(200))
+    broken = jv.ensemble(make, values(displaced=(1.0, jnp.nan, 1.1)), 5.0, stepsize_controller=jv.EqualSteps(200))
     assert broken.finite.tolist() == [True, False, True]
     np.testing.assert_array_equal(broken.error[::2], whole.error[::2])
     assert 0.0 < float(whole.error.max()) < 1e-2 and np.isnan(broken.error[1])
@@ -65,16 +67,16 @@ def test_a_quiet_run_beside_loud_ones_has_the_error_it_has_without_them():
     """One stands still beside them: nothing is not divided by nothing."""
     quiet = values(displaced=(0.1, 0.0, 1.1), moving=(0.0, 0.0, 0.8))
     loud = values(displaced=(0.1, 0.0, 1e2), moving=(0.0, 0.0, 0.8))
-    quietly, beside = (jv.ensemble(make, given, 5.0, steps=24) for given in (quiet, loud))
+    quietly, beside = (jv.ensemble(make, given, 5.0, stepsize_controller=jv.EqualSteps(24)) for given in (quiet, loud))
     np.testing.assert_array_equal(beside.error[:2], quietly.error[:2])
     assert float(beside.error[1]) == 0.0
-    exact = jv.ensemble(make, loud, 5.0, steps=4000, estimate=False)
+    exact = jv.ensemble(make, loud, 5.0, stepsize_controller=jv.EqualSteps(4000), estimate=False)
     for k in (0, 2):
         assert 0.0 < error_of(loud, k, beside, exact) <= float(beside.error[k])
 
 
 def test_steps_are_those_that_are_taken():
-    found = {n: jv.ensemble(make, values(), 5.0, steps=n) for n in (86, 88, 44, 12, 8)}
+    found = {n: jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(n)) for n in (86, 88, 44, 12, 8)}
     assert {n: int(many.steps) for n, many in found.items()} == {86: 88, 88: 88, 44: 44, 12: 12, 8: 8}
     # Beside 12 steps there are 8, not half as many.
     for fine, coarse in ((88, 44), (12, 8)):
@@ -83,14 +85,14 @@ def test_steps_are_those_that_are_taken():
 
 
 def test_a_run_is_not_compared_with_itself():
-    few = jv.ensemble(make, values(), 0.5, steps=3)
+    few = jv.ensemble(make, values(), 0.5, stepsize_controller=jv.EqualSteps(3))
     assert int(few.steps) == 4 and np.all(np.isinf(few.error)) and np.all(few.finite)
-    assert np.all(np.isnan(jv.ensemble(make, values(), 0.5, steps=3, estimate=False).error))
+    assert np.all(np.isnan(jv.ensemble(make, values(), 0.5, stepsize_controller=jv.EqualSteps(3), estimate=False).error))
 
 
 def test_runs_that_are_all_the_same():
-    same = jv.ensemble(make, values((2.0,) * 3, (1.0,) * 3, (1.0,) * 3), 5.0, steps=100)
-    first = jv.ensemble(make, values(), 5.0, steps=100)
+    same = jv.ensemble(make, values((2.0,) * 3, (1.0,) * 3, (1.0,) * 3), 5.0, stepsize_controller=jv.EqualSteps(100))
+    first = jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(100))
     np.testing.assert_allclose(same.state.angle[0], np.tile(first.state.angle[0][0], (3, 1)), rtol=1e-10)
 
 
@@ -107,7 +109,7 @@ def test_other_values_need_no_new_program(caplog):
 
     assert compiled(2.0, 3.0)
     assert compiled(2.1, 4.0) == []
-    assert compiled(2.2, 3.5, steps=64) == []
+    assert compiled(2.2, 3.5, stepsize_controller=jv.EqualSteps(64)) == []
 
 
 def test_seconds_are_those_of_the_whole_call(monkeypatch):
@@ -119,7 +121,7 @@ def test_seconds_are_those_of_the_whole_call(monkeypatch):
         return float(next(ticks))
 
     monkeypatch.setattr("jaxvib.motion.ensemble.time.perf_counter", clock)
-    found = jv.ensemble(make, values(), 5.0, steps=64)
+    found = jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(64))
     assert calls == [1.0] and float(found.seconds) == 2.0
 
 
@@ -164,7 +166,7 @@ def test_single_precision_keeps_its_phase():
         (dict(values=jnp.zeros(())), "values has leading axes"),
         (dict(values=(jnp.zeros(2), jnp.zeros(3))), "values has leading axes"),
         (dict(lanes=0), "lanes is 0"),
-        (dict(steps=0), "steps is 0"),
+        (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),
         (dict(make=lambda v: v), "make gives"),
     ],
 )

@@ -56,7 +56,7 @@ def test_motion_is_mujocos(gravity):
     for _ in range(20):
         mujoco.mj_step(model, data, nstep=1000)
         states.append(np.concatenate([data.qpos[:2] - sag, data.qpos[2:], data.qvel]))
-    run = jv.simulate(s, 20.0, start=start, samples=21, tolerance=1e-11)
+    run = jv.simulate(s, 20.0, start=start, samples=21, stepsize_controller=jv.Tolerance(1e-11))
     y = run.trajectory.state
     ours = np.concatenate([y.displacement, y.angle[0], y.velocity, y.rate[0]], axis=1)[1:]
     np.testing.assert_allclose(ours, states, atol=1e-6)
@@ -99,7 +99,7 @@ def test_mujoco_agrees_on_a_planar_rotor_with_loads():
     finally:
         mujoco.set_mjcb_control(None)
     state = jv.State(jnp.asarray(start[:2]), jnp.zeros(2), (jnp.asarray(start[2:]),), (jnp.zeros(2),))
-    run = jv.simulate(s, step * n, start=state, tolerance=1e-11, samples=2)
+    run = jv.simulate(s, step * n, start=state, stepsize_controller=jv.Tolerance(1e-11), samples=2)
     end = run.trajectory.state
     np.testing.assert_allclose(end.displacement[-1], data.qpos[:2], atol=1e-8)
     np.testing.assert_allclose(end.angle[0][-1], data.qpos[2:], atol=1e-6)
@@ -114,7 +114,7 @@ def test_smaller_tolerance_means_smaller_error():
     exact = solve_ivp(lambda t, y: np.asarray(right(t, y)), (0.0, 20.0), flat, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     error = []
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
-        run = jv.simulate(s, 20.0, start=start, samples=2, tolerance=tolerance)
+        run = jv.simulate(s, 20.0, start=start, samples=2, stepsize_controller=jv.Tolerance(tolerance))
         last = jax.tree.map(lambda leaf: leaf[-1], run.trajectory.state)
         error.append(np.max(np.abs(ravel_pytree(last)[0] - exact)))
     assert all(b < 0.1 * a for a, b in itertools.pairwise(error)), error
@@ -171,7 +171,7 @@ def test_a_soft_mount_under_a_fast_rotor_is_measured_without_aliasing():
         mass=(400.0, 40.0), stiffness=(300.0, 0.0), damping=(10.0, 0.0), link_stiffness=4e5, link_damping=50.0
     )
     s = jv.Scene(machine, jv.balls(count=1, mass=0.2, radius=0.05, drag=3.0), jv.ConstantSpeed("3000 rpm"))
-    run = jv.simulate(s, 40.0, start="jam", mode=5, save="window", tolerance=1e-7)
+    run = jv.simulate(s, 40.0, start="jam", mode=5, save="window", stepsize_controller=jv.Tolerance(1e-7))
     jam = jv.jam_modes(s).select(5)
     np.testing.assert_allclose(run.amplitude[1], jam.amplitude[1], rtol=2e-2)
     np.testing.assert_allclose(run.omega, jam.omega, rtol=1e-4)
@@ -189,7 +189,7 @@ def test_loads_in_contact_keep_their_order_and_their_distance():
     start = jv.initial_state(s)
     step = 2.0 * np.arcsin(diameter / 0.2)
     np.testing.assert_allclose(np.diff(start.angle[0]), step, rtol=1e-12)
-    run = jv.simulate(s, 3.0, start=start, tolerance=1e-7)
+    run = jv.simulate(s, 3.0, start=start, stepsize_controller=jv.Tolerance(1e-7))
     angle = np.asarray(run.trajectory.state.angle[0])
     gaps = np.diff(np.concatenate([angle, angle[:, :1] + 2.0 * np.pi], axis=1), axis=1)
     assert np.all(gaps > 0.9 * step)

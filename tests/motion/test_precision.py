@@ -15,13 +15,13 @@ def test_a_long_run_keeps_its_phase():
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     free = jv.Scene(machine, jv.pendulums(count=1, mass=1e-9, radius=0.1, drag=1e-9), jv.ConstantSpeed(100.0))
     start = eqx.tree_at(lambda y: (y.angle, y.rate), jv.initial_state(free), ((jnp.zeros(1),), (jnp.full(1, 100.0),)))
-    run = jv.simulate(free, 63.0, start=start, samples=2, tolerance=1e-7)
+    run = jv.simulate(free, 63.0, start=start, samples=2, stepsize_controller=jv.Tolerance(1e-7))
     assert abs(float(run.trajectory.state.angle[0][-1, 0]) - 6300.0) < 1e-5
 
 
 def test_what_float32_cannot_deliver_is_refused():
     with jax.enable_x64(False), pytest.raises(jv.InputError, match=r"in float32 .* switch JAX to float64"):
-        jv.simulate(published().scene(), 10.0, tolerance=1e-8)
+        jv.simulate(published().scene(), 10.0, stepsize_controller=jv.Tolerance(1e-8))
 
 
 def test_single_precision_keeps_its_phase():
@@ -31,7 +31,7 @@ def test_single_precision_keeps_its_phase():
     with jax.enable_x64(False):
         free = jv.Scene(machine32(machine), jv.pendulums(count=1, mass=1e-6, radius=0.1, drag=1e-4), jv.ConstantSpeed(100.0))
         start = eqx.tree_at(lambda y: (y.angle, y.rate), jv.initial_state(free), ((jnp.zeros(1),), (jnp.full(1, 100.0),)))
-        run = jv.simulate(free, 6283.185, start=start, save="window", tolerance=1e-5, estimate=False)
+        run = jv.simulate(free, 6283.185, start=start, save="window", stepsize_controller=jv.Tolerance(1e-5), estimate=False)
         phase = np.asarray(run.window.state.angle[0][:, 0], float) - 100.0 * np.asarray(run.window.time, float)
         assert run.amplitude.dtype == jnp.float32
         # A mean speed is an angle over a time between two samples, each of whose times is rounded by up to a spacing.

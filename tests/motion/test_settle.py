@@ -36,7 +36,7 @@ def test_a_stretch_goes_on_where_the_last_one_ended():
     start = jv.initial_state(s, angles=[0.3, 2.0])
     stretch = whole_turns(s, 0.2)
     assert stretch <= 0.2 and abs(np.sin(460.0 * stretch)) < 1e-12
-    given = dict(save="window", tolerance=1e-11, estimate=False)
+    given = dict(save="window", stepsize_controller=jv.Tolerance(1e-11), estimate=False)
     once = jv.simulate(s, 2.0 * stretch, start=start, **given).window.state
     first = last_state(s, jv.simulate(s, stretch, start=start, **given))
     assert float(jnp.max(jnp.abs(first.angle[0]))) <= np.pi

@@ -21,8 +21,11 @@ from jaxvib.motion.integrate import integrate
         (dict(start="jam"), "mode is missing"),
         (dict(start="jam", mode=9), "mode is 9; this machine's jam modes are numbered 1 to 5"),
         (dict(mode=3), "mode is 3, which goes with start='jam' only"),
-        (dict(tolerance=1e-17), "tolerance is 1e-17; in float64 it must be at least 2e-15 and less than 1"),
-        (dict(tolerance=2.0), "tolerance is 2.0; in float64"),
+        (
+            dict(stepsize_controller=jv.Tolerance(1e-17)),
+            "tolerance is 1e-17; in float64 it must be at least 2e-15 and less than 1",
+        ),
+        (dict(stepsize_controller=jv.Tolerance(2.0)), "tolerance is 2.0; in float64"),
         (dict(spin_up=3.0), "spin_up goes with start='spin_up' only"),
         (dict(start="spin_up", spin_up=-3.0), "drive.duration is -3 s; it must be greater than 0"),
         (dict(save="none"), "save is 'none'; it must be 'all' or 'window'"),
@@ -41,7 +44,7 @@ def test_wrong_arguments_are_one_sentence(arguments, sentence):
     ("change", "says"),
     [
         (dict(start="spin_up", spin_up=5.0), "longer than the run"),
-        (dict(tolerance="small"), "tolerance is 'small'"),
+        (dict(stepsize_controller=jv.Tolerance("small")), "tolerance is 'small'"),
         (dict(until=1e308), "run shorter stretches"),
     ],
 )
@@ -71,5 +74,5 @@ def test_a_scan_of_parameters_is_one_compilation():
         moved = eqx.tree_at(lambda x: x.drive.speed, s, jnp.asarray(n))
         start = some_state(moved) if start is None else start
         for tolerance in (1e-6, 1e-8):
-            jv.simulate(moved, 7.0, start=start, tolerance=tolerance, save="window", max_steps=2**14)
+            jv.simulate(moved, 7.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window", max_steps=2**14)
     assert integrate.jitted._cached._cache_size() - before <= 1

@@ -21,6 +21,7 @@ from jaxvib.motion.analysis.measure import Measured
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require, small_number
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import WrappedController, moved_on
 from jaxvib.ode.replay import solve
@@ -84,6 +85,7 @@ class _Units(eqx.Module):
         return Amplitudes((y0 + 1j * y1) * self.length, (v0 + 1j * v1) * speed, rate * self.speed, phase)
 
 
+@refuse_former(tolerance=FORMER["tolerance"], controller=FORMER["controller"])
 def envelope(
     scene: Scene,
     until: Number,
@@ -94,9 +96,8 @@ def envelope(
     save: Literal["all", "window"] = "all",
     samples: int = 256,
     turns: int = 20,
-    tolerance: float = 1e-4,
     solver: diffrax.AbstractSolver | None = None,
-    controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: Tolerance | diffrax.AbstractStepSizeController | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = 2**16,
     throw: bool = True,
@@ -111,10 +112,10 @@ def envelope(
 
     **Arguments**
 
-    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `controller`, `throw`: as `simulate`
+    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`
     - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
-    - `tolerance`: error a step may make, relative to the largest amplitude, and absolute in natural units: the throw S/M of the
-      loads for displacements, that times the rotor's speed for velocities, that speed for rates, 1 rad for phases
+    - `stepsize_controller`: `Tolerance`, the error a step may make, relative to the largest amplitude, and absolute in natural
+      units, for rates the rotor's speed, for phases 1 rad (1e-4 by default); or a step size controller of diffrax
     - `solver`: diffrax's, for stiff systems; `Rodas4` unless said otherwise
     - `max_steps`: the run fails after so many steps
 
@@ -144,11 +145,10 @@ def envelope(
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     count(samples, "samples", low=2)
     count(turns, "turns")
-    precision = float(jnp.finfo(end.dtype).eps)
-    if not isinstance(tolerance, (int, float)) or not 10.0 * precision <= tolerance < 1.0:
-        raise InputError(
-            "tolerance", f"is {tolerance!r}; in {end.dtype} it must be at least {10.0 * precision:.1g} and below 1"
-        )
+    chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
+    require(chosen, Tolerance, diffrax.AbstractStepSizeController)
+    if isinstance(chosen, Tolerance):
+        chosen = jnp.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     scene = brought_up(scene, end, start, spin_up)
     if isinstance(start, State):
         state = whole_state(scene, start, mode)
@@ -161,7 +161,7 @@ def envelope(
         end,
         state,
         solver,
-        jnp.asarray(tolerance, end.dtype) if controller is None else controller,
+        chosen,
         adjoint,
         samples if save == "all" else 0,
         turns,

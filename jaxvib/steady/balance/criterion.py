@@ -88,7 +88,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    >>> [bool(jv.criterion_functional(scene, w) < 0) for w in (28.0, 29.0)]     # the resonance is at 28.28 rad/s
+    >>> [bool(criterion_functional(scene, w) < 0) for w in (28.0, 29.0)]     # the resonance is at 28.28 rad/s
     [False, True]
 
     Source: Filimonikhin et al. 2022, equations (1)-(3), (15), (28).
@@ -148,7 +148,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=1e6, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    >>> table = jv.criterion_table(jv.criterion(scene))
+    >>> table = criterion_table(jv.criterion(scene))
     >>> [[round(a, 3), b] for a, b in table["balancing"]], [[a, round(b, 3)] for a, b in table["gathering"]]
     ([[141.421, None]], [[0.0, 141.421]])
     """

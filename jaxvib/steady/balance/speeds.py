@@ -107,7 +107,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=0.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
-    >>> print(jv.port_receptance(scene, 100.0)[0, 0].real)      # 1 / (40000 - 100^2 * 50)
+    >>> print(port_receptance(scene, 100.0)[0, 0].real)      # 1 / (40000 - 100^2 * 50)
     -2.173913...e-06
 
     Source: Filimonikhin et al. 2022, equations (14), (30), (48), for any carrier.
@@ -144,7 +144,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
     ...                         link_damping=0.01, rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
-    >>> speeds = jv.characteristic_speeds(form.scene())
+    >>> speeds = characteristic_speeds(form.scene())
     >>> [(label, round(w, 4)) for label, w in speeds.labelled()]
     [('resonance 1', 0.3333), ('additional 1', 0.7454), ('resonance 2', 1.0)]
     >>> [(label, round(w, 4)) for label, w in speeds.labelled(damped=True)]

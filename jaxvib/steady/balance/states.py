@@ -16,19 +16,19 @@ from jaxvib.equations.linear import circular_loads, natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
 from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
+from jaxvib.steady.balance.stability import BalancedStability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
     "BalanceStatus",
-    "BalancedStability",
     "BalancedStates",
-    "StabilityStatus",
     "balanced_growth",
     "balanced_intervals",
     "balanced_stability",
@@ -55,7 +55,7 @@ class BalancedStates(Result):
     0 unless the rotor is out of balance (no rows where nothing cancels); `dimension` of the set of arrangements, the
     common turn counted: N - 2, but 1 for two loads on a rotor in balance; `neutral` (k, N, d) orthonormal changes of
     the angles that keep each arrangement balanced to first order; and their `names` (d,): "turn of all loads" first
-    (not where the rotor is out of balance), then "shape 1", ...
+    (not where the rotor is out of balance), then "shape 1", ...; and the `scene`.
 
     Loads in one line have one neutral direction more than the family has dimensions.
     """
@@ -65,6 +65,27 @@ class BalancedStates(Result):
     dimension: int = eqx.field(metadata=in_unit(""))
     neutral: list[np.ndarray] = eqx.field(metadata=in_unit("", "arrangement", "load", "neutral_direction"))
     names: tuple[str, ...] = eqx.field(metadata=in_unit("", "neutral_direction", name="neutral_direction"))
+    scene: Scene = eqx.field(metadata=SCENE)
+
+    def stability(self, arrangement: int = 0, *, steps: int = 48) -> BalancedStability:
+        """Whether that arrangement, counted from 0, is stable at the scene's rotor speed, see `balanced_stability`."""
+        return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
+
+    def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int = 48) -> np.ndarray:
+        """Growth rate of its errors at rotor speeds, 1/s: stable where it is negative, see `balanced_growth`."""
+        return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)
+
+    def intervals(
+        self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int = 48
+    ) -> list[list[float]]:
+        """Intervals of rotor speed, rad/s, in which it is stable, see `balanced_intervals`."""
+        return balanced_intervals(self.scene, low, high, self._arranged(arrangement), points=points, steps=steps)
+
+    def _arranged(self, arrangement: int) -> np.ndarray:
+        """The angles of an arrangement. **Raises** `ComputationError` where there is none."""
+        if not len(self.angles):
+            raise failure(self.status)
+        return self.angles[arrangement]
 
     def summary(self) -> str:
         """A table a person can read."""
@@ -80,7 +101,8 @@ class BalancedStates(Result):
 
 
 def balanced_states(scene: Scene) -> BalancedStates:
-    """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`.
+    """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`; ask each for its
+    `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
 
         sum_j m_j R_j exp(i alpha_j) + M e exp(i angle) = 0
 
@@ -121,7 +143,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     rounding = 8.0 * n * np.finfo(sides.dtype).eps * largest
     if largest > rest + rounding:
         status = BalanceStatus.alone if sides.size == 1 else BalanceStatus.outweighed
-        return BalancedStates(status, np.zeros((0, n)), 0, [], ())
+        return BalancedStates(status, np.zeros((0, n)), 0, [], (), scene)
     if largest > rest - rounding:
         # In one line: the largest against all others.
         one = np.where(np.arange(sides.size) == np.argmax(sides), 0.0, np.pi)[None, :]
@@ -134,7 +156,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
     names = (*turn, *(f"shape {k + 1}" for k in range(neutral[0].shape[1] - len(turn))))
     status = BalanceStatus.unique if sides.size <= 3 else BalanceStatus.family
     dimension = max(n - 2, 1 if free else 0)
-    return BalancedStates(status, angles, dimension, neutral, names)
+    return BalancedStates(status, angles, dimension, neutral, names, scene)
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
@@ -202,48 +224,6 @@ def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np
     return np.concatenate([common, basis[:, size > 0.5]], axis=1)
 
 
-class StabilityStatus(eqx.Enumeration):
-    """Whether a balanced motion is stable; the members are the sentences a user reads."""
-
-    stable = "errors of the balanced motion die out"
-    unstable = "errors of the balanced motion grow"
-
-
-class BalancedStability(Result):
-    """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
-
-    **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
-    neutral directions left out; `multipliers` (2 (nd + N),) complex, the largest first; `neutral` the number of those
-    that are 1 because the arrangements form a family (the common turn at least); `error` of the multipliers,
-    estimated from half the number of steps.
-    """
-
-    stable: bool = eqx.field(metadata=in_unit(""))
-    growth: float = eqx.field(metadata=in_unit("1/s"))
-    multipliers: np.ndarray = eqx.field(metadata=in_unit("", "floquet"))
-    neutral: int = eqx.field(metadata=in_unit(""))
-    error: float = eqx.field(metadata=in_unit(""))
-
-    @property
-    def status(self) -> StabilityStatus:
-        """Whether it is stable, a `StabilityStatus`."""
-        return StabilityStatus.stable if self.stable else StabilityStatus.unstable
-
-    def summary(self) -> str:
-        """Whether it is stable and how fast errors change, for a person to read."""
-        largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
-        return (
-            f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
-            f"known to {self.error:.1e}"
-        )
-
-    def plot(self) -> Figure:
-        """The multipliers in the complex plane, and the unit circle. **Returns** a matplotlib figure."""
-        from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
-
-        return multiplier_chart(np.asarray(self.multipliers))
-
-
 def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
     """Exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
@@ -260,7 +240,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> loads = jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0)
-    >>> [jv.balanced_stability(jv.Scene(machine, loads, jv.ConstantSpeed(n))).stable for n in (20.0, 40.0)]
+    >>> [balanced_stability(jv.Scene(machine, loads, jv.ConstantSpeed(n))).stable for n in (20.0, 40.0)]
     [False, True]
 
     Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
@@ -287,7 +267,7 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(40.0))
-    >>> jv.balanced_growth(scene, [20.0, 40.0]) < 0.0
+    >>> balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
     angles, neutral = _arrangement(scene, angles)
@@ -325,7 +305,7 @@ def balanced_intervals(
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.01, radius=0.1, drag=5.0), jv.ConstantSpeed(40.0))
-    >>> [[round(w, 2) for w in row] for row in jv.balanced_intervals(scene, 20.0, 60.0, points=40)]
+    >>> [[round(w, 2) for w in row] for row in balanced_intervals(scene, 20.0, 60.0, points=40)]
     [[28.28, 60.0]]
     """
     if not 0.0 < low < high:

@@ -52,7 +52,7 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
-    >>> round(float(jv.jam_rotor_speed(form.scene(), 1.0015)), 4)
+    >>> round(float(jam_rotor_speed(form.scene(), 1.0015)), 4)
     5.1829
 
     Source: the antiphase paper, equations (31), (35).

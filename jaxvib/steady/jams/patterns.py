@@ -22,7 +22,7 @@ def phase_pattern(phase: Array) -> PhasePattern:
     """The pattern of phases (count,) rad: by their resultants |mean exp(i k phase)| for k = 1 and 2.
 
     >>> import jax.numpy as jnp, jaxvib as jv
-    >>> bool(jv.phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)
+    >>> bool(phase_pattern(jnp.array([0.0, 0.1, 3.1, 3.2])) == jv.PhasePattern.opposite)
     True
     """
     first, second = (jnp.abs(jnp.mean(jnp.exp(1j * k * phase))) for k in (1, 2))

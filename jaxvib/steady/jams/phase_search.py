@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, overload
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
 from jaxvib.results.fields import in_unit
-from jaxvib.results.result import Result
+from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
@@ -27,6 +27,7 @@ from jaxvib.steady.jams.phases import (
     jam_from,
     loads_with_drag,
     parts_of,
+    phase_jam,
     torques_at,
 )
 from jaxvib.units import count
@@ -34,7 +35,7 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PhaseBranch", "PhaseJams", "phase_branch", "phase_jams"]
+__all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
 _GRID = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
@@ -44,9 +45,6 @@ _SHOWN = 30.0
 
 _SAME_LINE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
-
-_JUMP = 0.3
-"""Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
 
 _HALVINGS = 6
 """Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
@@ -69,6 +67,10 @@ class PhaseJams(AbstractPhaseJam):
         fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
         return PhaseJam(**jax.tree.map(lambda leaf: leaf[index], fields))
 
+    def follow(self, index: int, omega: Array) -> PhaseBranch:
+        """The phase pattern of the jam of that place over load speeds `omega` (n,) rad/s, see `phase_branch`."""
+        return phase_branch(self.scene, self.select(index), omega)
+
     def summary(self) -> str:
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
@@ -89,7 +91,7 @@ class PhaseJams(AbstractPhaseJam):
             jam = self.select(k)
             if not any(_passes(branch, place, jam.growth) for branch in branches):
                 branches.append(phase_branch(self.scene, jam, jnp.asarray(speeds)))
-                factor, at, stable = _curve(branches[-1])
+                factor, at, stable = drag_curve(branches[-1])
                 for _, other, _, _ in curves:
                     # Dashes on other dashes would look like a line that is not broken.
                     factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE * factor), np.nan, factor)
@@ -99,7 +101,17 @@ class PhaseJams(AbstractPhaseJam):
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit)
 
 
-def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
+@overload
+def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams: ...
+
+
+@overload
+def phase_jams(scene: Scene, *, near: tuple[Array, Array]) -> PhaseJam: ...
+
+
+def phase_jams(
+    scene: Scene, *, starts: int = 128, seed: int = 0, near: tuple[Array, Array] | None = None
+) -> PhaseJams | PhaseJam:
     """Every way in which the scene's light loads can jam at its rotor speed, whatever their phases.
 
     At each of many load speeds, closer together near resonances, phases are looked for at which all loads need the same
@@ -112,10 +124,11 @@ def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
     the foundation force are the loads' alone. Where both count, ask `simulate`.
 
     **Arguments**: `starts`: random sets of phases at each load speed; `seed` which. Stable jams are found with a few; unstable
-    ones close to where patterns part from each other take many.
+    ones close to where patterns part from each other take many. `near`: a speed (rad/s) and phases (count,) rad of the loads,
+    from which Newton's method finds one jam, see `phase_jam`; `jit`, `vmap` and `grad` go through it then.
 
-    **Returns** `PhaseJams`. **Raises** `InputError` for loads without drag, drives without a given speed, and effects that
-    this theory leaves out.
+    **Returns** `PhaseJams`, or `PhaseJam` with `near`. **Raises** `InputError` for loads without drag, drives without a given
+    speed, and effects that this theory leaves out.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -126,6 +139,8 @@ def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams:
 
     Source: Artyunin 2013, section V; leading order of the loads' mass, see `jam_modes` for loads at one angle.
     """
+    if near is not None:
+        return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
     number = count(starts, "starts")
     parts = parts_of(scene)
@@ -248,60 +263,6 @@ def _phases(parts: Parts, influence: Array, omega: Array, start: Array) -> tuple
     return each[0], jnp.concatenate([jnp.zeros(1, x.dtype), x]), good
 
 
-class PhaseBranch(Result):
-    """One phase pattern over the loads' speed, at a given rotor speed.
-
-    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): at how many times the scene's drag the loads jam there,
-    NaN where the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
-    `rotor_speed` rad/s, and `drag` (count,) N s/m that the factor multiplies.
-    """
-
-    omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))
-    drag_factor: Array = eqx.field(metadata=in_unit("", "omega"))
-    phase: Array = eqx.field(metadata=in_unit("rad", "omega", "load"))
-    growth: Array = eqx.field(metadata=in_unit("1/s", "omega"))
-    stable: Array = eqx.field(metadata=in_unit("", "omega"))
-    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s"))
-    drag: Array = eqx.field(metadata=in_unit("N s/m", "load"))
-
-    @property
-    def status(self) -> PhaseStatus:
-        """At each load speed whether the pattern was found there, a `PhaseStatus`."""
-        return jax.vmap(lambda f: PhaseStatus.where(jnp.isnan(f), PhaseStatus.not_converged, PhaseStatus.found))(
-            self.drag_factor
-        )
-
-    def summary(self) -> str:
-        """The ranges of load speed and drag, for a person to read."""
-        factor, omega = np.asarray(self.drag_factor), np.asarray(self.omega)
-        there = np.isfinite(factor)
-        if not np.any(there):
-            return f"no jam from {omega[0]:.6g} to {omega[-1]:.6g} rad/s"
-        return (
-            f"{np.sum(there)} of {omega.size} load speeds have a jam, {np.sum(np.asarray(self.stable))} a stable one, from "
-            f"{np.min(omega[there]):.6g} to {np.max(omega[there]):.6g} rad/s, at {np.min(factor[there]):.4g} to "
-            f"{np.max(factor[there]):.4g} times the scene's drag"
-        )
-
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
-        """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
-        solid, unstable dashed. **Returns** a matplotlib figure. **Raises** `InputError` for another unit."""
-        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
-
-        alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
-        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")
-        factor, omega, stable = _curve(self)
-        curve = ("loads", times * factor, omega, stable)
-        return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit)
-
-
-def _curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drag factor, load speed and stability to be drawn: the factor is NaN where phases jump to another pattern."""
-    turned = np.exp(1j * np.diff(np.asarray(branch.phase), axis=0))
-    jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _JUMP)
-    return np.where(jump, np.nan, np.asarray(branch.drag_factor)), np.asarray(branch.omega), np.asarray(branch.stable)
-
-
 def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
     """Whether the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
@@ -319,8 +280,8 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
-    >>> jam = jv.phase_jam(scene, 165.0, jnp.zeros(2))
-    >>> branch = jv.phase_branch(scene, jam, jnp.array([150.0, float(jam.omega), 172.0]))
+    >>> jam = phase_jam(scene, 165.0, jnp.zeros(2))
+    >>> branch = phase_branch(scene, jam, jnp.array([150.0, float(jam.omega), 172.0]))
     >>> [round(float(x), 3) for x in branch.drag_factor], [bool(x) for x in branch.stable]
     ([0.212, 1.0, 2.21], [True, True, True])
     """

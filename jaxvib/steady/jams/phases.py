@@ -150,7 +150,7 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
-    >>> abs(float(jv.phase_torques(scene, 170.0, jnp.array([0.0, jnp.pi]))[0])) < 1e-12    # opposite: nothing vibrates
+    >>> abs(float(phase_torques(scene, 170.0, jnp.array([0.0, jnp.pi]))[0])) < 1e-12    # opposite: nothing vibrates
     True
 
     Source: Artyunin 2013, the pendulums' equation of (1), averaged over a turn.
@@ -182,7 +182,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
-    >>> jam = jv.phase_jam(scene, 165.0, jnp.array([0.0, 0.3]))
+    >>> jam = phase_jam(scene, 165.0, jnp.array([0.0, 0.3]))
     >>> round(float(jam.omega), 2), [abs(round(float(a), 6)) for a in jam.phase], bool(jam.stable)
     (164.63, [0.0, 0.0], True)
 

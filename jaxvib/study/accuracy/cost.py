@@ -80,9 +80,9 @@ def cost_figure(costs: Mapping[str, Cost]) -> Figure:
     **Arguments**: `costs` a `Cost` for each title, which stands above its panel. **Returns** a matplotlib figure.
 
     >>> import jaxvib as jv
-    >>> rows = [jv.CostRow("full", "Tsit5", "float64", f"{error:.0e}", error, seconds, 1.0)
+    >>> rows = [CostRow("full", "Tsit5", "float64", f"{error:.0e}", error, seconds, 1.0)
     ...         for error, seconds in ((1e-3, 0.1), (1e-6, 0.3))]
-    >>> figure = jv.cost_figure({"a jam": jv.Cost("amplitude", [1.0], 1e-9, rows)})
+    >>> figure = cost_figure({"a jam": jv.Cost("amplitude", [1.0], 1e-9, rows)})
     >>> figure.axes[0].get_title()
     'a jam'
 

@@ -23,6 +23,7 @@ from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
@@ -234,7 +235,11 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
         """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
-        return np.ravel(np.asarray(read(simulate(ask.scene, end, save="window", tolerance=tolerance, estimate=False)), float))
+        return np.ravel(
+            np.asarray(
+                read(simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)), float
+            )
+        )
 
     rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
     return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
@@ -253,7 +258,9 @@ def _integrated(
         end = length(tolerance)
 
         def averaged(end: float = end, tolerance: float = tolerance) -> Any:
-            return read(envelope(ask.scene, end, start=start, save="window", tolerance=tolerance, throw=False))
+            return read(
+                envelope(ask.scene, end, start=start, save="window", stepsize_controller=Tolerance(tolerance), throw=False)
+            )
 
         try:
             rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, ask.repeats))
@@ -272,8 +279,15 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
         solver = None if SOLVERS[name] is None else SOLVERS[name]()
 
         def run(tolerance: float) -> Run:
-            asked = dict(save="window", tolerance=tolerance, solver=solver, estimate=False, max_steps=steps, throw=False)
-            return simulate(scene, ends[tolerance], start=start, **asked)  # pyright: ignore[reportArgumentType]
+            asked = dict(
+                save="window",
+                stepsize_controller=Tolerance(tolerance),
+                solver=solver,
+                estimate=False,
+                max_steps=steps,
+                throw=False,
+            )
+            return simulate(scene, ends[tolerance], start=start, save="window", **asked)  # pyright: ignore[reportArgumentType]
 
         return [
             row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
@@ -295,7 +309,7 @@ def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], An
 
 def _final_state(ask: _Ask, end: float | None) -> Cost:
     end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
-    best = functools.cache(lambda: simulate(ask.scene, end, save="window", tolerance=1e-13))
+    best = functools.cache(lambda: simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
     @functools.cache
     def scale() -> State:
@@ -359,7 +373,7 @@ def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: _Jam, end: float | N
     max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
 
     def full(k: Any, adjoint: Any = None) -> Any:
-        asked = dict(save="window", tolerance=_GRADIENT_TOLERANCE, max_steps=max_steps, throw=False)
+        asked = dict(save="window", stepsize_controller=Tolerance(_GRADIENT_TOLERANCE), max_steps=max_steps, throw=False)
         run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
         return jnp.max(run.amplitude)
 
@@ -383,5 +397,5 @@ def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
 
 
 def _unstable(tiers: str, jam: _Jam) -> str:
-    multiplier = float(jam.fine.multiplier)
-    return f"{tiers}: jam mode {jam.mode} is unstable (largest Floquet multiplier {multiplier:.4g}), a run leaves it"
+    largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
+    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

@@ -20,7 +20,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, interval, ten_periods, turning_points
 from jaxvib.study.bearing.record import Record
-from jaxvib.study.bearing.swing import BearingPendulum, swing_states
+from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -238,7 +238,9 @@ def fit_swing(
         freed = eqx.tree_at(lambda p: p.g, pendulum, pull)
         solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
         smooth = None if at.dry is None else width
-        run = swing_states(freed, time, at.angle, at.rate, at.viscous, at.dry, smooth, _TOLERANCE, solver, adjoint, max_steps)
+        run = swing_states(
+            freed, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(_TOLERANCE), solver, adjoint, max_steps
+        )
         return at.offset + run.angle, run.stopped_at
 
     first, shape = jax.flatten_util.ravel_pytree(start)

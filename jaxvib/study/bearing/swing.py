@@ -15,6 +15,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
+from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
@@ -119,6 +120,7 @@ class Swing(Result):
         )
 
 
+@refuse_former(tolerance=FORMER["tolerance"])
 def swing(
     pendulum: BearingPendulum,
     time: Number | Sequence[Number],
@@ -128,7 +130,7 @@ def swing(
     viscous: Number,
     dry: Number | None = None,
     width: Number | None = None,
-    tolerance: float | None = None,
+    stepsize_controller: Tolerance | diffrax.AbstractStepSizeController | None = None,
     solver: diffrax.AbstractSolver | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = 2**17,
@@ -146,8 +148,8 @@ def swing(
     - `viscous` mu1, N m s; `dry` mu2, no unit (about 0.0015 for ball bearings); left out, there is no dry friction
     - `width` rad/s of the passage through 0 of the sign of sliding; unless said otherwise a twentieth of the dead zone's
       angle times the natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less
-    - `tolerance` of a step, relative, and in rad, 1e-9 unless said otherwise, in single precision 1e-5; `solver`, `adjoint`
-      diffrax's; `max_steps`
+    - `stepsize_controller`: `Tolerance` of a step, relative, and in rad (the default is 1e-9, in single precision 1e-5), or a
+      controller of diffrax; `solver`, `adjoint`, `max_steps` diffrax's
     - `throw`: raise where the steps do not suffice; otherwise, and under a JAX transformation, the status says so
 
     **Returns** `Swing`; gradients, forward (with `adjoint=diffrax.ForwardMode()`) and reverse, `jit` and `vmap` go through it.
@@ -165,6 +167,8 @@ def swing(
     if not isinstance(pendulum, BearingPendulum):
         raise InputError("pendulum", f"is {pendulum!r}; it must be a BearingPendulum(mass=..., length=...)")
     times = numbers(time, "s", "time", None)
+    chosen = Tolerance(1e-9 if times.dtype.itemsize >= 8 else 1e-5) if stepsize_controller is None else stepsize_controller
+    require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if times.ndim != 1:
         raise InputError("time", "is one number; a list of times is needed")
     if not traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
@@ -180,7 +184,7 @@ def swing(
         number(viscous, "N m s", "viscous", low=0.0),
         friction,
         None if width is None else number(width, "rad/s", "width", low=0.0, open_low=True),
-        (1e-9 if times.dtype.itemsize >= 8 else 1e-5) if tolerance is None else tolerance,
+        controller_to(chosen.tolerance) if isinstance(chosen, Tolerance) else chosen,
         diffrax.Tsit5() if solver is None else solver,
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         count(max_steps, "max_steps"),
@@ -196,6 +200,11 @@ def _diameter(pendulum: BearingPendulum) -> Array:
     return pendulum.bearing
 
 
+def controller_to(tolerance: float) -> diffrax.AbstractStepSizeController:
+    """A proportional and integral controller of steps to a relative and absolute error."""
+    return diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
+
+
 def swing_states(
     pendulum: BearingPendulum,
     times: Array,
@@ -204,7 +213,7 @@ def swing_states(
     viscous: Array,
     dry: Array | None,
     width: Array | None,
-    tolerance: float,
+    controller: diffrax.AbstractStepSizeController,
     solver: diffrax.AbstractSolver,
     adjoint: diffrax.AbstractAdjoint,
     max_steps: int,
@@ -249,7 +258,7 @@ def swing_states(
         dt0=0.02 / scale,
         y0=(angle, rate),
         saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=times), diffrax.SubSaveAt(t1=True)]),
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4),
+        stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,

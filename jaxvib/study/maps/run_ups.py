@@ -19,6 +19,7 @@ from jaxvib.motion.analysis.regime import REGIMES, Regime, RegimeName
 from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -32,7 +33,7 @@ __all__ = ["RunUps", "run_ups"]
 _FAILED = "failed"
 """The word for a run that did not reach its end: it has no kind of motion."""
 
-_TOLERANCE = 1e-7
+_TOLERANCE = Tolerance(1e-7)
 """Error of a step in double precision: enough to name a motion."""
 
 _FEWEST = 2**20
@@ -90,6 +91,7 @@ def _span(values: np.ndarray) -> str:
     return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
 
 
+@refuse_former(tolerance=FORMER["tolerance"])
 def run_ups(
     scene: Scene,
     until: Number,
@@ -98,7 +100,7 @@ def run_ups(
     starts: int | None = None,
     seed: int = 0,
     angles: Sequence[Sequence[float]] | None = None,
-    tolerance: float | None = None,
+    stepsize_controller: StepChoice | None = None,
     batch: int = 16,
     max_steps: int | None = None,
 ) -> RunUps:
@@ -110,7 +112,7 @@ def run_ups(
     - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
     - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
       rad. Without either all loads start together at the bottom
-    - `tolerance`: error of a step, as `simulate`; 1e-7 unless said otherwise, in single precision what `simulate` takes
+    - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
     - `batch`: so many runs go side by side
     - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
 
@@ -123,7 +125,7 @@ def run_ups(
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
     ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.SpinUp(60.0, duration=1.0))
-    >>> found = jv.run_ups(scene, 4.0, drag=[0.05, 5.0], starts=6, tolerance=1e-5)
+    >>> found = jv.run_ups(scene, 4.0, drag=[0.05, 5.0], starts=6, stepsize_controller=jv.Tolerance(1e-5))
     >>> found.kind.shape, found.fraction("jammed").tolist()
     ((2, 6), [0.0, 1.0])
     >>> print(found.summary())
@@ -159,11 +161,11 @@ def run_ups(
     shape = (len(drags), len(sets))
     size = min(batch, shape[0] * shape[1])
     end = number(until, "s", "until", low=0.0, open_low=True)
-    if tolerance is None and end.dtype.itemsize >= 8:
-        tolerance = _TOLERANCE
+    if stepsize_controller is None and end.dtype.itemsize >= 8:
+        stepsize_controller = _TOLERANCE
     if max_steps is None:
         max_steps = max(_FEWEST, enough_steps(scene, end))
-    named, omega, finished = _all(scene, end, grid, size, tolerance, max_steps)
+    named, omega, finished = _all(scene, end, grid, size, stepsize_controller, max_steps)
     code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
     kind = np.where(np.asarray(finished), np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)], _FAILED)
 
@@ -182,13 +184,13 @@ def run_ups(
 
 @eqx.filter_jit
 def _all(
-    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, tolerance: float | None, max_steps: int
+    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
     def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
         drag, angle = lane
         this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
         start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
-        run = simulate(this, until, start=start, save="window", tolerance=tolerance, max_steps=max_steps, throw=False)
+        run = simulate(this, until, start=start, save="window", stepsize_controller=chosen, max_steps=max_steps, throw=False)
         finished = run.status == RunStatus.done
         return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
 

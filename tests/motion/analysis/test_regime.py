@@ -9,6 +9,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.study.maps.published_rotor import published_rotor
 
 TIME = jnp.linspace(0.0, 1.0, 801)
@@ -23,7 +24,7 @@ def made(phase, speed, *, wobble=0.0, slow=0.0, effects=()):
     angle = angle + slow * TIME[:, None] ** 2
     rate = speed[None] + (100.0 * wobble * jnp.cos(100.0 * TIME) + 2.0 * slow * TIME)[:, None]
     still = jnp.zeros((801, 4))
-    return s, jv.Trajectory(
+    return s, Trajectory(
         TIME, jv.State(still, still, (angle,), (rate,)), jnp.zeros((801, 2)), 460.0 * TIME, jnp.full(801, 460.0)
     )
 
@@ -76,7 +77,7 @@ def test_loads_at_one_station_cannot_balance_what_tilts_their_rotor(effects, lab
 def test_a_run_that_starts_in_a_mode_and_stays_has_that_mode(speed, damping, mode, near):
     """Close to the rotor's speed it is the mode that rises there, not the unstable one that falls from the resonance below."""
     s = published(speed=speed, damping=damping, eps=0.01).scene()
-    run = jv.simulate(s, 300.0, start="jam", mode=mode, save="window", tolerance=1e-6, estimate=False)
+    run = jv.simulate(s, 300.0, start="jam", mode=mode, save="window", stepsize_controller=jv.Tolerance(1e-6), estimate=False)
     np.testing.assert_allclose(run.omega, jv.jam_modes(s).select(mode).omega, rtol=0.03)
     np.testing.assert_allclose(run.regime.load_speed, run.load_speed, rtol=1e-12)
     assert run.regime.label == "jammed" and int(run.regime.mode) == mode
@@ -95,8 +96,12 @@ def with_motor(drive):
 
 def test_weak_motor_is_caught_at_the_resonance_and_a_strong_one_passes():
     """The mean torque that the resonance takes, S^2 w^3 / (2 c) = 4.24 N m, against the motor's at that speed."""
-    weak = jv.simulate(with_motor(jv.DCMotor(60.0, stall_torque=2.0, inertia=0.05)), 15.0, tolerance=1e-6)
-    strong = jv.simulate(with_motor(jv.DCMotor(60.0, stall_torque=6.0, inertia=0.05)), 15.0, tolerance=1e-6)
+    weak = jv.simulate(
+        with_motor(jv.DCMotor(60.0, stall_torque=2.0, inertia=0.05)), 15.0, stepsize_controller=jv.Tolerance(1e-6)
+    )
+    strong = jv.simulate(
+        with_motor(jv.DCMotor(60.0, stall_torque=6.0, inertia=0.05)), 15.0, stepsize_controller=jv.Tolerance(1e-6)
+    )
     resonance = np.sqrt(4e4 / 50.0)
     assert 0.9 * resonance < float(jnp.mean(weak.window.rotor_speed)) < resonance
     assert bool(weak.regime.caught) and "caught" in weak.summary()
@@ -119,7 +124,7 @@ def slipped(s, until=0.5, from_rest=False, tolerance=1e-9, **options):
     """How far the pendulum falls back behind the shaft, that it turned with at first or hung still beside, rad."""
     rate = jnp.zeros(1) if from_rest else s.drive.speed[None]
     start = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (rate,))
-    run = jv.simulate(s, until, start=start, samples=2, tolerance=tolerance, **options)
+    run = jv.simulate(s, until, start=start, samples=2, stepsize_controller=jv.Tolerance(tolerance), **options)
     return float(s.drive.speed * until - run.trajectory.state.angle[0][-1, 0])
 
 

@@ -13,6 +13,7 @@ from gyroscopic_rotor import rotor
 from scenes import machines
 
 import jaxvib as jv
+from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
 
 POINTS = 112
 """Rotor speeds of one scan; the same in all tests, so that each machine is compiled once."""
@@ -56,7 +57,7 @@ def test_arrangements_cancel_and_know_their_neutral_directions(mass, rows, dimen
     if len(set(mass)) == 1 and len(mass) > 2:
         np.testing.assert_allclose(np.sort(states.angles[0]), np.arange(len(mass)) * 2 * np.pi / len(mass), atol=1e-12)
     name = "unique" if len(mass) <= 3 else "family"
-    assert states.status == getattr(jv.BalanceStatus, name) and "neutral directions: turn" in states.summary()
+    assert states.status == getattr(BalanceStatus, name) and "neutral directions: turn" in states.summary()
 
 
 @pytest.mark.parametrize(("count", "dimension", "directions"), [(1, 0, 0), (2, 0, 0), (3, 1, 1), (4, 2, 2)])
@@ -69,7 +70,7 @@ def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
         assert abs(np.sum(0.03 * np.exp(1j * angles)) + moment * np.exp(0.7j)) < 1e-13
         assert neutral.shape == (count, directions)
     too_large = loaded(count=count, effects=(jv.StaticImbalance(1.0),))
-    assert jv.balanced_states(too_large).status == jv.BalanceStatus.outweighed
+    assert jv.balanced_states(too_large).status == BalanceStatus.outweighed
 
 
 @pytest.mark.parametrize(
@@ -83,19 +84,19 @@ def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
 def test_loads_that_cannot_cancel_are_named(mass, status, sentence):
     s = loaded(count=len(mass), mass=mass)
     states = jv.balanced_states(s)
-    assert states.status == getattr(jv.BalanceStatus, status) and sentence in states.summary()
+    assert states.status == getattr(BalanceStatus, status) and sentence in states.summary()
     with pytest.raises(jv.ComputationError, match=sentence) as error:
-        jv.balanced_stability(s)
+        balanced_stability(s)
     assert error.value.status == status
 
 
 def test_motion_that_is_not_balanced_is_refused():
     with pytest.raises(jv.InputError, match="angles leave an unbalance"):
-        jv.balanced_stability(loaded(), np.array([0.0, 3.0]))
+        balanced_stability(loaded(), np.array([0.0, 3.0]))
     with pytest.raises(jv.InputError, match="effects disturb"):
-        jv.balanced_stability(loaded(effects=(jv.Gravity(),)))
+        balanced_stability(loaded(effects=(jv.Gravity(),)))
     with pytest.raises(jv.InputError, match="low is 5"):
-        jv.balanced_intervals(loaded(), 5.0, 3.0)
+        balanced_intervals(loaded(), 5.0, 3.0)
 
 
 def flat_field(s):
@@ -113,9 +114,9 @@ def flat_field(s):
 def test_multipliers_are_those_of_an_independent_integration(speed):
     """The full equations integrated by scipy from pairs of small errors, differenced; and four times the steps."""
     s = loaded("two_mass", 3, speed=speed)
-    result = jv.balanced_stability(s)
+    result = balanced_stability(s)
     assert result.error < 1e-6
-    finer = jv.balanced_stability(s, steps=192)
+    finer = balanced_stability(s, steps=192)
     np.testing.assert_allclose(
         np.sort_complex(result.multipliers), np.sort_complex(finer.multipliers), atol=3.0 * result.error + 1e-9
     )
@@ -143,7 +144,7 @@ def test_multipliers_are_those_of_an_independent_integration(speed):
 @pytest.mark.parametrize("count", [2, 3, 4, 5])
 def test_neutral_directions_are_multipliers_of_one(count):
     s = loaded("one_mass", count, speed=60.0)
-    result = jv.balanced_stability(s)
+    result = balanced_stability(s)
     assert result.stable and result.neutral == max(1, count - 2)
     ones = np.sort(np.abs(result.multipliers - 1.0))
     assert np.all(ones[: result.neutral] < 1e-8) and ones[result.neutral] > 1e-3
@@ -180,12 +181,12 @@ def test_runs_from_small_errors_balance_inside_the_exact_intervals_only(name, co
     s = loaded(name, count)
     resonances = np.asarray(jv.natural_frequencies(s))
     low, high = 0.7 * resonances[0], 1.6 * resonances[-1]
-    intervals = jv.balanced_intervals(s, low, high, points=POINTS)
+    intervals = balanced_intervals(s, low, high, points=POINTS)
     cuts = sorted({low, high, *(w for row in intervals for w in row)})
     # Narrow regions are left out: errors change too slowly there for a test.
     wide = [(a, b) for a, b in itertools.pairwise(cuts) if b > 1.05 * a]
     speeds = np.array([w for a, b in wide for w in (1.02 * a, 0.98 * b)])
-    growth = jv.balanced_growth(s, speeds)
+    growth = balanced_growth(s, speeds)
     inside = np.array([any(a < w < b for a, b in intervals) for w in speeds])
     np.testing.assert_array_equal(growth < 0.0, inside)
     assert 1 < inside.sum() < inside.size - 1
@@ -201,7 +202,7 @@ def test_runs_from_small_errors_balance_inside_the_exact_intervals_only(name, co
 def test_light_loads_with_strong_drag_have_the_boundaries_of_the_criterion():
     for name, count, top in (("one_mass", 2, 40.0), ("two_mass", 3, 90.0), ("three_mass", 2, 60.0)):
         s = loaded(name, count, mass=0.001, drag=5.0)
-        exact = np.array(jv.balanced_intervals(s, 12.0, top, points=POINTS))
+        exact = np.array(balanced_intervals(s, 12.0, top, points=POINTS))
         said = np.asarray(jv.criterion(s).balancing)
         np.testing.assert_allclose(exact[:, 0], said[:, 0], rtol=1e-4)
         np.testing.assert_allclose(exact[:-1, 1], said[:-1, 1], rtol=1e-4)
@@ -212,7 +213,7 @@ def test_rotor_with_gyroscopic_coupling_has_the_boundaries_of_the_criterion(pola
     """The first balancing interval, exact to 1e-6: what turns backward is rightly left out of the functional."""
     s = rotor(polar, mass=0.05)
     said = np.asarray(jv.criterion(s).balancing[0])
-    (exact,) = jv.balanced_intervals(s, 0.8 * said[0], 1.2 * said[1], points=48)
+    (exact,) = balanced_intervals(s, 0.8 * said[0], 1.2 * said[1], points=48)
     np.testing.assert_allclose(exact, said, rtol=1e-6)
 
 
@@ -233,7 +234,7 @@ def test_twenty_platforms():
     speeds = np.linspace(15.0, 90.0, 16)
     said = np.asarray(jv.criterion(s).balances(speeds))
     assert 0 < said.sum() < said.size
-    np.testing.assert_array_equal(jv.balanced_growth(s, speeds) < 0.0, said)
+    np.testing.assert_array_equal(balanced_growth(s, speeds) < 0.0, said)
 
 
 def test_criterion_holds_better_for_lighter_loads_and_for_stronger_drag_on_light_ones():
@@ -295,21 +296,21 @@ def test_imbalance_is_a_load_that_cannot_leave_the_rotor(machines, speed, weak):
         held = jv.balls(count=3, mass=[0.2, 0.3, 0.3], radius=0.1, drag=[drag, 1.0, 1.0])
         three = jv.Scene(machine, held, jv.ConstantSpeed(speed))
         angles = jv.balanced_states(three).angles[0]
-        found = jv.balanced_stability(two(angles[0] + 0.3), angles[1:] + 0.3)
-        whole = jv.balanced_stability(three, angles, steps=3072).multipliers
+        found = balanced_stability(two(angles[0] + 0.3), angles[1:] + 0.3)
+        whole = balanced_stability(three, angles, steps=3072).multipliers
         moving = found.multipliers[np.abs(found.multipliers) > 1e-3]
         off.append(max(np.min(np.abs(whole - multiplier)) for multiplier in moving))
         assert found.neutral == 0
     # What is left of the held load's freedom goes as 1/drag.
     assert off[1] < 3e-5, off
     np.testing.assert_allclose(off[0] / off[1], 10.0, rtol=0.1)
-    np.testing.assert_allclose(jv.balanced_stability(two(0.0)).growth, found.growth, rtol=1e-6)
+    np.testing.assert_allclose(balanced_stability(two(0.0)).growth, found.growth, rtol=1e-6)
 
 
 def test_imbalance_that_loads_cannot_cancel_is_refused():
     unbalanced = (jv.StaticImbalance(0.01),)
     with pytest.raises(jv.InputError, match="leave an unbalance"):
-        jv.balanced_stability(loaded(effects=unbalanced), [0.0, np.pi])
+        balanced_stability(loaded(effects=unbalanced), [0.0, np.pi])
     moment = (jv.MomentImbalance(1e-3),)
     for station, effects in ((0.0, moment), (0.2, moment), (0.2, unbalanced)):
         machine, *_ = tilting(station)
@@ -322,4 +323,4 @@ def test_a_machine_that_can_drift_is_refused():
     """Its free motion has multipliers of 1, and what is left of them by rounding would be read as growth."""
     s = eqx.tree_at(lambda x: x.machine.stiffness, loaded(), jnp.zeros(2))
     with pytest.raises(jv.InputError, match="lets the machine drift"):
-        jv.balanced_growth(s, [30.0, 60.0])
+        balanced_growth(s, [30.0, 60.0])

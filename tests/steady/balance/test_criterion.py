@@ -12,6 +12,8 @@ from gyroscopic_rotor import rotor
 from scenes import machines, scene
 
 import jaxvib as jv
+from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
+from jaxvib.steady.balance.speeds import CriterionStatus, characteristic_speeds
 
 LINKS = {1: (), 2: ((1, 2),), 3: ((1, 2), (1, 3), (2, 3))}
 
@@ -70,7 +72,7 @@ def test_closed_forms_are_the_general_method(n):
     rng = np.random.default_rng(n)
     for _ in range(30):
         natural, link, rho = drawn(rng, n)
-        speeds = jv.characteristic_speeds(paper(n, natural, link, rho).scene())
+        speeds = characteristic_speeds(paper(n, natural, link, rho).scene())
         if n == 1:
             resonances, additional = one_mass_speeds(natural[0])
         elif n == 2:
@@ -93,7 +95,7 @@ def test_damped_closed_form_is_the_functional():
         s = paper(2, natural, link, rho, h, h12).scene()
         unit = float(s.loads.unbalance()) ** 2 / 40.0
         closed = two_mass_functional(q, tuple(natural), link[0], tuple(h), h12[0], rho[0]) / 2.0
-        np.testing.assert_allclose(jv.criterion_functional(s, 30.0 * q) / unit, closed, rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(criterion_functional(s, 30.0 * q) / unit, closed, rtol=1e-11, atol=1e-13)
 
 
 def test_order_of_ten_thousand_three_mass_machines():
@@ -108,7 +110,7 @@ def test_order_of_ten_thousand_three_mass_machines():
     @jax.vmap
     def speeds(values):
         machine = eqx.tree_at(lambda m: tuple(getattr(m, name) for name in values), base.machine, tuple(values.values()))
-        found = jv.characteristic_speeds(eqx.tree_at(lambda s: s.machine, base, machine))
+        found = characteristic_speeds(eqx.tree_at(lambda s: s.machine, base, machine))
         return found.resonances, found.additional
 
     poles, zeros = speeds({name: jnp.asarray(value) for name, value in values.items()})
@@ -127,7 +129,7 @@ def test_one_mass_boundary_does_not_depend_on_damping_others_do():
     def damped(name, factor):
         s = scene(name)
         where = lambda x: (x.machine.damping, x.machine.link_damping)  # noqa: E731
-        return jv.characteristic_speeds(eqx.tree_at(where, s, tuple(factor * c for c in where(s))))
+        return characteristic_speeds(eqx.tree_at(where, s, tuple(factor * c for c in where(s))))
 
     one = [float(damped("one_mass", f).damped_resonances[0]) for f in (0.0, 1.0, 30.0)]
     np.testing.assert_allclose(one, one[0], rtol=1e-14)
@@ -146,7 +148,7 @@ def test_damper_under_the_exciter_moves_no_speed():
 
 def test_damping_moves_no_speed_out_of_the_range_of_resonances():
     for damping in (1.0, 30.0, 1000.0):
-        speeds = jv.characteristic_speeds(network_of(6, damping=damping))
+        speeds = characteristic_speeds(network_of(6, damping=damping))
         found = np.array([w for _, w in speeds.labelled(damped=True)])
         assert found.min() >= speeds.resonances[0] * (1 - 1e-12) and found.max() <= speeds.resonances[-1] * (1 + 1e-12)
 
@@ -174,7 +176,7 @@ def test_sign_of_the_functional_is_that_of_the_receptance(s):
     speeds = speeds[np.min(np.abs(speeds[:, None] / np.array(boundaries) - 1.0), axis=1) > 1e-9]
     negative = np.array([real_part(w) < 0.0 for w in speeds])
     np.testing.assert_array_equal(result.balances(speeds), negative)
-    functional = jax.vmap(lambda w: jv.criterion_functional(s, w))(jnp.asarray(speeds))
+    functional = jax.vmap(lambda w: criterion_functional(s, w))(jnp.asarray(speeds))
     np.testing.assert_array_equal(functional < 0.0, negative)
 
 
@@ -182,7 +184,7 @@ def test_sign_of_the_functional_is_that_of_the_receptance(s):
 def test_port_of_two_directions_without_damping(s):
     """Poles by scipy from the quadratic pencil, zeros as roots of the functional."""
     carrier = s.machine.carrier()
-    speeds = jv.characteristic_speeds(s)
+    speeds = characteristic_speeds(s)
     mass = carrier.mass + 0.4 * carrier.port.T @ carrier.port - 1j * carrier.gyroscopic
     inverse = scipy.linalg.eigvals(mass, carrier.stiffness).real
     poles = np.sort(1.0 / np.sqrt(inverse[inverse > 1e-12 * inverse.max()]))
@@ -224,7 +226,7 @@ NAMES = ("mass", "stiffness", "damping", "link_stiffness", "link_damping")
 def speeds_of(values, name):
     base = scene(name)
     machine = eqx.tree_at(lambda m: tuple(getattr(m, n) for n in NAMES), base.machine, tuple(values[n] for n in NAMES))
-    r = jv.characteristic_speeds(eqx.tree_at(lambda x: x.machine, base, machine))
+    r = characteristic_speeds(eqx.tree_at(lambda x: x.machine, base, machine))
     parts = (r.resonances, r.additional, r.damped_resonances, r.damped_additional)
     return jnp.concatenate([jnp.nan_to_num(part) for part in parts]), r.shapes
 
@@ -279,7 +281,7 @@ def test_mode_that_does_not_move_the_exciter_changes_no_sign():
         link_damping=(0, 0, 0),
     )
     result = jv.criterion(jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0)))
-    table = jv.criterion_table(result)
+    table = criterion_table(result)
     assert len(table["resonances"]) == 3 and len(table["additional"]) == 2
     assert len(table["balancing"]) == len(table["undamped_balancing"]) == 2
     np.testing.assert_allclose(np.array(table["balancing"][0]), table["undamped_balancing"][0], rtol=1e-7)
@@ -289,7 +291,7 @@ def test_table_is_ready_for_json_and_covers_all_speeds():
     import json
 
     for name in machines():
-        table = json.loads(json.dumps(jv.criterion_table(jv.criterion(scene(name)))))
+        table = json.loads(json.dumps(criterion_table(jv.criterion(scene(name)))))
         ends = sorted([*table["balancing"], *table["gathering"]])
         assert ends[0][0] == 0.0 and ends[-1][1] is None
         assert [a[1] for a in ends[:-1]] == [b[0] for b in ends[1:]]
@@ -299,10 +301,10 @@ def test_table_is_ready_for_json_and_covers_all_speeds():
 def test_machine_without_supports_is_named_and_balances_from_the_start():
     machine = jv.two_mass(mass=(4.0, 3.0), stiffness=(0, 0), damping=(0, 0), link_stiffness=1e4, link_damping=3.0)
     result = jv.criterion(jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0)))
-    assert jv.CriterionStatus[result.status].startswith("no support")
+    assert CriterionStatus[result.status].startswith("no support")
     assert result.resonances[0] == 0.0
     np.testing.assert_allclose(result.additional, 50.0, rtol=1e-14)
-    table = jv.criterion_table(result)
+    table = criterion_table(result)
     assert table["balancing"][0][0] == 0.0 and len(table["gathering"]) == 1
     assert "no support" in result.summary()
 

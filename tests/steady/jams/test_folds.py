@@ -9,8 +9,9 @@ from load_speeds import all_load_speeds
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
-rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jv.jam_rotor_speed, in_axes=(None, 0)))
+rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
 
 many_modes = eqx.filter_jit(eqx.filter_vmap(jv.jam_modes))

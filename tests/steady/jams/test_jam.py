@@ -9,6 +9,7 @@ from load_speeds import all_load_speeds, complex_response, unbalance_and_drag
 from scenes import loads, machines, published
 
 import jaxvib as jv
+from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
 @eqx.filter_jit
@@ -17,7 +18,7 @@ def modes_at(s, speed):
     return jv.jam_modes(eqx.tree_at(lambda x: x.drive.speed, s, speed))
 
 
-rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jv.jam_rotor_speed, in_axes=(None, 0)))
+rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
 
 def name(jam):

@@ -9,7 +9,8 @@ from scenes import machines
 
 import jaxvib as jv
 from jaxvib.numerics.linalg import eliminate
-from jaxvib.steady.jams.phase_search import _same
+from jaxvib.steady.jams.phase_search import _same, phase_branch
+from jaxvib.steady.jams.phases import phase_jam, phase_torques
 
 K1, K2, L1, L2 = 0.604e6, 0.555e6, 0.165, 0.155
 STATIONS = (0.28, 0.25, -0.25, -0.28)
@@ -53,7 +54,7 @@ def test_torques_are_means_over_a_turn():
     answer = np.linalg.solve(np.asarray(carrier.stiffness) - w**2 * mass + 1j * w * damping, force)
     angle = 2.0 * np.pi * np.arange(64) / 64.0
     acceleration = -(w**2) * (answer[:, None] * np.exp(1j * angle)).real
-    for row, a, torque in zip(rows, phase, jv.phase_torques(scene, w, phase), strict=True):
+    for row, a, torque in zip(rows, phase, phase_torques(scene, w, phase), strict=True):
         tangent = np.stack([-np.sin(angle + a), np.cos(angle + a)])
         np.testing.assert_allclose(torque, -0.05 * 0.08 * np.mean(np.sum(tangent * (row @ acceleration), axis=0)), rtol=1e-10)
 
@@ -78,7 +79,7 @@ def needed_friction(w, pattern, b3):
     ],
 )
 def test_closed_forms_of_the_rotor(mu, b3, start, phase, pattern):
-    jam = jv.phase_jam(rotor(mu, 0.0, b3), start, jnp.asarray(phase))
+    jam = phase_jam(rotor(mu, 0.0, b3), start, jnp.asarray(phase))
     assert bool(jam.status == jv.PhaseStatus.found)
     assert bool(jam.pattern == getattr(jv.PhasePattern, pattern))
     np.testing.assert_allclose(needed_friction(float(jam.omega), pattern, b3), mu, rtol=0.01)
@@ -127,7 +128,7 @@ def test_on_supports_alike_both_ways_jams_and_stability_are_exact(which):
         "rotor unequal": (rotor(1.02e-2, 13635.0), 271.0, [0.0, 0.06, -3.05, -3.12]),
         "planar heavy": (planar(4.0, 3, inertia=1e-3), 160.0, [0.0] * 3),
     }[which]
-    jam = jv.phase_jam(scene, start, jnp.asarray(phase))
+    jam = phase_jam(scene, start, jnp.asarray(phase))
     rest, matrix = turning_frame(scene, jam)
     assert bool(jam.status == jv.PhaseStatus.found)
     assert np.max(np.abs(rest)) < 1e-9 * float(jam.omega) ** 2
@@ -153,13 +154,13 @@ def test_equal_phases_on_platforms_are_the_jam_modes():
 
 def test_a_branch_over_the_drag_passes_its_folds():
     scene = rotor(9.2e-4)
-    jam = jv.phase_jam(scene, 169.6, jnp.zeros(4))
+    jam = phase_jam(scene, 169.6, jnp.zeros(4))
     omega = np.sort(
         np.append(
             np.concatenate([np.linspace(150.0, 168.0, 10), np.linspace(169.0, 171.0, 41), [180.0, 200.0]]), float(jam.omega)
         )
     )
-    branch = jv.phase_branch(scene, jam, omega)
+    branch = phase_branch(scene, jam, omega)
     np.testing.assert_allclose(branch.drag_factor[int(np.argmin(np.abs(omega - float(jam.omega))))], 1.0, rtol=1e-8)
     expected = [needed_friction(w, "together", 10.41) / 9.2e-4 for w in omega]
     np.testing.assert_allclose(branch.drag_factor, expected, rtol=0.01)
@@ -169,13 +170,13 @@ def test_a_branch_over_the_drag_passes_its_folds():
     last = np.max(np.asarray(branch.drag_factor)[np.asarray(branch.stable)])
     assert 9.2e-4 < 9.2e-4 * last < 9.6e-4
     with pytest.raises(jv.InputError, match="omega must be a list of load speeds that ascend"):
-        jv.phase_branch(scene, jam, [100.0, 500.0])
+        phase_branch(scene, jam, [100.0, 500.0])
 
 
 def test_figure_of_a_branch_is_solid_where_it_is_stable():
     scene = rotor(9.2e-4)
     omega = np.linspace(140.0, 190.0, 53)
-    branch = jv.phase_branch(scene, jv.phase_jam(scene, 169.6, jnp.zeros(4)), omega)
+    branch = phase_branch(scene, phase_jam(scene, 169.6, jnp.zeros(4)), omega)
     (axis,) = branch.plot(unit="rpm").axes
     assert axis.get_xlabel() == "drag, N s/m" and axis.get_ylabel() == "speed of loads, rpm"
     expected = np.stack([np.asarray(branch.drag_factor) * 9.2e-4 / 0.08**2, 30.0 / np.pi * omega], axis=1)
@@ -212,7 +213,7 @@ def test_derivatives_are_the_implicit_function_theorems():
         scene = eqx.tree_at(lambda s: s.loads.mass, rotor(1e-2, 0.0, 21.56), mass)
         scene = eqx.tree_at(lambda s: s.loads.drag, scene, mu / 0.08**2)
         scene = eqx.tree_at(lambda s: s.machine.damping_terms, scene, jnp.array([843.17, 0.0, 1.0]).at[2].set(b3))
-        jam = jv.phase_jam(scene, 271.0, phase)
+        jam = phase_jam(scene, 271.0, phase)
         return jnp.concatenate([jam.omega[None], jnp.sin(jam.phase[1:]), 1e3 * jam.amplitude])
 
     at = (jnp.asarray(1.24e-2), jnp.asarray(21.56), jnp.asarray(0.05))
@@ -241,9 +242,9 @@ def test_elimination_is_numpys():
 
 
 def test_loads_that_balance_are_no_jam():
-    jam = jv.phase_jam(planar(), 459.9, jnp.array([0.0, np.pi]))
+    jam = phase_jam(planar(), 459.9, jnp.array([0.0, np.pi]))
     assert jv.PhaseStatus[jam.status].startswith("the loads turn with the rotor") and np.isclose(jam.omega, 460.0)
-    lost = jv.phase_jam(planar(), 1e9, jnp.array([0.0, 1.0]))
+    lost = phase_jam(planar(), 1e9, jnp.array([0.0, 1.0]))
     assert bool(lost.status == jv.PhaseStatus.not_converged) and np.isnan(lost.omega) and np.isnan(lost.amplitude).all()
 
 
@@ -251,7 +252,7 @@ def test_wrong_questions():
     with pytest.raises(jv.InputError, match=r"loads.drag is 0; loads without drag"):
         jv.phase_jams(planar(0.0))
     with pytest.raises(jv.InputError, match=r"phase has shape \(3,\); one phase for each load is needed, \(2,\)"):
-        jv.phase_jam(planar(), 100.0, jnp.zeros(3))
+        phase_jam(planar(), 100.0, jnp.zeros(3))
     with pytest.raises(jv.InputError, match="starts is 0"):
         jv.phase_jams(planar(), starts=0)
     jams = jv.phase_jams(planar(), starts=8)

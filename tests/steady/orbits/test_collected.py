@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.collocation import periodic_motion
 from jaxvib.steady.orbits.orbit import light_rotor_speed
 
@@ -139,7 +140,7 @@ def test_loads_side_by_side_move_as_the_lagrangian_of_a_rigid_arc_says():
 def test_loads_side_by_side_in_the_leading_order_and_in_scene_files():
     scene = side_by_side()
     light = jax.tree.map(lambda x: x, eqx.tree_at(lambda s: (s.loads.mass, s.loads.drag), scene, (5e-6, 7e-11)))
-    np.testing.assert_allclose(jv.jam_orbit(light, omega=26.0).rotor_speed, jv.jam_rotor_speed(light, 26.0), rtol=1e-5)
+    np.testing.assert_allclose(jv.jam_orbit(light, omega=26.0).rotor_speed, jam_rotor_speed(light, 26.0), rtol=1e-5)
     text = jv.scene_to_toml(scene)
     assert "own_radius = 0.02" in text and "own_radius" not in jv.scene_to_toml(side_by_side(own_radius=None))
     assert eqx.tree_equal(jv.scene_from_toml(text), scene)

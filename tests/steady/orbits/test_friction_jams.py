@@ -12,6 +12,8 @@ from scenes import machines
 import jaxvib as jv
 from jaxvib.equations.collected import has_half_turn, load_torque, torque_slopes
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.balance.criterion import criterion_functional
+from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.collocation import periodic_motion
 
 
@@ -125,8 +127,8 @@ def test_leading_order_is_the_balance_by_hand(reaction):
     """The vibration's torque is that of the branch without friction, which has its own tests."""
     omega = 26.5
     scene, bare = alike(dry(reaction=reaction)), alike()
-    n = float(jv.jam_rotor_speed(scene, omega))
-    vibration = 2 * 0.7 * 0.01 * float(jv.jam_rotor_speed(bare, omega) - omega)
+    n = float(jam_rotor_speed(scene, omega))
+    vibration = 2 * 0.7 * 0.01 * float(jam_rotor_speed(bare, omega) - omega)
     load = {"exact": omega**2, "steady": n**2, "run_up": abs(omega**2 - 2 * n * (n - omega))}[reaction]
     rub = 2 * 0.1 * 0.01 * 0.1 * load * np.tanh((n - omega) / 0.01)
     np.testing.assert_allclose(2 * 0.7 * 0.01 * (n - omega) + rub, vibration, rtol=1e-9)
@@ -146,18 +148,18 @@ def test_modes_of_light_loads_with_dry_friction():
     assert modes.mode_numbers() == [1, 2, 3]
     for k in (1, 2):
         mode = modes.select(k)
-        np.testing.assert_allclose(jv.jam_rotor_speed(scene, mode.omega), 50.0, rtol=1e-9)
-        assert jv.jam_rotor_speed(bare, mode.omega) > 50.1
-    n = jax.vmap(lambda w: jv.jam_rotor_speed(scene, w))(jnp.linspace(0.99, 1.01, 101) * modes.folds.omega[0])
+        np.testing.assert_allclose(jam_rotor_speed(scene, mode.omega), 50.0, rtol=1e-9)
+        assert jam_rotor_speed(bare, mode.omega) > 50.1
+    n = jax.vmap(lambda w: jam_rotor_speed(scene, w))(jnp.linspace(0.99, 1.01, 101) * modes.folds.omega[0])
     assert int(jnp.argmax(n)) == 50
     # Where friction holds what the vibration takes, loads turn with the rotor but for the creep of its smoothing.
-    stuck = jv.jam_rotor_speed(alike(dry(0.5)), 20.0)
-    assert 0.0 < float(stuck - 20.0) < 0.01 < float(jv.jam_rotor_speed(alike(), 20.0) - 20.0)
+    stuck = jam_rotor_speed(alike(dry(0.5)), 20.0)
+    assert 0.0 < float(stuck - 20.0) < 0.01 < float(jam_rotor_speed(alike(), 20.0) - 20.0)
 
 
 def test_theories_without_dry_friction_refuse_it():
     scene = alike(dry())
-    for ask in (jv.criterion_functional, lambda s, w: jv.phase_jams(s)):
+    for ask in (criterion_functional, lambda s, w: jv.phase_jams(s)):
         with pytest.raises(jv.InputError, match=r"effects\.dry_friction is not part of this theory"):
             ask(scene, 20.0)
 

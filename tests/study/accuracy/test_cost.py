@@ -10,7 +10,7 @@ from scenes import published
 
 import jaxvib as jv
 from jaxvib.cli.app import run
-from jaxvib.study.accuracy.cost import Cost, CostRow
+from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
 
 
 def test_ways_agree_where_they_should(tmp_path, capsys):
@@ -78,7 +78,7 @@ def test_a_run_up_is_measured_at_its_end():
     cost = jv.work_precision(scene, until=2.0, tolerances=(1e-4, 1e-7), solvers=["Tsit5"], repeats=1)
     assert [row.setting for row in cost.rows] == ["1e-04", "1e-07"] and {row.method for row in cost.rows} == {"Tsit5"}
     assert cost.reference_error < 1e-9 and cost.rows[1].error < 1e-6 < cost.rows[0].error
-    run = jv.simulate(scene, 2.0, tolerance=1e-10, estimate=False)
+    run = jv.simulate(scene, 2.0, stepsize_controller=jv.Tolerance(1e-10), estimate=False)
     np.testing.assert_allclose(cost.reference, run.amplitude, rtol=1e-7)
     exact, averaged = cost.left_out
     assert exact == "leading order, exact orbit: drive.kind is 'run_up'; a jam is one at a constant speed"
@@ -103,7 +103,7 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
     assert cost.cheapest(0.1) == row(1e-2, 1.0) and cost.cheapest(1e-4) == row(1e-6, 2.0)
     assert cost.cheapest(1e-7) is None and cost.cheapest(1e-10) is None
     assert cost.plot().axes[0].get_ylabel() == "relative error of amplitude"
-    three = jv.cost_figure({"a": cost, "b": cost, "c": Cost("amplitude", [1.0], 1.0, [row(np.inf, 0.1)])})
+    three = cost_figure({"a": cost, "b": cost, "c": Cost("amplitude", [1.0], 1.0, [row(np.inf, 0.1)])})
     assert [axes.get_title() for axes in three.axes] == ["a", "b", "c", ""]
 
 

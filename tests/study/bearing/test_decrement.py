@@ -5,11 +5,12 @@ import pytest
 from swings import ROD, noisy, scipy_swing
 
 import jaxvib as jv
+from jaxvib.study.bearing.decrement import turning_points
 
 
 def test_turning_points_are_those_of_the_closed_form():
     t = np.sort(np.random.default_rng(0).uniform(0.0, 9.0, 400))
-    turns = jv.turning_points(jv.Record(t, 0.4 + 0.1 * np.exp(-0.02 * t) * np.sin(3.0 * t)))
+    turns = turning_points(jv.Record(t, 0.4 + 0.1 * np.exp(-0.02 * t) * np.sin(3.0 * t)))
     expected = (np.arctan(3.0 / 0.02) + np.pi * np.arange(9)) / 3.0
     np.testing.assert_allclose(turns.time, expected[expected < t[-1] - 0.17], atol=2e-3)
     np.testing.assert_allclose(turns.angle, 0.4 + 0.1 * np.exp(-0.02 * turns.time) * np.sin(3.0 * turns.time), atol=2e-5)
@@ -49,7 +50,7 @@ def test_dry_friction_biases_the_formula_as_stated(dry):
     clean, _ = scipy_swing(ROD, t, 0.1, 0.0, 1e-3, dry)
     found = jv.ten_periods(ROD, jv.Record(t, clean))
     torque, w = dry * 0.01 * 0.3 * 9.81, float(ROD.frequency)
-    last = jv.turning_points(jv.Record(t, clean)).amplitude[20]
+    last = turning_points(jv.Record(t, clean)).amplitude[20]
     middle = (0.1 - last) / np.log(0.1 / last)
     bias = found.estimates[0] - 1e-3
     np.testing.assert_allclose(bias, 4.0 * torque / (np.pi * w * middle), rtol=0.05)

@@ -8,6 +8,7 @@ import pytest
 from swings import ROD, T, noisy, scipy_swing
 
 import jaxvib as jv
+from jaxvib.study.bearing.decrement import turning_points
 from jaxvib.study.bearing.identify import first_guess, fit_swing, steps_for, student_quantile
 
 
@@ -23,7 +24,7 @@ def test_large_swings_bias_the_formula_and_not_the_fit():
 
 def many(records, t, dry, pendulum=ROD):
     """All records fitted at once."""
-    guesses = [first_guess(pendulum, r, jv.turning_points(r), dry) for r in records]
+    guesses = [first_guess(pendulum, r, turning_points(r), dry) for r in records]
     start, width = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(a) for a in x]), *guesses)
     steps = steps_for(start, t)
     angles = jnp.asarray(np.stack([r.angle for r in records]))

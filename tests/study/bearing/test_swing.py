@@ -11,7 +11,7 @@ from swings import ROD, T, scipy_swing
 
 import jaxvib as jv
 from jaxvib.machine.effects.friction import sliding_sign
-from jaxvib.study.bearing.swing import SwingStatus, swing_states
+from jaxvib.study.bearing.swing import SwingStatus, controller_to, swing_states
 
 
 def test_radial_load_is_what_holds_the_bob_on_its_circle():
@@ -35,7 +35,7 @@ def test_small_viscous_swing_is_the_closed_form():
     n = mu1 / (2.0 * 0.025)
     w = np.sqrt(0.3 * 9.81 * 0.25 / 0.025 - n**2)
     expected = size * np.exp(-n * t) * (np.cos(w * t) + n / w * np.sin(w * t))
-    swing = jv.swing(ROD, t, angle=size, viscous=mu1, tolerance=1e-11)
+    swing = jv.swing(ROD, t, angle=size, viscous=mu1, stepsize_controller=jv.Tolerance(1e-11))
     np.testing.assert_allclose(swing.angle, expected, atol=1e-6 * size)
     assert jv.SwingStatus[swing.status].startswith("the pendulum still swings") and np.isnan(swing.stopped_at)
 
@@ -78,8 +78,8 @@ def test_derivatives_of_the_swing():
     at = jnp.array([0.3, 0.1, 2e-3, 0.02])
 
     def angles(x, adjoint=None):
-        given = dict(angle=x[0], rate=x[1], viscous=x[2], dry=x[3], width=5e-3, tolerance=1e-11, adjoint=adjoint)
-        return jv.swing(ROD, t, **given).angle
+        given = dict(angle=x[0], rate=x[1], viscous=x[2], dry=x[3], width=5e-3, adjoint=adjoint)
+        return jv.swing(ROD, t, stepsize_controller=jv.Tolerance(1e-11), **given).angle
 
     forward = jax.jit(jax.jacfwd(lambda x: angles(x, diffrax.ForwardMode())))(at)
     steps = 1e-4 * jnp.diag(at)
@@ -125,7 +125,7 @@ def test_a_swing_that_does_not_exist_leaves_those_beside_it_alone(wrong):
     def swing(x):
         pendulum = eqx.tree_at(lambda p: p.g, ROD, x["g"])
         given = (x["angle"], jnp.zeros(()), jnp.asarray(1e-3), x["dry"], jnp.asarray(1e-3))
-        run = swing_states(pendulum, T[:200], *given, 1e-8, diffrax.Tsit5(), diffrax.ForwardMode(), 4096)
+        run = swing_states(pendulum, T[:200], *given, controller_to(1e-8), diffrax.Tsit5(), diffrax.ForwardMode(), 4096)
         return run.angle, run.status
 
     right = dict(angle=0.3, dry=0.02, g=9.81)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.steady.jams.phases import phase_jam
 from jaxvib.study.maps.published_rotor import published_rotor, rotor_regimes
 
 
@@ -19,7 +20,7 @@ def test_published_rotor_at_three_frictions():
     np.testing.assert_allclose(found.regime.ripple[0, 0], 3.1, atol=0.1)
     # The torque balance at unequal phases, started from the phases of the run, gives the speed the run has locked to.
     for k, mu in enumerate(first.mu):
-        jam = jv.phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
+        jam = phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
         assert bool(jam.stable)
         np.testing.assert_allclose(jam.omega, found.omega[k, 0], atol=0.1)
     assert "together" in first.said("uncoupled, both dampers", 0)
@@ -52,7 +53,7 @@ def test_first_jam_is_reached_from_equal_starts_only():
     """The first of 201 starts hangs together; one program for all, which takes longer to compile than to run."""
     s = published_rotor(9.2e-4, "uncoupled")
     together, scattered = np.full((1, 4), -np.pi / 2.0), np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 4))
-    found = jv.run_ups(s, 6.0, angles=np.concatenate([together, scattered]), batch=8, tolerance=1e-6)
+    found = jv.run_ups(s, 6.0, angles=np.concatenate([together, scattered]), batch=8, stepsize_controller=jv.Tolerance(1e-6))
     assert np.all(found.finished)
     near_first = (found.kind[0] == "jammed") & (np.abs(found.omega[0] - 169.6) < 0.1)
     assert near_first[0] and np.mean(near_first[1:]) < 0.05
@@ -64,13 +65,13 @@ def test_run_ups_name_each_lane():
         jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
         jv.SpinUp(60.0, duration=1.0),
     )
-    found = jv.run_ups(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], tolerance=1e-5)
+    found = jv.run_ups(s, 5.0, drag=[0.05, 5.0], angles=[[0.0, 0.1], [1.0, 2.0]], stepsize_controller=jv.Tolerance(1e-5))
     assert found.kind.shape == (2, 2) and np.all(found.finished)
     assert np.all(found.fraction("jammed") + found.fraction("unbalanced") + found.fraction("balanced") <= 1.0)
     assert not np.any(found.fraction("failed"))
     lone = eqx.tree_at(lambda s: s.loads.drag, s, jnp.asarray(5.0))
     start = eqx.tree_at(lambda y: y.angle, jv.initial_state(lone), (jnp.array([1.0, 2.0]),))
-    run = jv.simulate(lone, 5.0, start=start, save="window", tolerance=1e-5)
+    run = jv.simulate(lone, 5.0, start=start, save="window", stepsize_controller=jv.Tolerance(1e-5))
     assert run.regime.label == found.kind[1, 1]
     np.testing.assert_allclose(found.omega[1, 1], run.omega, rtol=1e-6)
     assert len(found.plot().axes) == 2

@@ -1,0 +1,112 @@
+"""How the steps of a time integration are chosen."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ParamSpec, TypeVar
+
+import diffrax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+
+__all__ = ["FORMER", "Accuracy", "EqualSteps", "StepChoice", "Tolerance", "refuse_former", "require", "small_number"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Steps of such a size that each makes an error of at most `tolerance`, relative, and absolute in natural units.
+
+    Natural units are the unbalance radius S/M of the loads for displacements, that times the rotor's speed for velocities, and
+    1 rad for angles, whose error is never relative.
+
+    >>> import jaxvib as jv
+    >>> jv.Tolerance(1e-6)
+    Tolerance(tolerance=1e-06)
+    """
+
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Steps of such a size that the estimated `error` of the whole result is at most this; found by repeated runs.
+
+    >>> import jaxvib as jv
+    >>> jv.Accuracy(1e-4)
+    Accuracy(error=0.0001)
+    """
+
+    error: float
+
+
+@dataclass(frozen=True)
+class EqualSteps:
+    """So many steps, all equally long.
+
+    >>> import jaxvib as jv
+    >>> jv.EqualSteps(2000)
+    EqualSteps(number=2000)
+    """
+
+    number: int
+
+
+StepChoice = Tolerance | Accuracy | EqualSteps | diffrax.AbstractStepSizeController
+"""All that `stepsize_controller` may be."""
+
+
+def require(chosen: object, *kinds: type) -> None:
+    """**Raises** `InputError` for a choice of steps that is of none of these kinds."""
+    if chosen is not None and not isinstance(chosen, kinds):
+        names = {diffrax.AbstractStepSizeController: "a step size controller of diffrax"}
+        allowed = ", ".join(names.get(kind, f"{kind.__name__}(...)") for kind in kinds)
+        raise InputError("stepsize_controller", f"is {chosen!r}; it must be one of: {allowed}")
+
+
+def small_number(value: float, name: str, time: Array, least: float) -> float:
+    """A tolerance or an accuracy, which the precision of `time` can deliver: at least so many of its roundings.
+
+    **Raises** `InputError` for what is none.
+    """
+    precision = float(jnp.finfo(time.dtype).eps)
+    plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not (plain and least * precision <= value < 1.0):
+        raise InputError(
+            name,
+            f"is {value!r}; in {time.dtype} it must be at least {least * precision:.1g} and less than 1"
+            + ("" if plain else ", a number of Python's own such as 1e-6")
+            + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
+        )
+    return value
+
+
+def refuse_former(**now: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Makes a function say the present spelling of keywords that it had in version 0.1: `now` names it for each."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        @functools.wraps(function)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+            for name in kwargs.keys() & now.keys():
+                raise InputError(name, f"is no argument of {function.__name__} any more; write {now[name]}")
+            return function(*args, **kwargs)
+
+        return checked
+
+    return decorate
+
+
+FORMER = {
+    "tolerance": "stepsize_controller=jv.Tolerance(1e-8)",
+    "accuracy": "stepsize_controller=jv.Accuracy(1e-4)",
+    "steps": "stepsize_controller=jv.EqualSteps(2000)",
+    "controller": "stepsize_controller=controller",
+    "progress": "progress_meter=diffrax.TextProgressMeter()",
+}
+"""Keywords of version 0.1 and what they are now."""

@@ -1,0 +1,58 @@
+"""Whether a balanced motion is stable: the answer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["BalancedStability", "StabilityStatus"]
+
+
+class StabilityStatus(eqx.Enumeration):
+    """Whether a balanced motion is stable; the members are the sentences a user reads."""
+
+    stable = "errors of the balanced motion die out"
+    unstable = "errors of the balanced motion grow"
+
+
+class BalancedStability(Result):
+    """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
+
+    **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
+    neutral directions left out; `multipliers` (2 (nd + N),) complex, the largest first; `neutral` the number of those
+    that are 1 because the arrangements form a family (the common turn at least); `error` of the multipliers,
+    estimated from half the number of steps.
+    """
+
+    stable: bool = eqx.field(metadata=in_unit(""))
+    growth: float = eqx.field(metadata=in_unit("1/s"))
+    multipliers: np.ndarray = eqx.field(metadata=in_unit("", "floquet"))
+    neutral: int = eqx.field(metadata=in_unit(""))
+    error: float = eqx.field(metadata=in_unit(""))
+
+    @property
+    def status(self) -> StabilityStatus:
+        """Whether it is stable, a `StabilityStatus`."""
+        return StabilityStatus.stable if self.stable else StabilityStatus.unstable
+
+    def summary(self) -> str:
+        """Whether it is stable and how fast errors change, for a person to read."""
+        largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
+        return (
+            f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "
+            f"known to {self.error:.1e}"
+        )
+
+    def plot(self) -> Figure:
+        """The multipliers in the complex plane, and the unit circle. **Returns** a matplotlib figure."""
+        from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
+
+        return multiplier_chart(np.asarray(self.multipliers))

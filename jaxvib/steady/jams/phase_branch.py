@@ -1,0 +1,77 @@
+"""One phase pattern of jammed loads over their speed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.steady.jams.phases import PhaseStatus
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["PhaseBranch", "drag_curve"]
+
+_JUMP = 0.3
+"""Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
+
+
+class PhaseBranch(Result):
+    """One phase pattern over the loads' speed, at a given rotor speed.
+
+    **Attributes** (n speeds): `omega` (n,) rad/s; `drag_factor` (n,): at how many times the scene's drag the loads jam there,
+    NaN where the pattern has no jam; `phase` (n, count) rad; `growth` (n,) 1/s and `stable` (n,) as in `PhaseJam`;
+    `rotor_speed` rad/s, and `drag` (count,) N s/m that the factor multiplies.
+    """
+
+    omega: Array = eqx.field(metadata=in_unit("rad/s", "omega"))
+    drag_factor: Array = eqx.field(metadata=in_unit("", "omega"))
+    phase: Array = eqx.field(metadata=in_unit("rad", "omega", "load"))
+    growth: Array = eqx.field(metadata=in_unit("1/s", "omega"))
+    stable: Array = eqx.field(metadata=in_unit("", "omega"))
+    rotor_speed: Array = eqx.field(metadata=in_unit("rad/s"))
+    drag: Array = eqx.field(metadata=in_unit("N s/m", "load"))
+
+    @property
+    def status(self) -> PhaseStatus:
+        """At each load speed whether the pattern was found there, a `PhaseStatus`."""
+        return jax.vmap(lambda f: PhaseStatus.where(jnp.isnan(f), PhaseStatus.not_converged, PhaseStatus.found))(
+            self.drag_factor
+        )
+
+    def summary(self) -> str:
+        """The ranges of load speed and drag, for a person to read."""
+        factor, omega = np.asarray(self.drag_factor), np.asarray(self.omega)
+        there = np.isfinite(factor)
+        if not np.any(there):
+            return f"no jam from {omega[0]:.6g} to {omega[-1]:.6g} rad/s"
+        return (
+            f"{np.sum(there)} of {omega.size} load speeds have a jam, {np.sum(np.asarray(self.stable))} a stable one, from "
+            f"{np.min(omega[there]):.6g} to {np.max(omega[there]):.6g} rad/s, at {np.min(factor[there]):.4g} to "
+            f"{np.max(factor[there]):.4g} times the scene's drag"
+        )
+
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
+        """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
+        solid, unstable dashed. **Returns** a matplotlib figure. **Raises** `InputError` for another unit."""
+        from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
+
+        alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
+        times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")
+        factor, omega, stable = drag_curve(self)
+        curve = ("loads", times * factor, omega, stable)
+        return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit)
+
+
+def drag_curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drag factor, load speed and stability to be drawn: the factor is NaN where phases jump to another pattern."""
+    turned = np.exp(1j * np.diff(np.asarray(branch.phase), axis=0))
+    jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _JUMP)
+    return np.where(jump, np.nan, np.asarray(branch.drag_factor)), np.asarray(branch.omega), np.asarray(branch.stable)
