@@ -236,6 +236,16 @@ def _unstack(x: Scalars, *, axis: int) -> list[Scalars]:
     return [moved[k, ...] for k in range(moved.shape[0])]
 
 
+def _pad(x: Scalars, value: Scalars, *, padding_config: Any) -> Scalars:
+    low, high, inner = zip(*padding_config, strict=True)
+    if min(low) < 0 or min(high) < 0 or any(inner):
+        raise NotScalarizable("a pad that cuts off, or fills between entries")
+    out = np.empty([n + before + after for n, before, after in zip(x.shape, low, high, strict=True)], dtype=object)
+    out.fill(value[()])
+    out[tuple(slice(before, before + n) for n, before in zip(x.shape, low, strict=True))] = x
+    return out
+
+
 def primitive_of(function: Callable[..., Any], *arguments: Any) -> core.Primitive:
     """The one primitive that a public function of JAX is made of.
 
@@ -298,6 +308,7 @@ def rules() -> dict[core.Primitive, Rule]:
         (lambda v: jnp.unstack(v), (v,), _unstack),
         (lambda v: lax.split(v, (1, 1)), (v,), lambda x, *, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis=axis)),
         (lambda v: lax.rev(v, (0,)), (v,), lambda x, *, dimensions: np.flip(x, dimensions)),
+        (lambda v: lax.pad(v, x, [(0, 0, 0), (0, 1, 0)]), (v,), _pad),
         (lambda: lax.iota(np.int32, 3), (), _iota),
         (lambda v: lax.reduce_sum(v, (0,)), (v,), _reduce(_add)),
         (lambda v: lax.reduce_max(v, (0,)), (v,), _reduce(lambda a, b: lax.max(jnp.asarray(a), jnp.asarray(b)))),

@@ -128,7 +128,7 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
         rows = lax.map(single, batch, batch_size=_BLOCK)
         ends = np.cumsum([leaf.size for leaf in shapes])
         parts = [
-            rows[:, end - leaf.size : end].reshape(-1, *leaf.shape).astype(leaf.dtype)
+            rows[:, end - leaf.size : end].reshape(len(rows), *leaf.shape).astype(leaf.dtype)
             for end, leaf in zip(ends, shapes, strict=True)
         ]
         return jax.tree.unflatten(structure, parts)
