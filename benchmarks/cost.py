@@ -24,7 +24,7 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-from common import machine_line, published  # noqa: E402
+from parts.common import machine_line, published  # noqa: E402
 
 from jaxvib.cli.cost import cost_document, cost_table  # noqa: E402
 from jaxvib.study.accuracy.cost import WANTED  # noqa: E402
