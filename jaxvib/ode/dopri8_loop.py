@@ -92,9 +92,8 @@ class _BatchedInterpolation(Dopri8Interpolation):
         return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.combine((weights, self.stages)), self.y0))
 
 
-_WITHOUT_TANGENTS = functools.partial(
-    _BatchedInterpolation, combine=batch_last(_linear_combination, _linear_combination_batched)
-)
+_combination = batch_last(_linear_combination, _linear_combination_batched)
+_WITHOUT_TANGENTS = functools.partial(_BatchedInterpolation, combine=_combination)
 _WITH_TANGENTS = functools.partial(_BatchedInterpolation, combine=multi_tangent_jvp(_combination, _linear_combination_jvp))
 
 
