@@ -1,6 +1,6 @@
 """What accuracy costs in time on four scenes: every tier, method, tolerance and dtype against one reference each.
 
-    python benchmarks/cost.py [--only jam fold run_up friction gradient] [--out FOLDER]
+    python benchmarks/cost.py [--only jam fold run_up friction gradient] [--quick] [--out FOLDER]
 
 Prints a table for each scene and one for the gradient of the first, and last the README's table of what is cheapest; --out
 adds the figure, cost.png, and the numbers, cost.json. It is what `jaxvib cost` says of one scene file. Times are of a call from
@@ -25,7 +25,7 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-from common import machine_line, published  # noqa: E402
+from parts.common import machine_line, published  # noqa: E402
 
 from jaxvib.cli.cost import cost_document, cost_table  # noqa: E402
 from jaxvib.study.accuracy.cost import WANTED  # noqa: E402

@@ -24,14 +24,14 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-from common import ROWS, cpu_name, machine_line, versions  # noqa: E402
-from envelope import run_ups  # noqa: E402
-from loads import growth_with_loads  # noqa: E402
-from many import ensemble  # noqa: E402
-from orbits import orbits  # noqa: E402
-from single import growth_with_length, single  # noqa: E402
-from slopes import designs, gradient, memory  # noqa: E402
-from table import bars, figures, markdown, whole  # noqa: E402
+from parts.common import ROWS, cpu_name, machine_line, versions  # noqa: E402
+from parts.envelope import run_ups  # noqa: E402
+from parts.loads import growth_with_loads  # noqa: E402
+from parts.many import ensemble  # noqa: E402
+from parts.orbits import orbits  # noqa: E402
+from parts.single import growth_with_length, single  # noqa: E402
+from parts.slopes import designs, gradient, memory  # noqa: E402
+from parts.table import bars, figures, markdown, whole  # noqa: E402
 
 GROUPS = dict(
     single=single,

@@ -116,7 +116,8 @@ def integrate(
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wrap_angles(scene, state.displacement.dtype)
-    motion = PackedSystem(vector_field(scene), state, wrapped=single and solver is None, together=together)
+    field = vector_field(scene)
+    motion = PackedSystem(field, state, wrapped=single and solver is None, together=together)
     if solver is None:
         solver = motion.method()
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
@@ -144,7 +145,7 @@ def integrate(
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
     whole = trajectory(scene, solution.ts[1], motion.unpack(solution.ys[1])) if samples else None
-    seen = (measure(scene, motion.rates, times, states), window, whole)
+    seen = (measure(scene, field, times, states), window, whole)
     measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     steps = solution.stats["num_steps"]
     unknown = jnp.full_like(end, jnp.nan)

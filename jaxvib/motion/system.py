@@ -16,7 +16,7 @@ from jax.extend import core
 from jaxvib.equations.dynamics import Dynamics, State
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
+from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 
 __all__ = ["PackedSystem"]
 
@@ -53,11 +53,11 @@ class PackedSystem(eqx.Module):
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
         self.args, self.program = field, None
-        if self.size <= MOST_NUMBERS:
-            self.program = program_on_numbers(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
+        if self.size <= MAX_SCALARS:
+            self.program = scalarized_program(lambda t, y, f: f(t, y), jnp.zeros((), leaves[0].dtype), state, field)
         if self.is_scalarized:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
-            self.args = numbers_of(field)
+            self.args = scalars_of(field)
 
     @property
     def is_scalarized(self) -> bool:
@@ -69,11 +69,6 @@ class PackedSystem(eqx.Module):
         """The equations of motion on what the integrator holds."""
         return diffrax.ODETerm(self._rates)
 
-    def rates(self, t: Array, state: State) -> State:
-        """The equations of motion on a state, by what the integrator holds: under `vmap` many times faster than the field."""
-        y = tuple(numbers_of(state)) if self.is_scalarized else state
-        return self._state(self._plain_rates(t, y, self.args))
-
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
         wrap = self._wrap if self.wrapped else None
@@ -81,7 +76,7 @@ class PackedSystem(eqx.Module):
 
     def pack(self, state: State) -> Any:
         """A state (or a tree like it) as the integrator holds it."""
-        y = tuple(numbers_of(state)) if self.is_scalarized else state
+        y = tuple(scalars_of(state)) if self.is_scalarized else state
         return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
     def unpack(self, held: Any) -> State:

@@ -1,4 +1,4 @@
-"""Many directions of a derivative, or many runs, at once, laid out as vector instructions want them."""
+"""Many tangents of a derivative, or many runs, at once, with their axis last: as vector instructions want them."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from jax import Array
 __all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
 
 VECTOR = 8
-"""Directions are filled up to a multiple of this: what a processor works on at a time."""
+"""The number of tangents is padded to a multiple of this: how many numbers a processor works on at a time."""
 
 Tangents = Any
-"""A tree like that of values, its arrays with a last axis over directions; None where a slope is 0 in all of them."""
+"""A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
 
 
-def multi_tangent_jvp(function: Callable[[Any], Any], beside: Callable[[Any, Tangents], Any]) -> Callable[[Any], Any]:
-    """`function` with forward derivatives by `beside`, and no reverse ones.
+def multi_tangent_jvp(function: Callable[[Any], Any], jvp: Callable[[Any, Tangents], Any]) -> Callable[[Any], Any]:
+    """`function` with forward derivatives by `jvp`, and no reverse ones.
 
-    Under `jacfwd` JAX maps the derivative in one direction over all of them, and puts the axis of the directions before all
-    others. Here `beside` is called once for all directions instead, which lie along a last axis: every number of the program
-    becomes a vector of directions, contiguous in memory.
+    Under `jacfwd` JAX maps the derivative along one tangent over all of them, and puts the axis of the tangents before all
+    others. Here `jvp` is called once for all tangents instead, which lie along a last axis: every number of the program
+    becomes a vector over the tangents, contiguous in memory.
 
-    **Arguments**: `beside(x, slopes)`: `function(x)` and its slopes, `slopes` and the slopes as `Tangents`.
+    **Arguments**: `jvp(x, tangents)`: `function(x)` and its tangents; both tangents are `Tangents`.
 
     >>> import jax, jax.numpy as jnp
     >>> square = multi_tangent_jvp(lambda x: x**2, lambda x, slope: (x**2, 2.0 * x[:, None] * slope))
@@ -41,29 +41,27 @@ def multi_tangent_jvp(function: Callable[[Any], Any], beside: Callable[[Any, Tan
     @call.def_jvp
     def _(primals: Any, tangents: Any) -> Any:
         leaves, rest = jax.tree.flatten(primals[0])
-        slopes = flat_tangents(tangents[0], primals[0])
+        moves = flat_tangents(tangents[0], primals[0])
         arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
-        places = [k for k, slope in enumerate(slopes) if slope is not None]
+        places = [k for k, move in enumerate(moves) if move is not None]
 
-        def on_arrays(arrays: Any, slopes: Any) -> Any:
+        def on_arrays(arrays: Any, moves: Any) -> Any:
             inputs = [leaf if array is None else array for array, leaf in zip(arrays, leaves, strict=True)]
-            given = dict(zip(places, slopes, strict=True))
-            return beside(
-                jax.tree.unflatten(rest, inputs), jax.tree.unflatten(rest, [given.get(k) for k in range(len(leaves))])
-            )
+            given = dict(zip(places, moves, strict=True))
+            return jvp(jax.tree.unflatten(rest, inputs), jax.tree.unflatten(rest, [given.get(k) for k in range(len(leaves))]))
 
-        return _along_last(on_arrays)(arrays, [slopes[k] for k in places])
+        return _tangents_last(on_arrays)(arrays, [moves[k] for k in places])
 
     return call
 
 
-def batch_last(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
-    """`function`, mapped over a batch by `beside`; with derivatives of every kind, in which it is mapped as JAX does it.
+def batch_last(function: Callable[[Any], Any], batched: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+    """`function`, under `vmap` computed by `batched`; with derivatives of every kind, which are mapped as JAX does it.
 
-    JAX puts the batch before all other axes of what a loop carries. `beside` may keep it as the last one, where every number of
-    the program is a vector over the batch, contiguous in memory.
+    JAX puts the batch before all other axes of what a loop carries. `batched` may keep it as the last one, where every number
+    of the program is a vector over the batch, contiguous in memory.
 
-    **Arguments**: `beside(x, mapped)`: `function(x)` of the whole batch, which lies along a last axis of those arrays of x
+    **Arguments**: `batched(x, mapped)`: `function(x)` of the whole batch, which lies along a last axis of those arrays of x
     that are True in the tree `mapped`, and of all arrays of the result.
 
     >>> import jax, jax.numpy as jnp
@@ -77,17 +75,17 @@ def batch_last(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]
         leaves, rest = jax.tree.flatten(x)
         places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
 
-        def whole(arrays: Any) -> Any:
+        def unflatten(arrays: Any) -> Any:
             given = dict(zip(places, arrays, strict=True))
             return jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
 
-        mapped = jax.custom_batching.custom_vmap(lambda *arrays: function(whole(arrays)))
+        mapped = jax.custom_batching.custom_vmap(lambda *arrays: function(unflatten(arrays)))
 
         @mapped.def_vmap
         def _(size: int, is_mapped: Any, *arrays: Array) -> Any:
             last = [jnp.moveaxis(a, 0, -1) if along else a for a, along in zip(arrays, is_mapped, strict=True)]
             known = dict(zip(places, is_mapped, strict=True))
-            out = beside(whole(last), jax.tree.unflatten(rest, [known.get(k, False) for k in range(len(leaves))]))
+            out = batched(unflatten(last), jax.tree.unflatten(rest, [known.get(k, False) for k in range(len(leaves))]))
             return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), out), jax.tree.map(lambda _: True, out)
 
         return mapped(*(leaves[k] for k in places))
@@ -99,34 +97,34 @@ def batch_last(function: Callable[[Any], Any], beside: Callable[[Any, Any], Any]
     return call
 
 
-def flat_tangents(slopes: Tangents, like: Any) -> list[Array | None]:
+def flat_tangents(tangents: Tangents, like: Any) -> list[Array | None]:
     """Tangents of the leaves of `like`, in order."""
-    return jax.tree.structure(like).flatten_up_to(slopes)  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.tree.structure(like).flatten_up_to(tangents)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _along_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """f(x, slopes) for one direction, of a function for directions along a last axis: called once where f is mapped."""
+def _tangents_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """f(x, tangents) for one direction, of a function for directions along a last axis: called once where f is mapped."""
 
-    def single(x: Any, slopes: Any) -> Any:
-        y, out = function(x, jax.tree.map(lambda s: s[..., None], slopes))
-        return y, jax.tree.map(lambda s: s[..., 0], out)
+    def single(x: Any, tangents: Any) -> Any:
+        y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))
+        return y, jax.tree.map(lambda dy: dy[..., 0], out)
 
     mapped = jax.custom_batching.custom_vmap(single)
 
     @mapped.def_vmap
-    def _(size: int, is_mapped: Any, x: Any, slopes: Any) -> Any:
+    def _(size: int, is_mapped: Any, x: Any, tangents: Any) -> Any:
         if any(jax.tree.leaves(is_mapped[0])):
             axes = jax.tree.map(lambda which: 0 if which else None, is_mapped)
-            out = jax.vmap(single, in_axes=tuple(axes))(x, slopes)
+            out = jax.vmap(single, in_axes=tuple(axes))(x, tangents)
             return out, jax.tree.map(lambda _: True, out)
-        filled = -(-size // VECTOR) * VECTOR
+        padded = -(-size // VECTOR) * VECTOR
 
-        def last(slope: Array, along: bool) -> Array:
-            all_of_them = jnp.moveaxis(slope, 0, -1) if along else jnp.repeat(slope[..., None], size, axis=-1)
-            return jnp.pad(all_of_them, [(0, 0)] * (all_of_them.ndim - 1) + [(0, filled - size)])
+        def last(tangent: Array, is_mapped: bool) -> Array:
+            every = jnp.moveaxis(tangent, 0, -1) if is_mapped else jnp.repeat(tangent[..., None], size, axis=-1)
+            return jnp.pad(every, [(0, 0)] * (every.ndim - 1) + [(0, padded - size)])
 
-        y, out = function(x, jax.tree.map(last, slopes, is_mapped[1]))
-        out = jax.tree.map(lambda slope: jnp.moveaxis(slope[..., :size], -1, 0), out)
+        y, out = function(x, jax.tree.map(last, tangents, is_mapped[1]))
+        out = jax.tree.map(lambda tangent: jnp.moveaxis(tangent[..., :size], -1, 0), out)
         return (y, out), (jax.tree.map(lambda _: False, y), jax.tree.map(lambda _: True, out))
 
     return mapped

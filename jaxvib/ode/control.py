@@ -1,4 +1,4 @@
-"""Step-size control."""
+"""Step-size controllers for diffrax."""
 
 from __future__ import annotations
 
@@ -10,29 +10,41 @@ import jax
 import jax.numpy as jnp
 import optimistix
 from jax import Array
+from jaxtyping import PyTree
 
 __all__ = ["PIController", "WrappedController"]
 
 
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
-    """Chooses steps whose error, in each part of the state's own unit, stays below a tolerance.
+    """A PI controller for a method of order 8 that keeps the error of each step below a tolerance.
 
-        e = max |error| / (tolerance (unit + relative |y|)),    next step = 0.9 e_before^(1/16) / e^(3/32) times this one
+        e = max |error| / (tolerance (unit + relative |y|)),    h_next = 0.9 e_before^(1/16) / e^(3/32) h
 
-    a PI controller for a method of order 8, its powers made of square roots. A step with e > 1 is taken again.
-    An angle grows without end; an error relative to it would let a long run lose its phase: `relative` is 0 there.
-    A step whose error is not a number is taken again too, a fifth as long; where no shorter one moves time on, the run ends.
+    over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = 0.9 / e^(1/8) h. The exponents
+    are products of square roots, which cost less than a power. h_next / h lies between 0.2 and 5. A step whose error is not a
+    number is rejected with e = infinity; where no shorter step advances the time in its dtype, the run ends with
+    `diffrax.RESULTS.dt_min_reached`.
 
-    **Attributes**: `tolerance` scalar; `unit`, `relative` trees like the integrator's state.
+    **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state, of what counts as 1 in each
+    of its numbers (in its unit) and of which share of |y| is added to it. `relative` is 0 for angles: they grow without end,
+    and an error relative to them would let a long run lose its phase.
+
+    >>> import diffrax, jax, jax.numpy as jnp
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> control = PIController(jnp.asarray(1e-9), jnp.asarray(1.0), jnp.asarray(1.0))
+    >>> end = diffrax.diffeqsolve(diffrax.ODETerm(lambda t, y, args: -y), diffrax.Dopri8(), 0.0, 1.0, 0.1, jnp.asarray(1.0),
+    ...                           stepsize_controller=control).ys[0]
+    >>> bool(abs(end - jnp.exp(-1.0)) < 1e-9)
+    True
     """
 
     tolerance: Array
-    unit: Any
-    relative: Any
+    unit: PyTree[Array]
+    relative: PyTree[Array]
 
     @property
     def rtol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What an implicit method solves its equations to."""
+        """The tolerance to which an implicit method solves its equations."""
         return self.tolerance
 
     @property
@@ -56,7 +68,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     def adapt_step_size(
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
     ) -> Any:
-        """Whether the step is kept, and where the next one ends."""
+        """Whether the step is accepted, where the next one begins and ends, and the controller's new state."""
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
             size = self.tolerance * (unit + relative * jnp.maximum(jnp.abs(a), jnp.abs(b)))
@@ -68,30 +80,30 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
             e = jnp.maximum(e, other)
         e = jax.lax.stop_gradient(jnp.clip(jnp.where(jnp.isnan(e), jnp.inf, e), 1e-8, 1e8))
         root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
-        keep = e <= 1.0
+        accept = e <= 1.0
         cube = root * root * root
-        factor = 0.9 * jnp.where(keep, controller_state * controller_state, 1.0 / root) / cube
-        factor = jnp.clip(factor, 0.2, jnp.where(keep, 5.0, 0.9))
-        start = jnp.where(keep, t1, t0)
+        factor = 0.9 * jnp.where(accept, controller_state * controller_state, 1.0 / root) / cube
+        factor = jnp.clip(factor, 0.2, jnp.where(accept, 5.0, 0.9))
+        start = jnp.where(accept, t1, t0)
         end = start + factor * (t1 - t0)
-        before = jnp.where(keep, root, controller_state)
-        return keep, start, end, False, before, moved_on(keep, start, t1, end)
+        before = jnp.where(accept, root, controller_state)
+        return accept, start, end, False, before, moved_on(accept, start, t1, end)
 
 
-def moved_on(keep: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
-    """Whether the run can go on: a step from `start` to `before` that was refused is followed by a shorter one to `end`."""
+def moved_on(accept: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
+    """Whether the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
     shorter = (end > start) & (end < before)
-    return diffrax.RESULTS.where(keep | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
+    return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 
 
 class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
-    """A controller around another one, whose tolerances it has for implicit methods."""
+    """A controller that acts through another one, its `controller`, and hands on that one's tolerances to implicit methods."""
 
     controller: eqx.AbstractVar[Any]
 
     @property
     def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What an implicit method solves its equations to; a controller without one has no implicit method to serve."""
+        """The tolerance of an implicit method; 0 where the inner controller, such as one of constant steps, has none."""
         return getattr(self.controller, "rtol", 0.0)
 
     @property

@@ -1,4 +1,4 @@
-"""The engine: Dormand and Prince's step of order 8, written out."""
+"""Dormand and Prince's step of order 8, its stages unrolled, and what its forms share."""
 
 from __future__ import annotations
 
@@ -26,9 +26,27 @@ __all__ = [
 ]
 
 _TABLEAU = diffrax.Dopri8.tableau
-_COEFFICIENTS = np.asarray(diffrax.Dopri8.interpolation_cls.eval_coeffs)  # pyright: ignore[reportFunctionMemberAccess]
-_LATE = int(np.flatnonzero(np.any(_COEFFICIENTS, axis=1))[1])
-_POLYNOMIALS = np.concatenate([_COEFFICIENTS[:1], _COEFFICIENTS[_LATE:]])
+_LATE = 5
+"""The first stage after the first one of which states within a step are made."""
+
+_POLYNOMIALS = np.array(
+    [
+        [-6.34483493928604, 22.139650499809406, -30.061056828966645, 19.999006933368396, -6.6910181737837595, 1.0],
+        [-39.61079198522025, 116.44221495503422, -121.49996277313346, 52.227353279294555, -7.6142658045872675, 0.0],
+        [20.376121380879145, -67.14513188259572, 83.17210046398478, -46.89191641810936, 10.728139263042886, 0.0],
+        [7.334709882679536, -16.56722435274965, 9.572450755599366, -0.18908932250105956, 0.5526637063753649, 0.0],
+        [32.88017743524592, -89.9916014847245, 87.84060576772056, -35.70759759462221, 4.218656262566515, 0.0],
+        [-10.158899052642676, 22.623748964853284, -17.415210777076297, 6.273644808324035, -0.6627209125361597, 0.0],
+        [-12.540126809878256, 32.23623401673554, -28.590328951479098, 10.316088127245076, -1.2636789001135462, 0.0],
+        [29.555300148451604, -82.10203154883598, 81.66309505843414, -34.76507698666118, 5.410603789859042, 0.0],
+        [-41.79234864243906, 116.26621857911195, -114.93752913770093, 47.745797107822554, -7.032137906794574, 0.0],
+        [20.300692582210083, -53.90207774663854, 50.255836422617605, -19.008209934160803, 2.3537586759714983, 0.0],
+    ]
+)
+"""Of each stage that states within a step are made of, the polynomial in the share of the step, highest power first.
+
+Source: P. Kidger's diffrax 0.7 (Apache 2.0), `diffrax/_solver/dopri8.py`, without the stages whose polynomials are 0.
+"""
 
 NODES = np.asarray(_TABLEAU.c)
 """At which share of the step each stage but the first is."""
@@ -90,9 +108,9 @@ class Dopri8Interpolation(diffrax.AbstractLocalInterpolation):
         weights = jnp.zeros(len(_POLYNOMIALS), share.dtype)
         for column in _POLYNOMIALS.T:
             weights = weights * share + jnp.asarray(column, share.dtype)
-        return self.moved(share * span * weights)
+        return self.from_weights(share * span * weights)
 
-    def moved(self, weights: Array) -> Any:
+    def from_weights(self, weights: Array) -> Any:
         """y0 + sum_j weights_j k_j."""
         return jax.tree.map(lambda y, change: y + change, self.y0, unravel(linear_combination(weights, self.stages), self.y0))
 

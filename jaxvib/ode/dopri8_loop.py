@@ -1,4 +1,4 @@
-"""Dormand and Prince's step of order 8 as a loop over its stages, with forward derivatives beside it."""
+"""Dormand and Prince's step of order 8 as a loop over its stages, with forward derivatives along many tangents at once."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ __all__ = ["LoopDopri8"]
 class LoopDopri8(AbstractDopri8):
     """The same method as `UnrolledDopri8` with a loop over its stages, which compiles in a fraction of the time.
 
-    **Arguments**: `slopes` whether forward derivatives are taken (and reverse ones never): those of a step are then computed
-    beside it in all directions at once, eight of them for not much more than one costs; `wrap` as in `UnrolledDopri8`.
+    **Arguments**: `tangents` whether forward derivatives are taken (and reverse ones never): those of a step are then computed
+    along all tangents at once, eight of them for not much more than one costs; `wrap` as in `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
     >>> def end(rate):
     ...     term = diffrax.ODETerm(lambda t, y, rate: -rate * y)
-    ...     return diffrax.diffeqsolve(term, LoopDopri8(slopes=True), 0.0, 2.0, 0.1, jnp.asarray(1.0), rate,
+    ...     return diffrax.diffeqsolve(term, LoopDopri8(tangents=True), 0.0, 2.0, 0.1, jnp.asarray(1.0), rate,
     ...                                adjoint=diffrax.ForwardMode()).ys[0]
     >>> bool(abs(jax.jacfwd(end)(0.5) + 2.0 * jnp.exp(-1.0)) < 1e-12)
     True
@@ -48,19 +48,19 @@ class LoopDopri8(AbstractDopri8):
     Source: as `UnrolledDopri8`.
     """
 
-    slopes: bool = eqx.field(static=True, default=False)
+    tangents: bool = eqx.field(static=True, default=False)
 
     @property
     def interpolation_cls(self) -> Callable[..., Any]:  # pyright: ignore
-        """What finds states within a step."""
-        return _WITH_TANGENTS if self.slopes else _WITHOUT_TANGENTS
+        """The interpolation that finds states within a step."""
+        return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
     def step(
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
         """As `UnrolledDopri8.step`."""
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.slopes else _advanced
+        advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.tangents else _advanced
         end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
         end = end if self.wrap is None else self.wrap(end)
         return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
@@ -70,10 +70,10 @@ def _linear_combination(inputs: tuple[Array, Array]) -> Array:
     return linear_combination(*inputs)
 
 
-def _linear_combination_jvp(inputs: tuple[Array, Array], slopes: Any) -> tuple[Array, Array]:
-    (weights, stages), (moved, bent) = inputs, slopes
-    parts = [] if moved is None else [linear_combination(moved.T, stages).T]
-    parts += [] if bent is None else [linear_combination(weights, bent)]
+def _linear_combination_jvp(inputs: tuple[Array, Array], tangents: Any) -> tuple[Array, Array]:
+    (weights, stages), (dweights, dstages) = inputs, tangents
+    parts = [] if dweights is None else [linear_combination(dweights.T, stages).T]
+    parts += [] if dstages is None else [linear_combination(weights, dstages)]
     return linear_combination(weights, stages), sum(parts[1:], parts[0])
 
 
@@ -85,18 +85,16 @@ def _linear_combination_batched(inputs: tuple[Array, Array], mapped: tuple[bool,
 class _BatchedInterpolation(Dopri8Interpolation):
     """As `Dopri8Interpolation`, with derivatives and batches of its own kind."""
 
-    mix: Callable[[tuple[Array, Any]], Array] = eqx.field(static=True)
+    combine: Callable[[tuple[Array, Any]], Array] = eqx.field(static=True)
 
-    def moved(self, weights: Array) -> Any:
-        """As `Dopri8Interpolation.moved`."""
-        return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.mix((weights, self.stages)), self.y0))
+    def from_weights(self, weights: Array) -> Any:
+        """As `Dopri8Interpolation.from_weights`."""
+        return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.combine((weights, self.stages)), self.y0))
 
 
-_WITHOUT_TANGENTS = functools.partial(_BatchedInterpolation, mix=batch_last(_linear_combination, _linear_combination_batched))
-_WITH_TANGENTS = functools.partial(
-    _BatchedInterpolation,
-    mix=multi_tangent_jvp(batch_last(_linear_combination, _linear_combination_batched), _linear_combination_jvp),
-)
+_combination = batch_last(_linear_combination, _linear_combination_batched)
+_WITHOUT_TANGENTS = functools.partial(_BatchedInterpolation, combine=_combination)
+_WITH_TANGENTS = functools.partial(_BatchedInterpolation, combine=multi_tangent_jvp(_combination, _linear_combination_jvp))
 
 
 def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
@@ -141,10 +139,10 @@ def _advance_batched(inputs: Any, mapped: Any) -> Any:
 _advanced = batch_last(_advance, _advance_batched)
 
 
-def _advance_jvp(inputs: Any, slopes: Any) -> tuple[Any, Any]:
-    """`_advance` and the slopes of all that."""
+def _advance_jvp(inputs: Any, tangents: Any) -> tuple[Any, Any]:
+    """`_advance` and the tangents of all that."""
     t0, dt, y0, first, args, terms = inputs
-    dt0, ddt, dy0, dfirst, *others = slopes
+    dt0, ddt, dy0, dfirst, *others = tangents
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
     moves = flat_tangents((dt0, ddt, *others), (t0, dt, args, terms))
     places = [k for k, move in enumerate(moves) if move is not None]
@@ -158,20 +156,20 @@ def _advance_jvp(inputs: Any, slopes: Any) -> tuple[Any, Any]:
         here = unravel(pair[0], y0), [leaves[k] for k in places]
         along = unravel(pair[1], y0), [moves[k] for k in places]
 
-        def slope(direction: Any) -> Any:
+        def tangent(direction: Any) -> Any:
             return jax.jvp(lambda y, moving: field(share, y, moving), here, direction)[1]
 
-        beside = jax.vmap(slope, in_axes=-1, out_axes=-1)(along)
-        return ravel(field(share, *here)), ravel(beside, 1)
+        tangents = jax.vmap(tangent, in_axes=-1, out_axes=-1)(along)
+        return ravel(field(share, *here)), ravel(tangents, 1)
 
     def over_step(pair: tuple[Array, Array]) -> tuple[Array, Array]:
         total, change = pair
         return dt * total, dt * change if ddt is None else dt * change + total[:, None] * ddt[None, :]
 
-    def whole(slopes: Any) -> Array:
+    def whole(tangents: Any) -> Array:
         size = jax.tree.leaves((dt0, ddt, dy0, dfirst, others))[0].shape[-1]
-        pairs = zip(flat_tangents(slopes, y0), jax.tree.leaves(y0), strict=True)
-        return ravel([jnp.zeros((*leaf.shape, size), leaf.dtype) if slope is None else slope for slope, leaf in pairs], 1)
+        pairs = zip(flat_tangents(tangents, y0), jax.tree.leaves(y0), strict=True)
+        return ravel([jnp.zeros((*leaf.shape, size), leaf.dtype) if dx is None else dx for dx, leaf in pairs], 1)
 
     starts = (ravel(y0), whole(dy0)), (ravel(first), whole(dfirst))
     (end, dend), (stages, dstages), (error, derror) = _stages(*starts, rates, over_step, dt)

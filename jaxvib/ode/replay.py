@@ -1,4 +1,4 @@
-"""Reverse derivatives of runs whose steps are chosen on the way."""
+"""The step-replay adjoint: reverse derivatives of runs with adaptive steps."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ def solve(
 ) -> diffrax.Solution:
     """`diffrax.diffeqsolve` from time 0 to `end`, which fails by its result alone.
 
-    Reverse derivatives go back over checkpoints, from which the run is computed once more. An adaptive controller that
-    computes its steps once more as well finds them a rounding apart, and the next ones further: after some hundred turns they
-    are other steps, whose derivatives no longer fit each other (off by up to 1e-3). So the steps are noted in a first run,
-    and it is those that are differentiated. A run of which no derivative is taken is done once, and notes nothing.
+    Its reverse derivatives are a step-replay adjoint. They go back over checkpoints, from which the run is computed once more;
+    an adaptive controller that chose its steps once more as well would find them a rounding apart, and the next ones further:
+    after some hundred turns they are other steps, whose derivatives do not belong together (off by up to 1e-3). So the end of
+    each step is recorded in a first run, and those steps are differentiated. A run of which no derivative is taken is done
+    once, and records nothing.
 
     **Arguments**: `adjoint` diffrax's, for another way: `diffrax.ForwardMode()` for forward derivatives. No function among the
     arguments may hold on to traced arrays; `args` is for them. The others are as in diffrax.
@@ -46,7 +47,7 @@ def solve(
     if adjoint is not None:
         return _solve(inputs, controller, adjoint, *rest)
     numbers, others = eqx.partition(controller, eqx.is_array)
-    return _once(inputs, eqx.combine(jax.lax.stop_gradient(numbers), others), *rest)
+    return _with_replay(inputs, eqx.combine(jax.lax.stop_gradient(numbers), others), *rest)
 
 
 def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: int, progress: Any) -> diffrax.Solution:
@@ -69,39 +70,39 @@ def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: i
 
 
 @eqx.filter_custom_vjp
-def _once(inputs: Any, controller: Any, *rest: Any) -> diffrax.Solution:
+def _with_replay(inputs: Any, controller: Any, *rest: Any) -> diffrax.Solution:
     return _solve(inputs, controller, diffrax.ForwardMode(), *rest)
 
 
-@_once.def_fwd
-def _recorded(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[diffrax.Solution, Array | None]:
+@_with_replay.def_fwd
+def _forward(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[diffrax.Solution, Array | None]:
     """The run, and the times at which its steps end."""
     if isinstance(controller, (diffrax.ConstantStepSize, diffrax.StepTo)):
         return _solve(inputs, controller, diffrax.ForwardMode(), *rest), None
     *others, saveat, term = inputs
     steps = diffrax.SubSaveAt(steps=True, fn=_nothing)
-    noting = (*others, diffrax.SaveAt(subs=[saveat.subs, steps]), term)
-    solution = _solve(noting, controller, diffrax.ForwardMode(), *rest)
+    recording = (*others, diffrax.SaveAt(subs=[saveat.subs, steps]), term)
+    solution = _solve(recording, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
     times = solution.ts[1]
     return eqx.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], solution.ys[0])), times
 
 
-@_once.def_bwd
-def _backwards(times: Array | None, slopes: Any, perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> Any:
-    wanted, fixed = eqx.partition(inputs, perturbed)
+@_with_replay.def_bwd
+def _backward(times: Array | None, cotangents: Any, perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> Any:
+    differentiable, fixed = eqx.partition(inputs, perturbed)
 
-    def again(wanted: Any) -> Any:
-        way = controller if times is None else _along(controller, times)
+    def replayed(differentiable: Any) -> Any:
+        steps = controller if times is None else _recorded_steps(controller, times)
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(inputs[2], rest[1]))
-        solution = _solve(eqx.combine(wanted, fixed), way, adjoint, *rest)
+        solution = _solve(eqx.combine(differentiable, fixed), steps, adjoint, *rest)
         return eqx.filter(solution, eqx.is_inexact_array)
 
-    solution, transposed = jax.vjp(again, wanted)
-    # A slope of zero comes as None.
+    solution, transposed = jax.vjp(replayed, differentiable)
+    # A cotangent of zero comes as None.
     leaves, rest = jax.tree.leaves(solution), jax.tree.structure(solution)
-    given = rest.flatten_up_to(slopes)  # pyright: ignore[reportAttributeAccessIssue]
-    whole = [jnp.zeros_like(leaf) if slope is None else slope for leaf, slope in zip(leaves, given, strict=True)]
+    given = rest.flatten_up_to(cotangents)  # pyright: ignore[reportAttributeAccessIssue]
+    whole = [jnp.zeros_like(leaf) if dy is None else dy for leaf, dy in zip(leaves, given, strict=True)]
     return transposed(jax.tree.unflatten(rest, whole))[0]
 
 
@@ -116,20 +117,20 @@ def _nothing(t: Any, y: Any, args: Any) -> None:
     return None
 
 
-def _along(controller: Any, times: Array) -> Any:
-    """The controller that takes the noted steps; where it jumps over jump_ts of the field, it still does."""
+def _recorded_steps(controller: Any, times: Array) -> Any:
+    """The controller that takes the recorded steps; one that steps onto `jump_ts` of the field still does."""
     if isinstance(controller, diffrax.ClipStepSizeController):
-        return eqx.tree_at(lambda c: c.controller, controller, _along(controller.controller, times))
-    return _RecordedSteps(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
+        return eqx.tree_at(lambda c: c.controller, controller, _recorded_steps(controller.controller, times))
+    return RecordedSteps(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
 
 
-class _RecordedSteps(WrappedController):
-    """Takes the steps that end at `times`."""
+class RecordedSteps(WrappedController):
+    """Takes the steps that end at `times` (max_steps,), in order."""
 
     controller: Any
     times: Array
 
-    def wrap(self, direction: Any) -> _RecordedSteps:
+    def wrap(self, direction: Any) -> RecordedSteps:
         return self
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:

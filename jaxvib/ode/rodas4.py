@@ -1,4 +1,4 @@
-"""A stiff solver without iterations, for small systems whose Jacobian is cheap."""
+"""A Rosenbrock method for small stiff systems whose Jacobian is cheap: no iterations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _C = np.array(
     ]
 )
 _NODES = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
-_SLOPES = np.array([0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0])
+_TIME_WEIGHTS = np.array([0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0])
 _GAMMA = 0.25
 _DENSE = (
     (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
@@ -48,21 +48,26 @@ _DENSE = (
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """The method's own continuous answer, of order 3: a cubic through both ends, without derivatives that stiffness spoils."""
+    """The method's own continuous extension of order 3, a cubic in the share s of the step, `coefficients` c (2, n):
+
+        y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
+
+    It uses no rates at the ends of a step, which stiffness makes useless.
+    """
 
     t0: Any
     t1: Any
     y0: Array
     y1: Array
-    bend: Array
-    twist: Array
+    coefficients: Array
 
     def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Array:
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
         span = self.t1 - self.t0
         s = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
-        return (1.0 - s) * self.y0 + s * (self.y1 + (1.0 - s) * (self.bend + s * self.twist))
+        inner = self.coefficients[0] + s * self.coefficients[1]
+        return (1.0 - s) * self.y0 + s * (self.y1 + (1.0 - s) * inner)
 
 
 class Rodas4(diffrax.AbstractAdaptiveSolver):
@@ -100,32 +105,35 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         h = t1 - t0
         # A padded step has no length; its inverse must not be a division by 0.
         per_step = 1.0 / jnp.where(h == 0.0, 1.0, h)
-        jacobian, change = _slopes(terms, t0, y0, args)
+        jacobian, time_derivative = _jacobian(terms, t0, y0, args)
         inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
 
-        def mixed(weights: Any, stages: Array) -> Array:
+        def combine(weights: Any, stages: Array) -> Array:
             return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))
 
         def stage(i: Array, stages: Array) -> Array:
-            a, c, node, slope = (jnp.asarray(table, y0.dtype)[i] for table in (_A, _C, _NODES, _SLOPES))
-            right = terms.vf(t0 + node * h, y0 + mixed(a, stages), args) + slope * h * change + per_step * mixed(c, stages)
+            a, c, node, weight = (jnp.asarray(table, y0.dtype)[i] for table in (_A, _C, _NODES, _TIME_WEIGHTS))
+            right = (
+                terms.vf(t0 + node * h, y0 + combine(a, stages), args)
+                + weight * h * time_derivative
+                + per_step * combine(c, stages)
+            )
             return lax.dynamic_update_index_in_dim(stages, jnp.sum(inverse * right[None, :], axis=1), i, 0)
 
         stages = lax.fori_loop(0, len(_A), stage, jnp.zeros((len(_A), *y0.shape), y0.dtype))
-        y1 = y0 + mixed(_A[-1].tolist(), stages) + stages[-1]
-        bend, twist = (mixed(row, stages) for row in _DENSE)
-        dense = dict(y0=y0, y1=y1, bend=bend, twist=twist)
+        y1 = y0 + combine(_A[-1].tolist(), stages) + stages[-1]
+        dense = dict(y0=y0, y1=y1, coefficients=jnp.stack([combine(row, stages) for row in _DENSE]))
         return y1, stages[-1], dense, None, diffrax.RESULTS.successful
 
 
-def _slopes(terms: Any, t: Array, y: Array, args: Any) -> tuple[Array, Array]:
-    """df/dy (n, n) and df/dt (n,): derivatives of numbers in directions along a last axis, filled up to whole vectors."""
+def _jacobian(terms: Any, t: Array, y: Array, args: Any) -> tuple[Array, Array]:
+    """df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis, padded to whole vectors."""
     n = y.shape[0]
     directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)
 
-    def slope(*direction: Array) -> Array:
+    def tangent(*direction: Array) -> Array:
         numbers = (t, *(y[i] for i in range(n)))
         return jax.jvp(lambda t, *y: terms.vf(t, jnp.stack(y), args), numbers, direction)[1]
 
-    found = jax.vmap(slope, in_axes=-1, out_axes=-1)(*directions)
+    found = jax.vmap(tangent, in_axes=-1, out_axes=-1)(*directions)
     return found[:, 1 : n + 1], found[:, 0]

@@ -7,8 +7,8 @@ over the batch: what a compiler turns into vector instructions best. The equatio
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -17,368 +17,224 @@ import numpy as np
 from jax import Array, lax
 from jax.extend import core
 
+from jaxvib.ode.scalar_rules import NotScalarizable, Scalars, elementwise, inlined, is_known, joined, primitive_of, rules
+from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
 from jaxvib.ode.sincos import sine_and_cosine
 
-__all__ = ["MOST_NUMBERS", "Unwritten", "numbers_of", "on_numbers", "program_on_numbers"]
+__all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", "scalarized_vmap", "scalars_of"]
 
-MOST_NUMBERS, _MOST_OPERATIONS = 32, 1200
-"""With more numbers in a state, or operations on them, equations written out take too long to compile for what they save."""
+MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
+"""With more numbers in a state, or operations on them, equations on scalars take too long to compile for what they save."""
 
-Cells = np.ndarray
-"""An array of dtype object: every entry is a traced scalar, or a NumPy number that is known while tracing."""
+_BLOCK = 128
+"""So many entries of a batch go through a program on scalars together: its values, a vector each, stay in the cache."""
+
+_MAX_RECOMPUTED = 8
+"""A value used more than once that takes more operations than these is fenced: see `_fenced`."""
 
 
-class Unwritten(Exception):
-    """The program has an operation that is not written out on numbers."""
-
-
-def on_numbers(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """`function`, traced for arguments of these shapes, on numbers.
+def scalarize(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+    """`function`, traced for arguments of these shapes, on single numbers.
 
     **Returns** a function of the same arguments in which every array is an object array of scalars; so is what it returns.
-    Sines and cosines are those of `jaxvib.ode.sincos`.
+    Sines and cosines are those of `jaxvib.ode.sincos`. A product with a 0 that the program itself holds is left out.
 
-    **Raises** `Unwritten` where an operation of the program has no rule here.
+    **Raises** `NotScalarizable` where an operation of the program has no rule on scalars, here or when the function that is
+    returned is called. A function with a derivative of its own (`jax.custom_jvp`) has none: its derivative would be lost.
+
+    >>> import jax.numpy as jnp, numpy as np
+    >>> on_scalars = scalarize(lambda x: x[0] * jnp.ones(2) + x, jnp.zeros(2))
+    >>> [float(x) for x in on_scalars(np.array([3.0, 4.0], dtype=object))]
+    [6.0, 7.0]
     """
     shape = jax.eval_shape(lambda *a: a, *arguments)
     closed, out = jax.make_jaxpr(function, return_shape=True)(*shape)
-    rest = jax.tree.structure(out)
+    structure = jax.tree.structure(out)
     _require_rules(closed.jaxpr)
 
-    def run(*cells: Any) -> Any:
-        leaves = jax.tree.leaves(cells, is_leaf=lambda x: isinstance(x, np.ndarray))
-        found = _run(closed.jaxpr, closed.consts, [_cells(leaf) for leaf in leaves], {})
-        return jax.tree.unflatten(rest, [_elementwise(_joined, [value], {}) for value in found])
+    def run(*given: Any) -> Any:
+        leaves = jax.tree.leaves(given, is_leaf=lambda x: isinstance(x, np.ndarray))
+        try:
+            found = _run(closed.jaxpr, closed.consts, [_to_scalars(leaf) for leaf in leaves], {})
+            return jax.tree.unflatten(structure, [elementwise(joined)(value) for value in found])
+        except NotScalarizable:
+            raise
+        except Exception as error:  # whatever a rule did not foresee
+            raise NotScalarizable(f"a rule failed: {error!r}") from error
 
     return run
 
 
-def program_on_numbers(function: Callable[..., Any], *arguments: Any) -> core.ClosedJaxpr | None:
-    """`on_numbers`, traced once: a program that takes the numbers of all arguments and gives those of the result, in order.
+def scalarized_program(function: Callable[..., Any], *arguments: Any) -> core.ClosedJaxpr | None:
+    """`scalarize`, traced: a program that takes the numbers of all arguments and gives those of the result, in order.
 
-    **Returns** None where an operation has no rule here, or where there are too many of them.
+    **Returns** None where an operation has no rule on scalars, or where there are too many of them.
     """
-    leaves, rest = jax.tree.flatten(arguments)
-    try:
-        written = on_numbers(function, *arguments)
-    except Unwritten:
-        return None
+    leaves, structure = jax.tree.flatten(arguments)
 
-    def run(*numbers: Any) -> list[Any]:
+    def run(*numbers: Array) -> list[Array]:
         given = iter(numbers)
 
-        def arranged(leaf: Any) -> Cells:
-            cells = np.empty(leaf.shape, dtype=object)
+        def arranged(leaf: Array) -> Scalars:
+            scalars = np.empty(leaf.shape, dtype=object)
             for index in np.ndindex(*leaf.shape):
-                cells[index] = next(given)
-            return cells
+                scalars[index] = next(given)
+            return scalars
 
-        found = written(*jax.tree.unflatten(rest, [arranged(leaf) for leaf in leaves]))
-        cells = jax.tree.leaves(found, is_leaf=lambda x: isinstance(x, np.ndarray))
-        return [jnp.asarray(x, leaves[0].dtype) for array in cells for x in array.ravel()]
+        found = on_scalars(*jax.tree.unflatten(structure, [arranged(leaf) for leaf in leaves]))
+        arrays = jax.tree.leaves(found, is_leaf=lambda x: isinstance(x, np.ndarray))
+        return [jnp.asarray(x, leaves[0].dtype) for array in arrays for x in array.ravel()]
 
     shapes = [jax.ShapeDtypeStruct((), leaf.dtype) for leaf in leaves for _ in range(leaf.size)]
-    program = jax.make_jaxpr(run)(*shapes)
-    return program if len(program.jaxpr.eqns) <= _MOST_OPERATIONS else None
+    try:
+        on_scalars = scalarize(function, *arguments)
+        program = jax.make_jaxpr(run)(*shapes)
+    except NotScalarizable:
+        return None
+    return program if len(program.jaxpr.eqns) <= _MAX_OPERATIONS else None
 
 
-def numbers_of(tree: Any) -> list[Array]:
+def scalars_of(tree: Any) -> list[Array]:
     """All numbers of a tree of arrays, in order."""
     return [leaf[index] for leaf in jax.tree.leaves(tree) for index in np.ndindex(*leaf.shape)]
 
 
-def split(value: Any) -> Cells:
-    """An array as an object array of its entries."""
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return value
-    if not isinstance(value, jax.Array):
-        return _cells(value)
-    cells = np.empty(value.shape, dtype=object)
-    for index in np.ndindex(*value.shape):
-        cells[index] = value[index]
-    return cells
+def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """`jax.vmap(function, in_axes=(0, None))`, on single numbers where `function` is small enough; for values only.
+
+    The program on scalars is fenced, so that its time grows with the number of its operations whatever they are, and it goes
+    through the batch in blocks that stay in the cache. Its derivatives are right but need not be fast.
+
+    **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
+
+    >>> import jax.numpy as jnp
+    >>> scalarized_vmap(lambda x, c: c * x)(jnp.asarray([1.0, 2.0]), jnp.asarray(3.0)).tolist()
+    [3.0, 6.0]
+    """
+
+    def run(batch: Any, shared: Any) -> Any:
+        one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), batch)
+        size = sum(leaf.size for leaf in jax.tree.leaves(one))
+        shared = jax.tree.map(jnp.asarray, shared)
+        program = scalarized_program(function, one, shared) if size <= MAX_SCALARS else None
+        if program is None:
+            return jax.vmap(function, in_axes=(0, None))(batch, shared)
+        shapes, structure = jax.tree.flatten(jax.eval_shape(function, one, shared))
+        constants = scalars_of(shared)
+
+        def single(x: Any) -> Array:
+            return jnp.stack(_fenced(program, [*scalars_of(x), *constants]))
+
+        rows = lax.map(single, batch, batch_size=_BLOCK)
+        ends = np.cumsum([leaf.size for leaf in shapes])
+        parts = [
+            rows[:, end - leaf.size : end].reshape(len(rows), *leaf.shape).astype(leaf.dtype)
+            for end, leaf in zip(ends, shapes, strict=True)
+        ]
+        return jax.tree.unflatten(structure, parts)
+
+    return run
 
 
-def _cells(value: Any) -> Cells:
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return value
-    if isinstance(value, jax.Array):
-        return split(value)
-    known = np.asarray(value)
-    cells = np.empty(known.shape, dtype=object)
-    for index in np.ndindex(*known.shape):
-        cells[index] = known[index]
-    return cells
+def _fenced(program: core.ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
+    """The results of a program on scalars, none of whose values the compiler computes many times over.
+
+    XLA's fusion on a CPU computes a value anew for each use of it. Where shared parts are made of shared parts, as in a
+    derivative of equations, that grows without bounds: 4096 samples of 3000 operations took 8 s. It does not do so to the
+    result of a division; so every value that is used more than once and would take more than a few operations is divided by
+    a 1 that the compiler cannot know. The first argument must be finite.
+    """
+    first = arguments[0]
+    one = lax.stop_gradient(jnp.where(jnp.abs(first) < jnp.inf, jnp.ones_like(first), first))
+    cost: dict[int, int] = {}
+
+    def run(jaxpr: core.Jaxpr, consts: Sequence[Any], given: Sequence[Any]) -> list[Any]:
+        uses: dict[core.Var, int] = {}
+        for atom in (*(a for equation in jaxpr.eqns for a in equation.invars), *jaxpr.outvars):
+            if isinstance(atom, core.Var):
+                uses[atom] = uses.get(atom, 0) + 1
+        known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *given), strict=True))
+        read = lambda atom: atom.val if isinstance(atom, core.Literal) else known[atom]  # noqa: E731
+        for equation in jaxpr.eqns:
+            values = [read(atom) for atom in equation.invars]
+            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
+            if inner is not None:
+                results = run(inner.jaxpr, inner.consts, values)
+            else:
+                found = equation.primitive.bind(*values, **equation.params)
+                results = found if equation.primitive.multiple_results else [found]
+                spent = 1 + sum(cost.get(id(value), 0) for value in {id(v): v for v in values}.values())
+                cost.update((id(result), spent) for result in results)
+            for k, atom in enumerate(equation.outvars):
+                spent = cost.get(id(results[k]), 0)
+                if uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and jnp.issubdtype(results[k].dtype, jnp.floating):
+                    results[k] = results[k] / one
+            kept.extend(results)  # a cost belongs to an id only as long as its value lives
+            known.update(zip(equation.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    kept: list[Any] = []
+    return run(program.jaxpr, program.consts, arguments)
 
 
-def _known(x: Any) -> bool:
-    return isinstance(x, (np.generic, int, float, bool))
-
-
-class _Pair:
-    """A complex number by its parts, of which one is often known to be 0; XLA multiplies that out."""
-
-    __slots__ = ("imag", "real")
-
-    def __init__(self, real: Any, imag: Any):
-        self.real, self.imag = real, imag
-
-
-def _is_complex(x: Any) -> bool:
-    return isinstance(x, _Pair) or jnp.iscomplexobj(x)
-
-
-def _parts(x: Any) -> tuple[Any, Any]:
-    if isinstance(x, _Pair) or _known(x):
-        return x.real, x.imag
-    return (lax.real(x), lax.imag(x)) if _is_complex(x) else (x, np.zeros((), x.dtype)[()])
-
-
-def _joined(x: Any) -> Any:
-    return lax.complex(*(jnp.asarray(part) for part in _parts(x))) if isinstance(x, _Pair) else x
-
-
-def _by_parts(rule: Callable[..., Any]) -> Callable[..., Any]:
-    """A rule for real numbers, applied to the real and to the imaginary parts."""
-
-    def apply(*x: Any, **params: Any) -> Any:
-        if not any(_is_complex(v) for v in x):
-            return rule(*x, **params)
-        real, imag = zip(*(_parts(v) for v in x), strict=True)
-        return _Pair(rule(*real, **params), rule(*imag, **params))
-
-    return apply
-
-
-@_by_parts
-def _add(x: Any, y: Any, **_: Any) -> Any:
-    if _known(x) and _known(y):
-        return x + y
-    return y if _known(x) and x == 0 else x if _known(y) and y == 0 else x + y
-
-
-@_by_parts
-def _sub(x: Any, y: Any, **_: Any) -> Any:
-    if _known(x) and _known(y):
-        return x - y
-    return _neg(y) if _known(x) and x == 0 else x if _known(y) and y == 0 else x - y
-
-
-@_by_parts
-def _neg(x: Any, **_: Any) -> Any:
-    return -x
-
-
-def _mul(x: Any, y: Any, **_: Any) -> Any:
-    if _is_complex(x) or _is_complex(y):
-        (a, b), (c, d) = _parts(x), _parts(y)
-        return _Pair(_sub(_mul(a, c), _mul(b, d)), _add(_mul(a, d), _mul(b, c)))
-    if _known(x) and _known(y):
-        return x * y
-    if (_known(x) and x == 0) or (_known(y) and y == 0):  # a term that is not there
-        return (x if _known(x) else y) * 0
-    return y if _known(x) and x == 1 else x if _known(y) and y == 1 else x * y
-
-
-def _div(x: Any, y: Any, **_: Any) -> Any:
-    if _is_complex(x) or _is_complex(y):
-        (a, b), (c, d) = _parts(x), _parts(y)
-        if not (_known(d) and d == 0):
-            return _joined(x) / _joined(y)
-        return _Pair(_div(a, c), _div(b, c))
-    if _known(x) and (x == 0 or _known(y)):
-        return x / y if _known(y) else x
-    return x if _known(y) and y == 1 else x / y
-
-
-def _plain(name: str) -> Callable[..., Any]:
-    def apply(*x: Any, **params: Any) -> Any:
-        return getattr(lax, f"{name}_p").bind(*(jnp.asarray(_joined(v)) for v in x), **params)
-
-    return apply
-
-
-def _power(x: Any, *, y: int, **_: Any) -> Any:
-    if _known(x):
-        return x**y
-    return _mul(x, x) if y == 2 else lax.integer_pow(_joined(x), y)
-
-
-def _convert(x: Any, *, new_dtype: Any, **_: Any) -> Any:
-    if _known(x):
-        return np.asarray(x, new_dtype)[()]
-    if jnp.issubdtype(new_dtype, jnp.complexfloating):
-        part = np.empty((), new_dtype).real.dtype
-        return _Pair(*(_convert(v, new_dtype=part) for v in _parts(x)))
-    return lax.convert_element_type(_joined(x), new_dtype)
-
-
-def _select(which: Any, *cases: Any, **_: Any) -> Any:
-    if _known(which):
-        return cases[int(which)]
-    return _choice(*cases, which=which)
-
-
-@_by_parts
-def _choice(a: Any, b: Any, *, which: Any) -> Any:
-    return jnp.where(which, b, a)
-
-
-_ELEMENTWISE: dict[str, Callable[..., Any]] = {
-    "add": _add,
-    "add_any": _add,
-    "sub": _sub,
-    "mul": _mul,
-    "div": _div,
-    "neg": _neg,
-    "integer_pow": _power,
-    "square": lambda x, **_: _mul(x, x),
-    "convert_element_type": _convert,
-    "select_n": _select,
-    "real": lambda x, **_: _parts(x)[0],
-    "imag": lambda x, **_: _parts(x)[1],
-    "complex": lambda x, y, **_: _Pair(x, y),
-    "conj": lambda x, **_: _Pair(_parts(x)[0], _neg(_parts(x)[1])),
-    "stop_gradient": _by_parts(lambda x, **_: lax.stop_gradient(x)),
-    "copy": lambda x, **_: x,
-    "copy_p": lambda x, **_: x,
-    **{
-        name: _plain(name)
-        for name in (
-            *("max", "min", "abs", "sign", "sqrt", "rsqrt", "exp", "log", "tanh", "atan2", "tan", "pow", "log1p", "expm1"),
-            *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "floor", "ceil", "round", "rem", "is_finite", "clamp"),
-            *("logistic", "asin", "acos", "atan", "sinh", "cosh", "erf", "cbrt", "exp2"),
-        )
-    },
-}
-_INNER = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr", "remat": "jaxpr"}
-
-
-def _broadcast_in_dim(x: Cells, *, shape: Any, broadcast_dimensions: Any, **_: Any) -> Cells:
-    whole = [1] * len(shape)
-    for axis, place in enumerate(broadcast_dimensions):
-        whole[place] = x.shape[axis]
-    return np.broadcast_to(x.reshape(whole), shape)
-
-
-def _reduced(combine: Callable[[Any, Any], Any], start: float | None) -> Callable[..., Cells]:
-    def reduce(x: Cells, *, axes: Any, **_: Any) -> Cells:
-        moved = np.moveaxis(x, axes, range(len(axes))).reshape(-1, *np.delete(x.shape, axes).astype(int))
-        out = np.empty(moved.shape[1:], dtype=object)
-        for index in np.ndindex(*out.shape):
-            column = moved[(slice(None), *index)]
-            total = column[0] if len(column) else start
-            for entry in column[1:]:
-                total = combine(total, entry)
-            out[index] = total
-        return out
-
-    return reduce
-
-
-def _dot_general(x: Cells, y: Cells, *, dimension_numbers: Any, **_: Any) -> Cells:
-    (over_x, over_y), batch = dimension_numbers
-    if any(batch):
-        raise Unwritten("dot_general with batch dimensions")
-    a = np.moveaxis(x, over_x, range(x.ndim - len(over_x), x.ndim))
-    b = np.moveaxis(y, over_y, range(len(over_y)))
-    rows, columns = a.shape[: x.ndim - len(over_x)], b.shape[len(over_y) :]
-    left, right = a.reshape(math.prod(rows), -1), b.reshape(-1, math.prod(columns))
-    out = np.empty((left.shape[0], right.shape[1]), dtype=object)
-    for i in range(out.shape[0]):
-        for k in range(out.shape[1]):
-            total: Any = np.float64(0.0)
-            for p, q in zip(left[i], right[:, k], strict=True):
-                total = _add(total, _mul(p, q))
-            out[i, k] = total
-    return out.reshape(rows + columns)
-
-
-def _dynamic_slice(x: Cells, *starts: Cells, slice_sizes: Any) -> Cells:
-    begin = [s[()] for s in starts]
-    if not all(_known(s) for s in begin):
-        raise Unwritten("dynamic_slice at a traced place")
-    places = [min(max(int(s), 0), n - size) for s, n, size in zip(begin, x.shape, slice_sizes, strict=True)]
-    return x[tuple(slice(p, p + size) for p, size in zip(places, slice_sizes, strict=True))]
-
-
-_STRUCTURAL: dict[str, Callable[..., Cells]] = {
-    "broadcast_in_dim": _broadcast_in_dim,
-    "reshape": lambda x, *, new_sizes, **_: x.reshape(new_sizes),
-    "squeeze": lambda x, *, dimensions: np.squeeze(x, axis=tuple(dimensions)),
-    "expand_dims": lambda x, *, dimensions: np.expand_dims(x, tuple(dimensions)),
-    "transpose": lambda x, *, permutation: np.transpose(x, permutation),
-    "slice": lambda x, *, start_indices, limit_indices, strides: x[
-        tuple(slice(a, b, c) for a, b, c in zip(start_indices, limit_indices, strides or [1] * x.ndim, strict=True))
-    ],
-    "concatenate": lambda *x, dimension: np.concatenate(x, axis=dimension),
-    "stack": lambda *x, axis: np.stack(x, axis),
-    "rev": lambda x, *, dimensions: np.flip(x, dimensions),
-    "reduce_sum": _reduced(_add, 0.0),
-    "reduce_max": _reduced(lambda a, b: jnp.maximum(a, b), None),
-    "reduce_min": _reduced(lambda a, b: jnp.minimum(a, b), None),
-    "dot_general": _dot_general,
-    "dynamic_slice": _dynamic_slice,
-}
+@functools.cache
+def _angles() -> dict[core.Primitive, int]:
+    """The sine and the cosine, and the place of each in what `sine_and_cosine` returns."""
+    return {primitive_of(lax.sin, np.float32(1.0)): 0, primitive_of(lax.cos, np.float32(1.0)): 1}
 
 
 def _require_rules(jaxpr: core.Jaxpr) -> None:
     for equation in jaxpr.eqns:
-        name = equation.primitive.name
-        if name in _INNER:
-            inner = equation.params[_INNER[name]]
-            _require_rules(getattr(inner, "jaxpr", inner))
-        elif name not in _ELEMENTWISE and name not in _STRUCTURAL and name not in ("iota", "split", "unstack", "sin", "cos"):
-            raise Unwritten(name)
+        if equation.primitive in inlined():
+            _require_rules(_inner(equation)[0])
+        elif equation.primitive not in rules() and equation.primitive not in _angles():
+            raise NotScalarizable(equation.primitive.name)
 
 
-def _run(jaxpr: core.Jaxpr, consts: Any, arguments: list[Cells], angles: dict[int, Any]) -> list[Cells]:
-    known: dict[Any, Cells] = {}
+def _inner(equation: core.JaxprEqn) -> tuple[core.Jaxpr, Sequence[Any]]:
+    inner = equation.params["jaxpr"]
+    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
-    def read(atom: Any) -> Cells:
-        return (
-            _cells(np.asarray(atom.val, getattr(atom.aval, "dtype", None))) if isinstance(atom, core.Literal) else known[atom]
-        )
 
-    known.update(zip(jaxpr.constvars, (_cells(c) for c in consts), strict=True))
+def _run(jaxpr: core.Jaxpr, consts: Sequence[Any], arguments: list[Scalars], sines: dict[int, Any]) -> list[Scalars]:
+    known: dict[core.Var, Scalars] = {}
+
+    def read(atom: core.Var | core.Literal) -> Scalars:
+        if isinstance(atom, core.Literal):
+            return _to_scalars(np.asarray(atom.val, getattr(atom.aval, "dtype", None)))
+        return known[atom]
+
+    known.update(zip(jaxpr.constvars, (_to_scalars(c) for c in consts), strict=True))
     known.update(zip(jaxpr.invars, arguments, strict=True))
     for equation in jaxpr.eqns:
-        name, params = equation.primitive.name, equation.params
         given = [read(atom) for atom in equation.invars]
-        if name in _INNER:
-            inner = params[_INNER[name]]
-            results = _run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", []), given, angles)
-        elif name == "iota":
-            results = [_cells(np.indices(params["shape"])[params["dimension"]].astype(params["dtype"]))]
-        elif name == "split":
-            cuts = np.cumsum(params["sizes"])[:-1]
-            results = np.split(given[0], cuts, axis=params["axis"])
-        elif name == "unstack":
-            moved = np.moveaxis(given[0], params["axis"], 0)
-            results = [moved[k, ...] for k in range(moved.shape[0])]
-        elif name in _STRUCTURAL:
-            results = [_STRUCTURAL[name](*given, **params)]
-        elif name in ("sin", "cos"):
-            (given_cells,) = given
-            results = [_elementwise(lambda x, which=name == "cos", **_: _of_angle(x, which, angles), [given_cells], {})]
+        if equation.primitive in inlined():
+            results = _run(*_inner(equation), given, sines)
+        elif equation.primitive in _angles():
+            place = _angles()[equation.primitive]
+            results = elementwise(lambda x, place=place: _of_angle(x, place, sines))(*given)
         else:
-            results = [_elementwise(_ELEMENTWISE[name], given, params)]
-        known.update(zip(equation.outvars, results, strict=True))
+            results = rules()[equation.primitive](*given, **equation.params)
+        results = results if isinstance(results, list) else [results]
+        for atom, result in zip(equation.outvars, results, strict=True):
+            known[atom] = _checked(result, atom.aval, equation.primitive.name)
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _of_angle(x: Any, cosine: bool, angles: dict[int, Any]) -> Any:
+def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
+    """The result of an operation, after a look at whether it has the shape and the dtype the program on arrays says."""
+    scalars = (x for x in result.flat if hasattr(x, "dtype"))
+    if result.shape != aval.shape or any(x.dtype != aval.dtype for x in scalars):
+        raise NotScalarizable(f"{name}: its rule gave another shape or dtype than {aval}")
+    return result
+
+
+def _of_angle(x: Any, place: int, sines: dict[int, Any]) -> Any:
     """The sine or cosine of an angle, both computed once however often a program asks."""
-    if _known(x):
-        return np.cos(x) if cosine else np.sin(x)
-    if id(x) not in angles:
-        angles[id(x)] = x, sine_and_cosine(x)
-    return angles[id(x)][1][int(cosine)]
-
-
-def _elementwise(rule: Callable[..., Any], given: list[Cells], params: dict[str, Any]) -> Cells:
-    whole = np.broadcast_arrays(*given) if len(given) > 1 else given
-    out = np.empty(whole[0].shape, dtype=object)
-    for index in np.ndindex(*out.shape):
-        out[index] = rule(*(cells[index] for cells in whole), **params)
-    return out
+    if is_known(x):
+        return np.cos(x) if place else np.sin(x)
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        raise NotScalarizable(f"the sine of a number of {x.dtype}")
+    if id(x) not in sines:
+        sines[id(x)] = x, sine_and_cosine(x)
+    return sines[id(x)][1][place]

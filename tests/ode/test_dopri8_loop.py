@@ -30,7 +30,7 @@ def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.F
     control = diffrax.PIDController(rtol=1e-6, atol=1e-6) if adaptive else diffrax.ConstantStepSize()
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(on_arrays if arrays else on_numbers),
-        LoopDopri8(slopes=slopes),
+        LoopDopri8(tangents=slopes),
         jnp.zeros(()),
         end,
         0.1 if adaptive else end / 12.0,

@@ -1,49 +1,176 @@
-"""Functions of arrays written out on single numbers."""
+"""Programs on single numbers: the same values as on arrays, or none."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
+from scenes import scene
 
-from jaxvib.ode.scalarize import Unwritten, on_numbers, program_on_numbers
+import jaxvib as jv
+from jaxvib.motion.analysis.measure import _derivatives
+from jaxvib.motion.start import initial_state
+from jaxvib.ode import scalarize as module
+from jaxvib.ode.scalar_rules import primitive_of, rules, to_scalars
+from jaxvib.ode.scalarize import NotScalarizable, scalarize, scalarized_program, scalarized_vmap, scalars_of
+
+X = np.array([[0.3, -0.7, 0.2], [0.9, -0.1, 0.5]])
+
+SAME = {
+    "arithmetic": lambda x: (x + 2.0) * x - x / (3.0 + x) + x**3 - (-x) ** 2,
+    "elementary": lambda x: jnp.exp(x) + jnp.tanh(x) + jnp.arctan2(x, 2.0) + jnp.sqrt(jnp.abs(x)) + jnp.log1p(x * x),
+    "more of them": lambda x: (
+        jnp.sinh(x) + jnp.cosh(x) + jnp.expm1(x) + jnp.cbrt(x) + lax.logistic(x) + jnp.tan(x) + jnp.exp2(x)
+    ),
+    "inverse": lambda x: jnp.arcsin(x) + jnp.arccos(x) + jnp.arctan(x) + lax.erf(x) + lax.rsqrt(x * x + 1.0) + jnp.log(x * x),
+    "sines": lambda x: jnp.sin(x) * jnp.cos(3.0 * x),
+    "comparisons": lambda x: jnp.where((x > 0.1) & ~(x >= 0.5) | (x == -0.1), x, -x) + jnp.sign(x) + jnp.maximum(x, 0.2),
+    "rounding": lambda x: (
+        jnp.floor(3.0 * x) + jnp.ceil(x) + jnp.round(5.0 * x) + jnp.clip(x, -0.2, 0.4) + lax.rem(x, jnp.full_like(x, 0.3))
+    ),
+    "three cases": lambda x: lax.select_n(jnp.int32(2) * (x > 0.0), x, 2.0 * x, 3.0 * x),
+    "whole numbers": lambda x: lax.div(jnp.asarray([7, -7, 9]), jnp.asarray([2, 2, 4]))[None] + x,
+    "powers": lambda x: x**-2 + lax.pow(jnp.abs(x), jnp.full_like(x, 1.5)) + 2.0**x,
+    "sums": lambda x: jnp.sum(x, 0) + jnp.max(x, 0) - jnp.min(x, axis=0) + x.T[:, 0] @ jnp.eye(3),
+    "products": lambda x: x @ x.T + jnp.einsum("ij,kj->ik", x, 2.0 * x),
+    "shapes": lambda x: jnp.concatenate([x[::-1], jnp.stack([x[0], x[1]]) + jnp.arange(3.0, dtype=x.dtype)[None]]).T.reshape(
+        2, 6
+    )[:, 1:4],
+    "parts": lambda x: jnp.stack(jnp.split(x, [1], axis=1)[0]) + x[:, 2:] + lax.dynamic_slice(x, (5, 0), (1, 1)),
+    "inner programs": lambda x: jax.checkpoint(jax.jit(lambda y: y * jnp.sin(y)))(x),
+    "a derivative": lambda x: jax.jvp(lambda y: jnp.sin(y) * jnp.sum(y), (x,), (jnp.ones_like(x),))[1],
+    "a gradient": lambda x: jax.grad(lambda y: jnp.sum(y[0] * jnp.sin(y[1])) + jnp.sum(y) ** 2)(x),
+}
 
 
-def test_complex_numbers_are_written_in_their_parts():
-    """Every operation on complex numbers that has a rule, with real ones among them; a factor i costs no multiplication."""
-
-    def linear_combination(x, w):
-        real, imag = x
-        z = real + 1j * imag
-        chosen = jnp.where(x[0] > 0.0, z * w, jnp.conj(z))
-        return jnp.stack([z * jnp.conj(w) / x[1] - x[0], w / z + 2.0, -(z**2) + z**3, jnp.square(w) * chosen, 1j - jnp.exp(z)])
-
-    x, w = jnp.asarray([0.7, -1.3]), jnp.asarray(0.4 - 0.9j)
-    cells = [np.array([*x], dtype=object), np.full((), w, dtype=object)]
-    np.testing.assert_allclose(
-        [complex(v) for v in on_numbers(linear_combination, x, w)(*cells)], linear_combination(x, w), rtol=1e-14
-    )
-
-    turned = program_on_numbers(lambda a, b: (1j * (a + 1j * b)).real, x[0], x[1])
-    assert turned is not None and [e.primitive.name for e in turned.jaxpr.eqns] == ["neg"]
+@pytest.mark.parametrize("name", SAME)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_values_are_those_on_arrays(name, dtype):
+    x = jnp.asarray(X, dtype)
+    on_arrays = SAME[name](x)
+    on_scalars = scalarize(SAME[name], x)(to_scalars(x))
+    assert on_scalars.shape == on_arrays.shape
+    found = np.array([float(v) for v in on_scalars.ravel()]).reshape(on_arrays.shape)
+    np.testing.assert_allclose(found, on_arrays, rtol=20 * np.finfo(dtype).eps, atol=20 * np.finfo(dtype).eps)
+    program = scalarized_program(SAME[name], x)
+    assert program is not None
+    assert {v.aval.dtype for v in program.jaxpr.outvars} == {np.dtype(dtype)}
 
 
-def test_an_operation_without_a_rule_is_named():
-    with pytest.raises(Unwritten, match="cumsum"):
-        on_numbers(jnp.cumsum, jnp.zeros(3))
+@jax.custom_jvp
+def with_its_own_derivative(x):
+    return jnp.abs(x)
 
 
-def test_a_term_that_is_not_there_is_not_computed():
-    """A product with a known 0 leaves no operation; a sine asked for twice is computed once."""
+with_its_own_derivative.defjvp(lambda primals, tangents: (jnp.abs(primals[0]), 0.0 * tangents[0]))
 
-    def with_zero(x):
-        return jnp.zeros(2) * jnp.sin(x) + jnp.ones(2) * x
 
-    written = on_numbers(with_zero, jnp.zeros(2))
-    cells = np.empty(2, dtype=object)
+@pytest.mark.parametrize(
+    ("function", "named"),
+    [
+        (jnp.cumsum, "cumsum"),
+        (lambda x: lax.fori_loop(0, 3, lambda i, y: 2.0 * y, x), "scan|while"),
+        (lambda x: lax.reduce_max(x[:0], (0,)), "empty"),
+        (lambda x: x[jnp.argmax(x)], "argmax"),
+        (lambda x: lax.pad(x, 0.0, [(1, 1, 1)]), "pad"),
+        (with_its_own_derivative, "custom_jvp"),
+        (lambda x: jnp.einsum("bi,bi->b", x[:, None], x[:, None]), "batch dimensions"),
+    ],
+)
+def test_what_has_no_rule_stays_on_arrays(function, named):
+    x = jnp.arange(1.0, 4.0)
+    with pytest.raises(NotScalarizable, match=named):
+        scalarize(function, x)(to_scalars(x))
+    assert scalarized_program(function, x) is None
+    batch = jnp.stack([x, -x])
+    alone = scalarized_vmap(lambda y, shared: function(y) * shared)(batch, 2.0)
+    np.testing.assert_array_equal(alone, 2.0 * jax.vmap(function)(batch))
 
-    def run(a, b):
-        cells[0], cells[1] = a, b
-        return tuple(written(cells))
 
-    operations = [e.primitive.name for e in jax.make_jaxpr(run)(1.0, 2.0).eqns]
-    assert operations.count("mul") == 0 and operations.count("add") == 0
+def test_a_rule_that_fails_or_gives_another_shape_is_not_believed(monkeypatch):
+    x = jnp.arange(3.0)
+    changed = dict(rules())
+    monkeypatch.setattr(module, "rules", lambda: changed)
+    changed[primitive_of(lax.exp, 1.0)] = lambda x, **_: 1 // 0
+    assert scalarized_program(jnp.exp, x) is None
+    changed[primitive_of(lax.exp, 1.0)] = lambda x, **_: x[:1]
+    assert scalarized_program(jnp.exp, x) is None
+
+
+def test_an_error_of_the_function_itself_is_not_hidden():
+    def broken(x):
+        raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine"):
+        scalarized_program(broken, jnp.zeros(2))
+
+
+def test_primitives_are_known_by_themselves_and_not_by_name():
+    """Another primitive of the same name has no rule."""
+    found = {primitive.name: primitive for primitive in rules()}
+    assert {"add", "mul", "select_n", "dot_general", "broadcast_in_dim", "add_any", "stack", "unstack"} <= set(found)
+    assert type(found["add"])("add") not in rules()
+
+
+def test_a_zero_of_the_program_leaves_no_term_and_a_zero_among_the_arguments_does():
+    """Which tells the two apart where the other factor is infinite."""
+
+    def function(c, x):
+        return jnp.stack([jnp.dot(jnp.array([1.0, 0.0]), x), jnp.dot(c, x)])
+
+    c, x = jnp.asarray([1.0, 0.0]), jnp.asarray([2.0, jnp.inf])
+    program = scalarized_program(function, c, x)
+    assert program is not None
+    assert [e.primitive.name for e in program.jaxpr.eqns] == ["mul", "mul", "add"]
+    first, second = scalarize(function, c, x)(to_scalars(c), to_scalars(x))
+    assert float(first) == 2.0 and np.isnan(float(second))
+
+
+def expanded(jaxpr):
+    """For each result the operations that it takes if all are computed anew for each use, but those of divisions."""
+    cost = {}
+    for equation in jaxpr.eqns:
+        total = 1 + sum(cost.get(v, 0) for v in {v for v in equation.invars if not hasattr(v, "val")})
+        cost.update((v, 0 if equation.primitive.name == "div" else total) for v in equation.outvars)
+    return max(cost.get(v, 0) for v in jaxpr.outvars)
+
+
+def test_shared_parts_of_shared_parts_are_not_computed_again_and_again():
+    """A chain in which every value is used twice: 2^40 operations without fences."""
+
+    def chain(t, c):
+        a, b = t, c
+        for _ in range(40):
+            a, b = a * b + c, a - b * c
+        return a, b
+
+    program = scalarized_program(chain, jnp.asarray(0.1), jnp.asarray(0.2))
+    assert program is not None
+    assert expanded(program.jaxpr) > 1e10
+    fenced = jax.make_jaxpr(lambda *x: module._fenced(program, x))(0.1, 0.2)
+    assert expanded(fenced.jaxpr) < 200
+    for ours, theirs in zip(scalarized_vmap(chain)(jnp.full(3, 0.1), jnp.asarray(0.2)), chain(0.1, 0.2), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-13)
+
+
+def test_a_batch_has_the_shapes_and_derivatives_that_vmap_gives():
+    def function(x, shared):
+        t, y = x
+        return {"a": y * t * shared["c"][0], "b": jnp.sum(y) + jnp.zeros((0, 2)), "n": jnp.sin(t)}
+
+    batch, shared = (jnp.linspace(0.0, 1.0, 300), jnp.arange(600.0).reshape(300, 2)), {"c": jnp.asarray([2.0])}
+    slopes = jax.tree.map(jnp.ones_like, batch)
+    ways = (scalarized_vmap(function), jax.vmap(function, in_axes=(0, None)))
+    ours, theirs = (jax.jvp(lambda x, way=way: way(x, shared), (batch,), (slopes,)) for way in ways)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14), ours, theirs)
+
+
+@pytest.mark.parametrize(("machine", "load"), [("one_mass", "rollers"), ("two_mass", "balls")])
+def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machine, load):
+    """As the measurement of a run takes it: without fences a run of the rotor took ten seconds."""
+    s = scene(machine, load, effects=(jv.Gravity(),))
+    moment, field = (jnp.asarray(0.0), initial_state(s)), jv.vector_field(s)
+    program = scalarized_program(_derivatives, moment, field)
+    assert program is not None
+    numbers = [*scalars_of(moment), *scalars_of(field)]
+    assert expanded(jax.make_jaxpr(lambda *x: module._fenced(program, x))(*numbers).jaxpr) < 200 < expanded(program.jaxpr)

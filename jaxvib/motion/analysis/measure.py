@@ -14,6 +14,7 @@ from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_fi
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import _extremum, _places
+from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
 __all__ = ["STATE", "AbstractMeasured", "Measured", "Trajectory", "measure"]
@@ -25,6 +26,9 @@ STATE = {
     "rate": in_unit("rad/s", "load"),
 }
 """Units and axes of the fields of a `State`; the rotor's angle and speed stand beside it where they count."""
+
+Field = Callable[[Array, State], State]
+"""The equations of motion: the rates of a state at a time."""
 
 
 class Trajectory(eqx.Module):
@@ -82,7 +86,7 @@ def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
     return Trajectory(times, states, force, angle, speed)
 
 
-def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Measured:
+def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured:
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
@@ -110,7 +114,7 @@ def measure(scene: Scene, field: Callable[[Array, State], State], times: Array, 
 
 
 @eqx.filter_custom_jvp
-def _spans(scene: Scene, field: Callable[[Array, State], State], times: Array, states: State) -> Array:
+def _spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
     """Half of peak to peak of displacements and foundation forces, over the first half of the samples, the second and all of
     them, (3, outputs).
 
@@ -126,11 +130,12 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
     _, samples, shares = jax.lax.stop_gradient(_extrema(*primals))
     outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
 
-    def spans(scene: Scene, field: Any, times: Array, states: State) -> Array:
+    def spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
         def extremum(output: Array, k: Array, share: Array) -> Array:
             def sample(j: Array) -> list[Array]:
                 state = jax.tree.map(lambda leaf: leaf[j], states)
-                return [part[output] for part in _moving(scene, field, _step(times), times[j], state)]
+                found = _outputs(scene, _step(times), state, *_derivatives((times[j], state), field))
+                return [part[output] for part in found]
 
             return _extremum(sample(k), sample(k + 1), share)
 
@@ -140,24 +145,37 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
     return eqx.filter_jvp(spans, primals, tangents)
 
 
-def _extrema(scene: Scene, field: Any, times: Array, states: State) -> tuple[Array, Array, Array]:
+def _extrema(scene: Scene, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Least and greatest values of each output, and their places, see `_places`; (2, 3, outputs) each."""
-    step = _step(times)
-    samples = jax.vmap(lambda t, y: _moving(scene, field, step, t, y))(times, states)
+    first, second = scalarized_vmap(_derivatives)((times, states), field)
+    samples = jax.vmap(lambda *y: _outputs(scene, _step(times), *y))(states, first, second)
     return jax.vmap(_places, in_axes=1, out_axes=-1)(*samples)
 
 
-def _moving(scene: Scene, field: Any, step: Array, t: Array, state: State) -> tuple[Array, Array, Array]:
-    """Displacements and foundation forces with their first two derivatives, in units of the step."""
+def _derivatives(moment: tuple[Array, State], field: Field) -> tuple[State, State]:
+    """First and second time derivative of a state at a time: y' = f(t, y), and y'' = df/dt + (df/dy) y'."""
+    rates = field(*moment)
+    return rates, jax.jvp(field, moment, (jnp.ones_like(moment[0]), rates))[1]
 
-    def outputs(state: State) -> Array:
-        return jnp.concatenate([state.displacement, foundation_force(scene, state)])
 
-    def first(s: Array, y: State) -> Array:
-        return jax.jvp(outputs, (y,), (field(s, y),))[1]
+def _outputs(scene: Scene, step: Array, state: State, first: State, second: State) -> tuple[Array, Array, Array]:
+    """Displacements and foundation forces with their first two derivatives, in units of the step.
 
-    second = jax.jvp(first, (t, state), (jnp.ones_like(t), field(t, state)))[1]
-    return outputs(state), first(t, state) * step, second * step**2
+    Both follow from the state's own two derivatives: the equations of motion are not differentiated again.
+    """
+
+    def force(state: State) -> Array:
+        return foundation_force(scene, state)
+
+    def slope(state: State, rates: State) -> Array:
+        return jax.jvp(force, (state,), (rates,))[1]
+
+    changing, curved = jax.jvp(slope, (state, first), (first, second))
+    return (
+        jnp.concatenate([state.displacement, force(state)]),
+        jnp.concatenate([first.displacement, changing]) * step,
+        jnp.concatenate([first.velocity, curved]) * step**2,
+    )
 
 
 def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:

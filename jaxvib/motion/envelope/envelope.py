@@ -26,7 +26,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import WrappedController, moved_on
 from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
-from jaxvib.ode.scalarize import MOST_NUMBERS, numbers_of, program_on_numbers
+from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.results.status import failure, status_name
 from jaxvib.units import Number, count, number, traced
 
@@ -256,14 +256,14 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
         field, units = args
         return units.pack(field(t, units.unpack(y, nd)))
 
-    program = program_on_numbers(on_arrays, jnp.zeros((), y.dtype), y, args) if y.size <= MOST_NUMBERS else None
+    program = scalarized_program(on_arrays, jnp.zeros((), y.dtype), y, args) if y.size <= MAX_SCALARS else None
     if program is None:
         return on_arrays, args
 
     def on_numbers(t: Any, y: Array, args: list[Array]) -> Array:
         return jnp.stack(core.jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
 
-    return on_numbers, numbers_of(args)
+    return on_numbers, scalars_of(args)
 
 
 def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:

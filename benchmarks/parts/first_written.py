@@ -17,7 +17,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-from common import TOLERANCES, best, published, reach, thrown  # noqa: E402
+from parts.common import TOLERANCES, best, published, reach, thrown  # noqa: E402
 
 import jaxvib as jv  # noqa: E402
 

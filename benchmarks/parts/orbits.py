@@ -1,6 +1,6 @@
 """What exact jams cost: collocation with the carrier eliminated against other ways to the same orbits, at the same accuracy.
 
-    python benchmarks/orbits.py
+    python benchmarks/engine.py --only orbits
 
 Peers: shooting with RK4, jaxcont's collocation of the whole state (left out where it is not installed), SciPy's solve_bvp.
 Compile and run time apart, the best of several runs; ratios travel between machines, absolute times do not. The machine is
@@ -16,8 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import best, first, published, say
 from jax.flatten_util import ravel_pytree
+from parts.common import best, first, published, say
 
 import jaxvib as jv
 from jaxvib.equations.linear import steady_displacement
@@ -261,8 +261,3 @@ def value_and_gradient(quick: bool, runs: int) -> None:
             at, rough = (jv.jam_orbit(machine, near=near, points=p, throw=False) for p in (16, points))
             off = None if points == 16 else abs(float(rough.omega / at.omega) - 1.0)
             say(group, f"{platforms} platforms, {points} points", seconds, base, off, compiling)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    orbits()

@@ -15,9 +15,9 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
-import native
 import numpy as np
-from common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
+from parts import native
+from parts.common import TOLERANCES, as_first_written, best, best_in_turn, first, flat, published, reach, say, thrown, told
 
 import jaxvib as jv
 from jaxvib.motion.system import PackedSystem

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import best, best_in_turn, first, published, say, thrown
+from parts.common import best, best_in_turn, first, published, say, thrown
 
 import jaxvib as jv
 from jaxvib.steady.jams.folds import jam_rotor_speed

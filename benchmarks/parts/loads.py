@@ -1,6 +1,6 @@
 """What 1, 10, 100, 1000 loads cost: an evaluation of the vector field, and a time integration; no more than their number.
 
-    python benchmarks/loads.py
+    python benchmarks/engine.py --only loads
 
 The field is evaluated many times inside one compiled loop, so that the cost of calling into JAX does not count; each
 evaluation uses the last one's result, so that none is left out. The integration takes equal steps, each load has its own angle
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from common import best, first, say
-from single import integrator
+from parts.common import best, first, say
+from parts.single import integrator
 
 import jaxvib as jv
 
@@ -67,9 +67,3 @@ def growth_with_loads(quick: bool = False) -> None:
             note = "" if before is None else f"{seconds / before[1] / (count / before[0]):.2f} of linear since the last"
             say(group, "1 load" if count == 1 else f"{count} loads", seconds, base, None, compiling, note, loads=count)
             before = (count, seconds)
-
-
-if __name__ == "__main__":
-    jv.prepare_cpu()
-    jax.config.update("jax_enable_x64", True)
-    growth_with_loads()

@@ -1,6 +1,6 @@
 """What engine.py measured, as a markdown table and as figures; from its JSON alone too.
 
-python benchmarks/table.py out/engine.json      # writes engine.md, engine.png, memory.png beside it
+PYTHONPATH=benchmarks python -m parts.table out/engine.json      # writes engine.md, engine.png, memory.png beside it
 """
 
 from __future__ import annotations

@@ -103,13 +103,17 @@ def told(setting: float, found: float, error: float) -> str:
 
 def as_first_written(task: str, **given: Any) -> list[list[Any]]:
     """Rows [name, seconds, error, compile] of `first_written.py`, in a process of its own without any flags."""
-    script = Path(__file__).with_name("first_written.py")
     clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "EQX_ON_ERROR")}
     done = subprocess.run(
-        [sys.executable, str(script)], input=json.dumps({"task": task, **given}), env=clean, capture_output=True, text=True
+        [sys.executable, "-m", "parts.first_written"],
+        cwd=Path(__file__).parents[1],
+        input=json.dumps({"task": task, **given}),
+        env=clean,
+        capture_output=True,
+        text=True,
     )
     if done.returncode:
-        raise RuntimeError(f"{script.name} failed: {done.stderr[-2000:]}")
+        raise RuntimeError(f"first_written.py failed: {done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -1,6 +1,6 @@
 """What a run-up costs at 1 % error in amplitude: the averaged equations against the full ones.
 
-    python benchmarks/envelope.py
+    python benchmarks/engine.py --only envelope
 
 For every solver the loosest tolerance that still gives 1 % is found first, then the runs are timed in turn, best of several,
 compile and run time apart, called as an optimizer would: under `jax.jit`, the amplitudes at the end asked for. Ratios travel
@@ -19,7 +19,7 @@ import diffrax
 import equinox as eqx
 import jax
 import numpy as np
-from common import best_in_turn, first, published, say
+from parts.common import best_in_turn, first, published, say
 
 import jaxvib as jv
 from jaxvib.ode.dopri8 import UnrolledDopri8
@@ -110,9 +110,3 @@ def run_ups(quick: bool = False) -> None:
     compare("caught below the second resonance", run_up(2e-3, 1.5, 8000.0), 8000.0, 20)
     compare("past both resonances", run_up(2e-3, 6.0, 8000.0), 8000.0, 20)
     compare("caught, lighter loads, longer", run_up(5e-4, 1.5, 32000.0), 32000.0, 20)
-
-
-if __name__ == "__main__":
-    jv.prepare_cpu()
-    jax.config.update("jax_enable_x64", True)
-    run_ups()

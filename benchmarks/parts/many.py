@@ -9,9 +9,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import native
 import numpy as np
-from common import as_first_written, best, first, flat, published, reach, say, thrown
+from parts import native
+from parts.common import as_first_written, best, first, flat, published, reach, say, thrown
 
 import jaxvib as jv
 
