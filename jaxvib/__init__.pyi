@@ -26,6 +26,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state
+from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.cpu import prepare_cpu
 from jaxvib.steady.balance.criterion import Criterion, CriterionStatus, criterion, criterion_functional, criterion_table
 from jaxvib.steady.balance.speeds import CharacteristicSpeeds, characteristic_speeds, port_receptance
@@ -199,6 +200,7 @@ __all__ = [
     "three_mass",
     "turning_points",
     "two_mass",
+    "use_cache",
     "vector_field",
     "whirl",
     "work_precision",
