@@ -22,7 +22,10 @@ def use_cache(folder: str | os.PathLike[str] | None = None) -> Path:
     Two caches are used: jaxvib's own in `folder/programs`, of traced programs, and JAX's compilation cache, of what XLA makes
     of them, in `folder` itself (where `jax_compilation_cache_dir` is set already, it stays). The command line does this by
     itself; from Python it is one line at the start. Programs that differ in shapes, in options, in a version of jaxvib or JAX,
-    or in the processor are kept apart. To undo it, delete the folder.
+    or in the processor are kept apart. The folder may be deleted at any time.
+
+    A program that calls back into Python cannot be stored. Those of `simulate` do, for the run-time checks of Equinox, unless
+    the environment has EQX_ON_ERROR=nan before Equinox is imported; statuses of results do not depend on them.
 
     **Arguments**: `folder`, made where it does not exist; None: the one that JAX caches in already, else
     `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`.
@@ -30,9 +33,11 @@ def use_cache(folder: str | os.PathLike[str] | None = None) -> Path:
     **Returns** the folder. **Raises** `InputError` for a folder that cannot be made, that belongs to another user, or in which
     others may write: whoever can write there can run code as you.
 
-    >>> import tempfile, jaxvib as jv
-    >>> with tempfile.TemporaryDirectory() as folder:                       # doctest: +SKIP
-    ...     jv.use_cache(folder)
+    >>> import jaxvib as jv
+    >>> jv.use_cache("/dev/null")           # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: folder is '/dev/null'; it must be a folder that can be written to (Not a directory)
     """
     path = (default_folder() if folder is None else Path(folder)).expanduser().absolute()
     programs = path / "programs"
