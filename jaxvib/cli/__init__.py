@@ -39,3 +39,4 @@ def prepare() -> None:
         use_cache()
     except InputError as error:
         print(f"jaxvib: programs are not cached: {error}", file=sys.stderr)
+        jax.config.update("jax_compilation_cache_dir", None)

@@ -26,14 +26,14 @@ from jax import Array, export
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import is_tracer
 from jaxvib.runtime.cpu import processor
-from jaxvib.runtime.structure import Description, Undescribable, describe, rebuild
+from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Undescribable, describe, rebuild
 
 __all__ = ["cached"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
+_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib"}), "jaxlib", "numpy")
 """Whose versions a traced program depends on."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
@@ -65,11 +65,12 @@ class _CachedFunction(Generic[P, T]):
             return self.jitted(*args, **kwargs)
         asked = (folder, treedef, tuple(map(_leaf_key, leaves)), _options())
         try:
-            if asked not in self.ready:
-                self.ready[asked] = self._program(folder, leaves, treedef)
-            program = self.ready[asked]
+            is_ready = asked in self.ready
         except TypeError:  # an argument without a hash
-            program = None
+            return self.jitted(*args, **kwargs)
+        if not is_ready:
+            self.ready[asked] = self._program(folder, leaves, treedef)
+        program = self.ready[asked]
         if program is None:
             return self.jitted(*args, **kwargs)
         return program(leaf for leaf in leaves if eqx.is_array(leaf))
@@ -77,11 +78,10 @@ class _CachedFunction(Generic[P, T]):
     def _program(self, folder: Path, leaves: list[Any], treedef: Any) -> _Program | None:
         """From the disk, or traced and written there; None where this call has no program that could be stored."""
         try:
-            key = self._key(leaves, treedef)
+            path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
+            return _read(path) or self._write(path, leaves, treedef)
         except Undescribable:
             return None
-        path = folder / f"{self.function.__name__}-{key}.program"
-        return _read(path) or self._write(path, leaves, treedef)
 
     def _key(self, leaves: list[Any], treedef: Any) -> str:
         def abstract(leaf: Array) -> str:
@@ -93,12 +93,14 @@ class _CachedFunction(Generic[P, T]):
         name = f"{self.function.__module__}:{self.function.__qualname__}"
         return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
 
-    def _write(self, path: Path, leaves: list[Any], treedef: Any) -> _Program | None:
+    def _write(self, path: Path, leaves: list[Any], treedef: Any) -> _Program:
         structure: list[Description] = []
+        # Not the arrays of this call, which would live as long as the program.
+        static = [_Slot(k) if eqx.is_array(leaf) else leaf for k, leaf in enumerate(leaves)]
 
         def flat(*arrays: Array) -> list[Array]:
             given, found = iter(arrays), []
-            args, kwargs = jax.tree.unflatten(treedef, [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves])
+            args, kwargs = jax.tree.unflatten(treedef, [next(given) if isinstance(x, _Slot) else x for x in static])
             out = self.function(*args, **kwargs)  # pyright: ignore[reportCallIssue]
             structure[:] = [describe(out, found.append)]
             return found
@@ -107,21 +109,20 @@ class _CachedFunction(Generic[P, T]):
         try:
             exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
             stored = bytes(exported.serialize())
-        except Undescribable:
-            return None
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
+        program = _Program.of(_compiled(path, exported), structure[0])
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
-        return _Program.of(_compiled(path, exported), structure[0])
+        return program
 
 
 @dataclasses.dataclass(frozen=True)
 class _Slot:
-    """Stands where an array of a result goes."""
+    """Stands where an array goes."""
 
     place: int
 
@@ -136,7 +137,11 @@ class _Program:
 
     @classmethod
     def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
-        return cls(run, *jax.tree.flatten(rebuild(structure, map(_Slot, itertools.count()))))
+        places = itertools.count()
+        leaves, treedef = jax.tree.flatten(rebuild(structure, map(_Slot, places)))
+        if sum(isinstance(leaf, _Slot) for leaf in leaves) != next(places):
+            raise Undescribable("an array of the result is in a static field")
+        return cls(run, leaves, treedef)
 
     def __call__(self, arrays: Iterable[Array]) -> Any:
         found = self.run(*arrays)

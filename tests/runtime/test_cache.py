@@ -91,13 +91,14 @@ def test_the_default_is_the_users_cache(tmp_path, theirs):
     assert done.stdout.split() == [str(tmp_path / ("j" if theirs else "jaxvib"))] * 2
 
 
-def test_the_command_line_goes_on_without(tmp_path):
+@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"])
+def test_the_command_line_goes_on_without(tmp_path, variable):
     (tmp_path / "jaxvib").mkdir()
     (tmp_path / "jaxvib").chmod(0o777)
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment[variable] = str(tmp_path if variable == "XDG_CACHE_HOME" else tmp_path / "jaxvib")
     code = "from jaxvib.cli import prepare; prepare(); import jax; print(jax.config.jax_compilation_cache_dir)"
     command = [sys.executable, "-c", code]
-    environment["XDG_CACHE_HOME"] = str(tmp_path)
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
     assert "programs are not cached" in done.stderr and done.stdout.strip() == "None"
 

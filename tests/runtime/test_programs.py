@@ -31,6 +31,10 @@ def doubled(pair, factor):
     return Pair(factor * pair.first, pair.name + "!"), {"sum": jnp.sum(pair.first), "name": pair.name}
 
 
+def hidden(x):
+    return Pair(x, np.arange(2))  # an array where a text should be
+
+
 def with_callback(x):
     jax.debug.callback(lambda _: None, x)
     return x + 1.0
@@ -132,6 +136,8 @@ def test_what_cannot_be_stored_still_runs(folder):
     """A callback has no form on disk; a function made on the spot has no name; a class from outside may change unseen."""
     assert float(programs.cached(with_callback)(jnp.asarray(1.0))) == 2.0
     assert float(programs.cached(lambda f, x: f(x))(lambda x: 3.0 * x, jnp.asarray(1.0))) == 3.0
+    with pytest.warns(UserWarning, match="static"):
+        assert programs.cached(hidden)(jnp.asarray(1.0)).name.tolist() == [0, 1]
     structure.KNOWN_PACKAGES.discard(__name__)
     assert programs.cached(doubled)(Pair(jnp.arange(3.0), "a"), 2.0)[0].name == "a!"
     assert not list(folder.iterdir())
