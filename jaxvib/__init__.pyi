@@ -2,6 +2,7 @@
 
 # Errors, and the processor
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.runtime.cache import use_cache
 from jaxvib.runtime.cpu import prepare_cpu
 
 # Machines
@@ -85,6 +86,7 @@ __all__ = [
     "InputError",
     "ComputationError",
     "prepare_cpu",
+    "use_cache",
     # Machines
     "Machine",
     "Carrier",

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 
 from jaxvib.errors import InputError
+from jaxvib.runtime.compat import is_tracer
 
 __all__ = ["FIELD_UNITS", "Number", "count", "number", "numbers", "to_float", "traced"]
 
@@ -55,7 +55,7 @@ def traced(value: Any) -> bool:
     >>> traced(1.0)
     False
     """
-    return isinstance(value, Tracer)
+    return is_tracer(value)
 
 
 def _unit_name(unit: str) -> str:

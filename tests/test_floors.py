@@ -15,7 +15,8 @@ FLOORS = (
     ("jaxvib.steady",),
     ("jaxvib.equations",),
     ("jaxvib.machine",),
-    ("jaxvib.ode", "jaxvib.draw", "jaxvib.results", "jaxvib.runtime", "jaxvib.units"),
+    ("jaxvib.ode", "jaxvib.draw", "jaxvib.results", "jaxvib.units"),
+    ("jaxvib.runtime",),
     ("jaxvib.numerics", "jaxvib.errors"),
 )
 """From the top down; a module may import from its own package and from floors below its own."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from pathlib import Path
 
 __all__ = ["main"]
 
@@ -24,7 +23,7 @@ def main() -> None:
 
 
 def prepare() -> None:
-    """Float64, and compiled programs kept on disk so that the second call of a command answers at once."""
+    """Float64, and compiled programs cached on disk, so that the second call of a command answers at once."""
     # Equinox turns runtime checks into host callbacks, which keep a program out of the cache; results carry a status instead.
     os.environ.setdefault("EQX_ON_ERROR", "nan")
     from jaxvib.runtime.cpu import prepare_cpu
@@ -33,11 +32,11 @@ def prepare() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "jaxvib"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    from jaxvib.errors import InputError
+    from jaxvib.runtime.cache import use_cache
 
-    from jaxvib.runtime.programs import keep_programs
-
-    keep_programs(Path(str(jax.config.values["jax_compilation_cache_dir"])) / "programs")
+    try:
+        use_cache()
+    except InputError as error:
+        print(f"jaxvib: programs are not cached: {error}", file=sys.stderr)
+        jax.config.update("jax_compilation_cache_dir", None)

@@ -1,4 +1,4 @@
-"""JAX's CPU backend made ready for time loops, before it starts."""
+"""XLA's options for time loops on the CPU, set before JAX starts."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import contextlib
 import os
 import platform
 import re
-import sys
 from pathlib import Path
 
 from jaxvib.errors import InputError
+from jaxvib.runtime.compat import accepted_flags, backend_started
 
 __all__ = ["prepare_cpu", "processor"]
 
+_EXTRA = "--xla_backend_extra_options="
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold"
 
 
@@ -25,11 +26,12 @@ def prepare_cpu(devices: int | None = 1) -> str:
         XLA_FLAGS="--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000 ..."
 
     which this does for you: it also asks for vectors of 512 bits where the processor has them, and for `devices` devices in one
-    process, over which `ensemble` spreads its runs. What the environment says already is left as it is.
+    process, over which `ensemble` spreads its runs. Flags that the environment holds already are left as they are, and those
+    that the installed jaxlib does not know are left out: XLA would end the process.
 
-    **Arguments**: `devices`, 1 unless said otherwise; None: as many as this process may use cores.
+    **Arguments**: `devices`, default 1; None: as many as this process may use cores.
 
-    **Returns** the flags. **Raises** `InputError` where JAX has begun to compute already, so that they would go unheard, or
+    **Returns** the flags. **Raises** `InputError` where JAX has begun to compute already, so that they would have no effect, or
     for a number of devices below 1.
 
     >>> import jax.numpy as jnp, jaxvib as jv
@@ -43,29 +45,23 @@ def prepare_cpu(devices: int | None = 1) -> str:
         devices = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
         raise InputError("devices", f"is {devices!r}; it must be a whole number, at least 1, or None for all cores")
-    if _started():
+    if backend_started():
         raise InputError("prepare_cpu", "comes too late, JAX has begun to compute; call it before any array is made")
     flags = os.environ.get("XLA_FLAGS", "").split()
-    options = [f"{_LOOPS}=1000000000"]
+    ours = []
     for place, flag in enumerate(flags):
-        if flag.startswith("--xla_backend_extra_options="):
-            if _LOOPS not in flag:
-                flags[place] = f"{flag},{options[0]}"
-            options = []
-    flags += [f"--xla_backend_extra_options={option}" for option in options]
-    wanted = {"xla_force_host_platform_device_count": devices if devices > 1 else None}
-    wanted["xla_cpu_prefer_vector_width"] = 512 if _has_wide_vectors() else None
-    for name, value in wanted.items():
-        if value is not None and not any(flag.startswith(f"--{name}=") for flag in flags):
-            flags.append(f"--{name}={value}")
+        if flag.startswith(_EXTRA) and _LOOPS not in flag:
+            flags[place] = f"{flag},{_LOOPS}=1000000000"
+    if not any(_LOOPS in flag for flag in flags):
+        ours.append(f"{_EXTRA}{_LOOPS}=1000000000")
+    if devices > 1:
+        ours.append(f"--xla_force_host_platform_device_count={devices}")
+    if _has_wide_vectors():
+        ours.append("--xla_cpu_prefer_vector_width=512")
+    names = [flag.partition("=")[0] for flag in flags]
+    flags += accepted_flags([flag for flag in ours if flag.partition("=")[0] not in names])
     os.environ["XLA_FLAGS"] = " ".join(flags)
     return os.environ["XLA_FLAGS"]
-
-
-def _started() -> bool:
-    """Whether JAX has a backend already; there is no public way to ask without starting one."""
-    bridge = sys.modules.get("jax._src.xla_bridge")
-    return bridge is not None and bool(getattr(bridge, "_backends", None))
 
 
 def _has_wide_vectors() -> bool:
@@ -73,9 +69,9 @@ def _has_wide_vectors() -> bool:
 
 
 def processor() -> str:
-    """The kind of processor this is, with its instruction sets where the system tells them."""
-    told = ""
+    """The kind of processor this is, with its instruction sets where the system lists them."""
+    features = ""
     with contextlib.suppress(OSError):  # Linux only
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        told = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
-    return f"{platform.machine()} {platform.processor()} {told}"
+        features = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return f"{platform.machine()} {platform.processor()} {features}"

@@ -1,147 +1,218 @@
-"""Compiled programs cached on disk, so that the next process that asks the same question neither traces nor compiles."""
+"""Programs cached on disk, so that the next process that asks the same question need not trace them.
+
+A program is stored as `jax.export` writes it, under a line of JSON that describes the structure of its result. What XLA makes
+of it is in JAX's own compilation cache. Nothing that is read is run as Python.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import itertools
+import json
 import os
-import pickle
-import re
 import tempfile
-import uuid
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Hashable, Iterable
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-from jax.core import Tracer
-from jax.experimental import serialize_executable
+from jax import Array, export
 
+from jaxvib.runtime.cache import program_folder
+from jaxvib.runtime.compat import is_tracer
 from jaxvib.runtime.cpu import processor
+from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Undescribable, describe, rebuild
 
-__all__ = ["cached", "keep_programs"]
+__all__ = ["cached"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_folder: list[Path] = []
+_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib"}), "jaxlib", "numpy")
+"""Whose versions a traced program depends on."""
+
+_OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
+"""JAX's options that a traced program depends on."""
 
 
-def keep_programs(folder: Path | None) -> None:
-    """From now on `cached` functions are looked for in `folder` and written there; None: they are not.
+def cached(function: Callable[P, T]) -> Callable[P, T]:
+    """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk after `use_cache`.
 
-    JAX's own compilation cache saves compiling, not tracing and lowering, which take as long for a program of this kind.
-    Whoever can write to the folder can run code as you: it must be your own.
+    Under a JAX transformation it is just the compiled function. The key of a program on disk holds all that it depends on: the
+    shapes and types of arrays, the static parts of the arguments, JAX's options, the versions, when the sources were changed,
+    and the processor. Some programs are not stored, but traced in each process: those with arguments of a class from outside
+    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
     """
-    _folder[:] = [] if folder is None else [folder]
+    return _CachedFunction(function)
 
 
 class _CachedFunction(Generic[P, T]):
-    """`equinox.filter_jit` of a function, whose programs outlive the process where `keep_programs` has named a folder."""
-
     def __init__(self, function: Callable[P, T]):
         self.function = function
         self.jitted = eqx.filter_jit(function)
-        self.ready: dict[str, tuple[Callable[..., list[Any]], Any]] = {}
+        self.ready: dict[Hashable, _Program | None] = {}
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
-        leaves, rest = jax.tree.flatten((args, kwargs))
-        if not _folder or any(isinstance(leaf, Tracer) for leaf in leaves):
+        leaves, treedef = jax.tree.flatten((args, kwargs))
+        folder = program_folder()
+        if folder is None or any(is_tracer(leaf) for leaf in leaves) or _is_debugging():
             return self.jitted(*args, **kwargs)
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        key = self._key(leaves, rest)
-        if key is None:
-            return self.jitted(*args, **kwargs)
-        if key not in self.ready:
-            path = _folder[0] / f"{self.function.__name__}-{key}"
-            self.ready[key] = _read(path) or self._write(path, leaves, rest)
-        run, skeleton = self.ready[key]
-        values = iter(run(*arrays))
-        return jax.tree.map(lambda leaf: next(values) if leaf is _ARRAY else leaf, skeleton)
-
-    def _key(self, leaves: list[Any], rest: Any) -> str | None:
-        """All that the traced program depends on; None where that cannot be told, as with a function made on the spot."""
-        shown = [f"{x.dtype}{x.shape}{jax.typeof(x).weak_type}" if eqx.is_array(x) else repr(x) for x in leaves]
-        modes = [str(jax.config.values[name]) for name in ("jax_enable_x64", "jax_numpy_rank_promotion")]
-        said = "\n".join([self.function.__module__, _sources(), jax.__version__, _machine(), *modes, str(rest), *shown])
-        said = re.sub(r"<function ([\w.]+) at 0x[0-9a-f]+>", r"\1", said)
-        return None if re.search(r" at 0x|<lambda>|<locals>", said) else hashlib.sha256(said.encode()).hexdigest()[:32]
-
-    def _write(self, path: Path, leaves: list[Any], rest: Any) -> tuple[Callable[..., list[Any]], Any]:
-        skeleton: list[Any] = []
-
-        def flat(*arrays: Any) -> list[Any]:
-            given = iter(arrays)
-            args, kwargs = jax.tree.unflatten(rest, [next(given) if eqx.is_array(leaf) else leaf for leaf in leaves])
-            out = self.function(*args, **kwargs)  # pyright: ignore[reportCallIssue]
-            skeleton[:] = [jax.tree.map(lambda leaf: _ARRAY if eqx.is_array(leaf) else leaf, out)]
-            return [jnp.asarray(leaf) for leaf in jax.tree.leaves(out) if eqx.is_array(leaf)]
-
-        # A name of its own keeps JAX's compilation cache away: what that has loaded cannot be written again.
-        flat.__name__ = f"{self.function.__name__}_{uuid.uuid4().hex}"
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        compiled = jax.jit(flat).lower(*arrays).compile()
+        asked = (folder, treedef, tuple(map(_leaf_key, leaves)), _options())
         try:
-            calls = set(re.findall(r'custom_call_target="(\w+)"', compiled.as_text() or ""))
-            if all(name.startswith("lapack_") for name in calls):  # anything else may be an address in this process
-                program, given, given_back = serialize_executable.serialize(compiled)
-                written = pickle.dumps((program, given, given_back, bool(calls), skeleton[0]))
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                    file.write(written)
-                os.replace(file.name, path)  # at once: another process never reads half a program
-        except (RuntimeError, ValueError, TypeError, OSError, pickle.PicklingError, AttributeError):
-            pass  # a program of no fixed form, or a folder that cannot be written: this process has it all the same
-        return compiled, skeleton[0]
+            is_ready = asked in self.ready
+        except TypeError:  # an argument without a hash
+            return self.jitted(*args, **kwargs)
+        if not is_ready:
+            self.ready[asked] = self._program(folder, leaves, treedef)
+        program = self.ready[asked]
+        if program is None:
+            return self.jitted(*args, **kwargs)
+        return program(leaf for leaf in leaves if eqx.is_array(leaf))
+
+    def _program(self, folder: Path, leaves: list[Any], treedef: Any) -> _Program | None:
+        """From the disk, or traced and written there; None where this call has no program that could be stored."""
+        try:
+            path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
+            return _read(path) or self._write(path, leaves, treedef)
+        except Undescribable:
+            return None
+
+    def _key(self, leaves: list[Any], treedef: Any) -> str:
+        def abstract(leaf: Array) -> str:
+            if leaf.sharding.device_set != {jax.devices()[0]}:
+                raise Undescribable("an array is not on the first device")
+            return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
+
+        asked = describe(jax.tree.unflatten(treedef, leaves), abstract)
+        name = f"{self.function.__module__}:{self.function.__qualname__}"
+        return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
+
+    def _write(self, path: Path, leaves: list[Any], treedef: Any) -> _Program:
+        structure: list[Description] = []
+        # Not the arrays of this call, which would live as long as the program.
+        static = [_Slot(k) if eqx.is_array(leaf) else leaf for k, leaf in enumerate(leaves)]
+
+        def flat(*arrays: Array) -> list[Array]:
+            given, found = iter(arrays), []
+            args, kwargs = jax.tree.unflatten(treedef, [next(given) if isinstance(x, _Slot) else x for x in static])
+            out = self.function(*args, **kwargs)  # pyright: ignore[reportCallIssue]
+            structure[:] = [describe(out, found.append)]
+            return found
+
+        jitted = jax.jit(flat)
+        try:
+            exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
+            stored = bytes(exported.serialize())
+        except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
+            if not structure:  # the function's own error
+                raise
+            return _Program.of(jitted, structure[0])
+        program = _Program.of(_compiled(path, exported), structure[0])
+        head = json.dumps({"structure": structure[0]}).encode() + b"\n"
+        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
+            _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
+        return program
 
 
-class _Array:
-    """Stands where an array of a result goes."""
+@dataclasses.dataclass(frozen=True)
+class _Slot:
+    """Stands where an array goes."""
 
-    def __reduce__(self) -> str:
-        return "_ARRAY"
-
-
-_ARRAY = _Array()
+    place: int
 
 
-def _read(path: Path) -> tuple[Callable[..., list[Any]], Any] | None:
+@dataclasses.dataclass(frozen=True)
+class _Program:
+    """A function of all arrays of the arguments, and what its arrays are put into."""
+
+    run: Callable[..., list[Array]]
+    leaves: list[Any]
+    treedef: Any
+
+    @classmethod
+    def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
+        places = itertools.count()
+        leaves, treedef = jax.tree.flatten(rebuild(structure, map(_Slot, places)))
+        if sum(isinstance(leaf, _Slot) for leaf in leaves) != next(places):
+            raise Undescribable("an array of the result is in a static field")
+        return cls(run, leaves, treedef)
+
+    def __call__(self, arrays: Iterable[Array]) -> Any:
+        found = self.run(*arrays)
+        return jax.tree.unflatten(self.treedef, [found[x.place] if isinstance(x, _Slot) else x for x in self.leaves])
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Writes a file at once, so that another process never reads half a program; nothing is left where that fails."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+        try:
+            file.write(content)
+            file.close()
+            os.replace(file.name, path)
+        except OSError:
+            os.unlink(file.name)
+            raise
+
+
+def _read(path: Path) -> _Program | None:
+    """None where there is no such file, where it is another user's, and where it is damaged: it is written anew."""
     try:
-        program, given, given_back, lapack, skeleton = pickle.loads(path.read_bytes())
-        with ThreadPoolExecutor(1) as beside:
-            loaded = beside.submit(
-                serialize_executable.deserialize_and_load, program, given, given_back, execution_devices=jax.devices()[:1]
-            )
-            if lapack:  # JAX binds the library only when it lowers a call of it; an unbound call would end the process
-                jax.jit(jnp.linalg.eigvalsh).lower(jax.ShapeDtypeStruct((1, 1), float))
-            return loaded.result(), skeleton
-    except Exception:  # no such file, or whatever a damaged one makes of its reader: it is written anew
+        with path.open("rb") as file:
+            if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
+                return None
+            digest, _, content = file.read().partition(b"\n")
+        if digest != _digest(content).encode():
+            return None
+        head, _, stored = content.partition(b"\n")
+        exported = export.deserialize(bytearray(stored))
+    except (OSError, ImportError):
         return None
+    return _Program.of(_compiled(path, exported), json.loads(head)["structure"])
+
+
+def _compiled(path: Path, exported: export.Exported) -> Callable[..., list[Array]]:
+    def run(*arrays: Array) -> list[Array]:
+        return exported.call(*arrays)  # pyright: ignore[reportReturnType]
+
+    run.__name__ = path.stem  # part of the key in JAX's compilation cache, which does not hold the processor
+    return jax.jit(run)
+
+
+def _leaf_key(leaf: Any) -> Hashable:
+    if eqx.is_array(leaf):
+        return jax.typeof(leaf), leaf.sharding
+    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
+
+
+def _is_debugging() -> bool:
+    """Whether JAX runs programs operation by operation, or may have to."""
+    return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
+
+
+def _options() -> tuple[Hashable, ...]:
+    return tuple(getattr(jax.config, name) for name in _OPTIONS)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 @functools.cache
 def _sources() -> str:
     """Changes whenever a line of the code that programs are traced from may have changed."""
-    files = [file.stat() for file in sorted(Path(__file__).parent.rglob("*.py"))]
-    versions = [importlib.metadata.version(name) for name in ("jaxlib", "equinox", "diffrax")]
-    return f"{versions} {[(file.st_size, file.st_mtime_ns) for file in files]}"
+    package = Path(__file__).parents[1]
+    files = [file.stat() for file in sorted(package.rglob("*.py"))]
+    versions = [importlib.metadata.version(name) for name in _PACKAGES]
+    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {[(file.st_size, file.st_mtime_ns) for file in files]}"
 
 
 @functools.cache
 def _machine() -> str:
-    """What a compiled program can run on."""
+    """What a program is compiled for."""
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
-
-
-def cached(function: Callable[P, T]) -> Callable[P, T]:
-    """Compiles a function of pytrees, as `equinox.filter_jit` does, and keeps its programs where a folder is named.
-
-    Under a JAX transformation it is just the compiled function. The key holds everything a program depends on: the shapes,
-    the static parts of the arguments, the processor, the versions, and when the sources were changed.
-    """
-    return _CachedFunction(function)

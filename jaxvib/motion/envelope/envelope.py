@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.extend import core
 
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.equations.dynamics import State
@@ -28,6 +27,7 @@ from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -261,7 +261,7 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
         return on_arrays, args
 
     def on_numbers(t: Any, y: Array, args: list[Array]) -> Array:
-        return jnp.stack(core.jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
+        return jnp.stack(jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
 
     return on_numbers, scalars_of(args)
 

@@ -1,0 +1,87 @@
+"""The folder in which compiled programs are cached on disk."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import jax
+
+from jaxvib.errors import InputError
+from jaxvib.runtime.compat import user_folder
+
+__all__ = ["default_folder", "use_cache"]
+
+_folder: list[Path] = []
+
+
+def use_cache(folder: str | os.PathLike[str] | None = None) -> Path:
+    """Caches compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
+
+    Two caches are used: jaxvib's own in `folder/programs`, of traced programs, and JAX's compilation cache, of what XLA makes
+    of them, in `folder` itself (where `jax_compilation_cache_dir` is set already, it stays). The command line does this by
+    itself; from Python it is one line at the start. Programs that differ in shapes, in options, in a version of jaxvib or JAX,
+    or in the processor are kept apart. The folder may be deleted at any time.
+
+    A program that calls back into Python cannot be stored. Those of `simulate` do, for the run-time checks of Equinox, unless
+    the environment has EQX_ON_ERROR=nan before Equinox is imported; statuses of results do not depend on them.
+
+    **Arguments**: `folder`, made where it does not exist; None: the one that JAX caches in already, else
+    `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`.
+
+    **Returns** the folder. **Raises** `InputError` for a folder that cannot be made, that belongs to another user, or in which
+    others may write: whoever can write there can run code as you.
+
+    >>> import jaxvib as jv
+    >>> jv.use_cache("/dev/null")           # doctest: +IGNORE_EXCEPTION_DETAIL
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: folder is '/dev/null'; it must be a folder that can be written to (Not a directory)
+    """
+    path = (default_folder() if folder is None else Path(folder)).expanduser().absolute()
+    programs = path / "programs"
+    try:
+        programs.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("folder", f"is '{path}'; it must be a folder that can be written to ({error.strerror})") from error
+    for place in (path, programs):
+        require_own(place)
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_compilation_cache_dir", str(path))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    keep_programs(programs)
+    return path
+
+
+def default_folder() -> Path:
+    """Where programs are cached if no folder is named."""
+    set_already = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    return Path(set_already or user_folder())
+
+
+def keep_programs(folder: Path | None) -> None:
+    """From now on traced programs are looked for in `folder` and written there; None: they are not."""
+    _folder[:] = [] if folder is None else [folder]
+
+
+def program_folder() -> Path | None:
+    """Where traced programs are cached; None where they are not."""
+    return _folder[0] if _folder else None
+
+
+def require_own(folder: Path) -> None:
+    """**Raises** `InputError` where another user may write to a folder, or put another one in its place."""
+    if not hasattr(os, "geteuid"):  # Windows: a home folder is its owner's
+        return
+    for place in (folder, *folder.resolve().parents):
+        found = place.stat()
+        mode = stat.S_IMODE(found.st_mode)
+        if found.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
+            raise InputError("folder", f"is '{folder}'; it must be your own, but '{place}' belongs to user {found.st_uid}")
+        others = mode & (stat.S_IWGRP | stat.S_IWOTH if place == folder else stat.S_IWOTH)
+        if others and not (mode & stat.S_ISVTX and place != folder):
+            raise InputError(
+                "folder",
+                f"is '{folder}'; it must be yours alone, but others may write to '{place}', do chmod go-w '{place}'",
+            )

@@ -1,0 +1,118 @@
+"""All that the project uses of JAX and XLA beyond what they promise to keep, each with what is done without it.
+
+tests/runtime/test_compat.py has a test for each, which fails by its name when a new version changes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+
+__all__ = [
+    "HAS_JAXPRS",
+    "ClosedJaxpr",
+    "Jaxpr",
+    "Literal",
+    "accepted_flags",
+    "backend_started",
+    "custom_vmap",
+    "is_tracer",
+    "jaxpr_as_fun",
+    "user_folder",
+]
+
+_TESTED = ((0, 10), (0, 12))
+"""The first and the last version of jaxlib (major, minor) that knows all flags of `prepare_cpu`."""
+
+try:
+    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+    HAS_JAXPRS = True
+except ImportError:
+    HAS_JAXPRS = False
+    if not TYPE_CHECKING:
+        ClosedJaxpr = Jaxpr = Literal = jaxpr_as_fun = None
+"""Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
+
+
+class _PlainVmap:
+    """In place of `jax.custom_batching.custom_vmap`: JAX's own rule, by which the function is mapped operation by operation."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+
+    def def_vmap(self, rule: Callable[..., Any]) -> Callable[..., Any]:
+        return rule
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+
+custom_vmap: Any = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
+"""A function with a rule of its own for `vmap`. Without it the results are the same, and slower."""
+
+
+def is_tracer(value: object) -> bool:
+    """Whether JAX is transforming the computation that `value` is part of, so that it has no number yet.
+
+    >>> is_tracer(1.0)
+    False
+    """
+    tracer = getattr(getattr(jax, "core", None), "Tracer", None)
+    if tracer is not None:
+        return isinstance(value, tracer)
+    try:
+        return isinstance(value, jax.Array) and not value.devices()
+    except jax.errors.ConcretizationTypeError:
+        return True
+
+
+def backend_started() -> bool:
+    """Whether JAX has begun to compute, so that flags for the compiler come too late; False where that cannot be found out.
+
+    There is no public way to ask without starting a backend.
+    """
+    return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
+
+
+def accepted_flags(flags: list[str]) -> list[str]:
+    """Those of XLA's `flags` that this jaxlib knows: XLA ends the process at the first one in XLA_FLAGS that it does not know.
+
+    A version that is not known to accept them is asked, in a process of its own (seconds); the answer is remembered in a file.
+    """
+    version = importlib.metadata.version("jaxlib")
+    number = tuple(int(part) for part in version.split(".")[:2])
+    if _TESTED[0] <= number <= _TESTED[1]:
+        return flags
+    path = user_folder() / f"flags-{version}.json"
+    answers: dict[str, bool] = {}
+    with contextlib.suppress(OSError, ValueError):
+        answers = {str(flag): answer is True for flag, answer in json.loads(path.read_text()).items()}
+    asked = [flag for flag in flags if flag not in answers]
+    if asked:
+        answers |= {flag: starts_with([flag]) for flag in asked}
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            path.write_text(json.dumps(answers))
+    return [flag for flag in flags if answers[flag]]
+
+
+def starts_with(flags: list[str]) -> bool:
+    """Whether JAX starts with these XLA_FLAGS, tried in a process of its own."""
+    environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
+
+
+def user_folder() -> Path:
+    """`$XDG_CACHE_HOME/jaxvib`, or `~/.cache/jaxvib`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxvib"

@@ -1,0 +1,121 @@
+"""A tree of dataclasses, tuples, lists and dictionaries described in JSON, and made from such a description again.
+
+JSON holds no code: a description can name classes and functions of known packages, and nothing that is named is called.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+
+__all__ = ["KNOWN_PACKAGES", "Description", "Undescribable", "describe", "rebuild"]
+
+Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
+"""What JSON can hold."""
+
+KNOWN_PACKAGES = {"jaxvib", "jax", "equinox", "diffrax", "optimistix", "lineax"}
+"""Whose classes and functions a description may name: their sources and versions are known."""
+
+
+class Undescribable(Exception):
+    """A value that has no description: a function without a name, or of a class that is not of a known package."""
+
+
+def describe(value: Any, array: Callable[[Any], Description]) -> Description:
+    """The description of a tree; `array` gives that of an array in it.
+
+    **Raises** `Undescribable`.
+
+    >>> describe({"a": (1, None)}, lambda x: str(x.dtype))
+    {'dict': [['a', {'tuple': [1, None]}]]}
+    """
+    inner = functools.partial(describe, array=array)
+    match value:
+        case jax.Array() | np.ndarray():
+            return {"array": array(value)}
+        case None | bool() | int() | float() | str() if type(value) in (type(None), bool, int, float, str):
+            return value
+        case list() if type(value) is list:
+            return {"list": [inner(x) for x in value]}
+        case tuple() if type(value) is tuple:
+            return {"tuple": [inner(x) for x in value]}
+        case dict() if type(value) is dict:
+            return {"dict": [[inner(key), inner(x)] for key, x in value.items()]}
+    if isinstance(value, type) or inspect.isroutine(value):
+        return {"name": _name(value)}
+    try:
+        return {"class": _name(type(value)), "fields": [inner(getattr(value, name)) for name in _fields(type(value))]}
+    except AttributeError as error:
+        raise Undescribable(str(error)) from error
+
+
+def rebuild(description: Description, arrays: Iterator[Any]) -> Any:
+    """The tree of a description; its arrays are taken from `arrays` in the order in which `describe` met them.
+
+    **Raises** `Undescribable` for a description that `describe` cannot have given.
+
+    >>> rebuild({"dict": [["a", {"tuple": [1, None]}]]}, iter(()))
+    {'a': (1, None)}
+    """
+    match description:
+        case None | bool() | int() | float() | str():
+            return description
+        case {"array": _}:
+            return next(arrays)
+        case {"list": [*items]}:
+            return [rebuild(x, arrays) for x in items]
+        case {"tuple": [*items]}:
+            return tuple(rebuild(x, arrays) for x in items)
+        case {"dict": [*items]}:
+            return {rebuild(key, arrays): rebuild(x, arrays) for key, x in items}  # pyright: ignore
+        case {"name": str() as name}:
+            return _named(name)
+        case {"class": str() as name, "fields": [*items]}:
+            return _instance(_named(name), [rebuild(x, arrays) for x in items])
+    raise Undescribable(f"{description!r} describes nothing")
+
+
+def _fields(kind: type) -> list[str]:
+    if dataclasses.is_dataclass(kind):
+        return [field.name for field in dataclasses.fields(kind)]
+    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
+        return list(kind._fields)  # pyright: ignore[reportAttributeAccessIssue]
+    raise Undescribable(f"{kind} is no dataclass")
+
+
+def _instance(kind: Any, values: list[Any]) -> Any:
+    """An object with these values in its fields; its constructor, which may convert and check them, is not called."""
+    if not isinstance(kind, type):
+        raise Undescribable(f"{kind} is no class")
+    names = _fields(kind)
+    if issubclass(kind, tuple):
+        return tuple.__new__(kind, values)
+    made = object.__new__(kind)
+    for name, value in zip(names, values, strict=True):
+        object.__setattr__(made, name, value)
+    return made
+
+
+def _name(value: Any) -> str:
+    """`module:name` of a class or function that can be found by it."""
+    name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
+    if _named(name) is not value:
+        raise Undescribable(f"{value!r} cannot be found by its name")
+    return name
+
+
+def _named(name: str) -> Any:
+    module, _, path = name.partition(":")
+    if module.partition(".")[0] not in KNOWN_PACKAGES:
+        raise Undescribable(f"{name} is not of a known package")
+    try:
+        return functools.reduce(getattr, path.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError) as error:
+        raise Undescribable(f"{name} cannot be found") from error

@@ -1,0 +1,123 @@
+"""What may change in a new version of JAX, XLA or diffrax: each test names one thing."""
+
+import importlib.metadata
+import json
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.runtime import compat
+
+
+def test_backend_started_is_false_before_the_first_array_and_true_after():
+    """jax._src.xla_bridge._backends."""
+    code = """
+import jax.numpy as jnp
+from jaxvib.runtime.compat import backend_started
+before = backend_started()
+jnp.zeros(1)
+print(before, backend_started())
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == ["False", "True"]
+
+
+def test_tracers_are_recognized(monkeypatch):
+    """jax.core.Tracer; and the fallback where it is gone."""
+
+    def answers():
+        found = []
+        for transform in (jax.jit, jax.grad, jax.jacfwd):
+            transform(lambda x: found.append(compat.is_tracer(x)) or x)(1.0)
+        return [*found, *map(compat.is_tracer, (1.0, None, np.ones(2), jnp.ones(2)))]
+
+    expected = [True] * 3 + [False] * 4
+    assert answers() == expected
+    monkeypatch.delattr(jax.core, "Tracer")
+    assert answers() == expected
+
+
+def test_jaxprs_can_be_read_and_run():
+    """jax.extend.core: jaxpr_as_fun, Literal, Jaxpr, ClosedJaxpr; the fields and the primitives of equations."""
+    assert compat.HAS_JAXPRS
+    closed = jax.make_jaxpr(lambda x: jnp.sin(x) + 2.0)(1.0)
+    assert isinstance(closed, compat.ClosedJaxpr) and isinstance(closed.jaxpr, compat.Jaxpr)
+    sine, plus = closed.jaxpr.eqns
+    assert (sine.primitive.name, plus.primitive.name) == ("sin", "add")
+    assert isinstance(plus.invars[1], compat.Literal) and plus.invars[1].val == 2.0
+    (value,) = compat.jaxpr_as_fun(closed)(jnp.asarray(1.0))
+    assert float(value) == float(sine.primitive.bind(jnp.asarray(1.0), **sine.params)) + 2.0
+
+
+@pytest.mark.parametrize("kind", [compat.custom_vmap, compat._PlainVmap])
+def test_functions_can_have_a_rule_for_vmap(kind):
+    """jax.custom_batching.custom_vmap; without it the rule is left out."""
+    assert compat.custom_vmap is jax.custom_batching.custom_vmap
+    called = []
+
+    @kind
+    def square(x):
+        return x**2
+
+    @square.def_vmap
+    def _(size, is_mapped, x):
+        called.append((size, is_mapped))
+        return x**2, True
+
+    assert jax.vmap(square)(jnp.asarray([1.0, 3.0])).tolist() == [1.0, 9.0]
+    assert called == ([] if kind is compat._PlainVmap else [(2, [True])])
+
+
+def test_options_of_jax_can_be_read():
+    """Attributes of jax.config; each changes the key of a cached program or where it is cached."""
+    from jaxvib.runtime.programs import _OPTIONS, _is_debugging
+
+    assert jax.config.jax_enable_x64 is True and jax.config.jax_compilation_cache_dir
+    assert all(hasattr(jax.config, name) for name in _OPTIONS) and not _is_debugging()
+    for option in (jax.disable_jit(), jax.debug_nans(True), jax.debug_infs(True)):
+        with option:
+            assert _is_debugging()
+
+
+def test_this_jaxlib_starts_with_the_flags_of_prepare_cpu():
+    """Flags that XLA does not know end the process."""
+    code = "import os; os.environ.pop('XLA_FLAGS', None); import jaxvib as jv; print(jv.prepare_cpu(2))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    flags = done.stdout.split()
+    assert len(flags) >= 2 and compat.starts_with(flags)
+
+
+def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
+    """The answer is remembered by version; a file of answers that is damaged is written anew."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    flags = ["--xla_force_host_platform_device_count=2", "--xla_no_such_flag=1"]
+    assert compat.accepted_flags(flags) == flags  # a known version is not asked
+
+    version = importlib.metadata.version
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "99.1.0" if name == "jaxlib" else version(name))
+    (tmp_path / "jaxvib").mkdir()
+    (tmp_path / "jaxvib" / "flags-99.1.0.json").write_text("{")
+    assert compat.accepted_flags(flags) == flags[:1]
+    assert json.loads((tmp_path / "jaxvib" / "flags-99.1.0.json").read_text()) == {flags[0]: True, flags[1]: False}
+    monkeypatch.setattr(compat, "starts_with", lambda flags: pytest.fail("asked again"))
+    assert compat.accepted_flags(flags) == flags[:1]
+
+
+def test_private_modules_are_used_in_one_file_only():
+    """No other module reaches into private or unstable parts of JAX and diffrax."""
+    package = pathlib.Path(jv.__file__).parent
+    private = ("jax._src", "jax.extend", "jax.core", "jax.custom_batching", "config.values", "eval_coeffs")
+    found = {
+        f"{path.relative_to(package)}: {name}"
+        for path in package.rglob("*.py")
+        for name in private
+        if path.name != "compat.py" and name in path.read_text()
+    }
+    engine = {"dopri8.py: eval_coeffs", "scalarize.py: jax.extend", "batching.py: jax.custom_batching"}
+    assert found - {f"ode/{entry}" for entry in engine} - {"motion/system.py: jax.extend"} == set()

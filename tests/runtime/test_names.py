@@ -1,0 +1,31 @@
+"""Names that are imported when they are asked for."""
+
+import ast
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+import jaxvib as jv
+
+
+def test_an_import_loads_little():
+    """The package alone needs nothing; a jam mode needs neither pictures nor the time integrator."""
+    code = """
+import sys, jaxvib
+assert not {"jax", "matplotlib", "diffrax", "pint"} & set(sys.modules)
+jaxvib.jam_modes
+assert "jax" in sys.modules and not {"matplotlib", "diffrax", "pint", "rich", "optax"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_is_there():
+    """The stub is the one list of names: each is found, and __all__ of the stub leaves none out."""
+    stub = ast.parse(pathlib.Path(jv.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    (listed,) = [ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign)]
+    assert sorted(listed) == jv.__all__ and set(jv.__all__) <= set(dir(jv))
+    assert all(getattr(jv, name).__name__ for name in jv.__all__ if callable(getattr(jv, name)))
+    with pytest.raises(AttributeError, match="no attribute 'jam_mode'"):
+        _ = jv.jam_mode
