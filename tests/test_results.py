@@ -22,7 +22,7 @@ from jaxvib.steady.jams.phase_search import phase_branch
 from jaxvib.steady.orbits.diagram import SpecialPoint
 from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
-from jaxvib.study.accuracy.tiers import Tier, Tiers
+from jaxvib.study.accuracy.tiers import Tiers, TierValues
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
 from optimize.synthesize import Outcome, Synthesis
@@ -59,7 +59,7 @@ def run_ups():
 
 
 def tiers():
-    light = Tier(np.array([5.0, np.nan]), np.ones((2, 1)), np.ones(2), np.array([True, False]), ("there", "absent"))
+    light = TierValues(np.array([5.0, np.nan]), np.ones((2, 1)), np.ones(2), np.array([True, False]), ("there", "absent"))
     return Tiers(np.array([0.1, 1.0]), light, eqx.tree_at(lambda t: t.omega, light, np.array([5.1, 5.2])))
 
 

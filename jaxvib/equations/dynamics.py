@@ -19,7 +19,7 @@ from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, times
 
-__all__ = ["Dynamics", "State", "rotor_angle", "rotor_speed", "vector_field"]
+__all__ = ["Dynamics", "State", "vector_field"]
 
 
 class State(eqx.Module):
@@ -35,6 +35,16 @@ class State(eqx.Module):
     angle: tuple[Array, ...]
     rate: tuple[Array, ...]
     rotor: tuple[Array, Array] | None = None
+
+    @property
+    def azimuth(self) -> Array:
+        """The loads' angles about the rotor's axis, (..., count) rad: the first of their coordinates."""
+        return self.angle[0]
+
+    @property
+    def azimuth_rate(self) -> Array:
+        """Their rates, (..., count) rad/s."""
+        return self.rate[0]
 
 
 class _Support(eqx.Module):
@@ -93,7 +103,7 @@ class Dynamics(eqx.Module):
         A motor's rotor that is out of balance is one more such body. What is left is (1 + mobility W) a = a_free - mobility g,
         one equation for each row of P, however many platforms and loads there are.
         """
-        speed = rotor_speed(self.drive, t, state)
+        speed = self.drive.rotor_speed(t, state.rotor)
         unforced = self._unforced(state, speed)
         throw = self._throw(t, state)
         loads = _kinematics(self.loads, state.angle, state.rate)
@@ -188,7 +198,7 @@ class Dynamics(eqx.Module):
         """With d(theta) (nP,) what is out of balance: d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2."""
         if not any(effect.has_imbalance for effect in self.effects):
             return None
-        turn, rate = rotor_angle(self.drive, t, state), rotor_speed(self.drive, t, state)
+        turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
 
         def thrown(angle: Array) -> tuple[Array, ...]:
             found = [imbalance for imbalance in (effect.imbalance(angle) for effect in self.effects) if imbalance is not None]
@@ -288,24 +298,6 @@ def vector_field(scene: Scene) -> Dynamics:
         effects=effects,
         axes=carrier.axes,
     )
-
-
-def rotor_speed(drive: Drive, t: Array, state: State) -> Array:
-    """The rotor's speed at time `t` in `state`, rad/s."""
-    if isinstance(drive, Motor):
-        assert state.rotor is not None
-        return state.rotor[1]
-    assert isinstance(drive, IdealDrive)
-    return drive.speed_at(t)
-
-
-def rotor_angle(drive: Drive, t: Array, state: State) -> Array:
-    """The rotor's angle at time `t` in `state`, rad."""
-    if isinstance(drive, Motor):
-        assert state.rotor is not None
-        return state.rotor[0]
-    assert isinstance(drive, IdealDrive)
-    return drive.angle_at(t)
 
 
 def _signed(friction: Friction, a: dict[int, Any]) -> Friction:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_field
+from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.machine.drive import Motor
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
@@ -62,7 +62,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
         if rows is not None:
             parts.append(effect.support_potential(rows @ q))
     t = jnp.asarray(t, q.dtype)
-    turn, rate = rotor_angle(scene.drive, t, state), rotor_speed(scene.drive, t, state)
+    turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     parts.append(rate * _throw_rate(scene, turn) @ v)
     if isinstance(scene.drive, Motor):
         parts.append(0.5 * scene.drive.inertia * rate**2)
@@ -77,7 +77,7 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     M_j = b_W R^2 (speed - phi_j') + friction
     """
     carrier, loads = scene.machine.carrier(), scene.loads
-    turn, speed = rotor_angle(scene.drive, t, state), rotor_speed(scene.drive, t, state)
+    turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     acceleration = vector_field(scene)(t, state).velocity
     at_load = carrier.point_rates(acceleration)
     torque = loads.resistance(state.angle, state.rate, speed)

@@ -259,7 +259,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, 
     helds, taken = jax.lax.map(whole, counts)
     # Wrapped angles are counted from the first of the states that are asked for together.
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
-    angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).angle[0]
+    angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).azimuth
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
     finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
     # A run whose coarser one did not stay finite has an error that nobody knows.

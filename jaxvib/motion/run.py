@@ -99,7 +99,7 @@ class Run(AbstractMeasured, Result):
         return time_histories(
             np.asarray(kept.time),
             np.asarray(kept.state.displacement),
-            np.asarray(kept.state.rate[0]),
+            np.asarray(kept.state.azimuth_rate),
             np.asarray(kept.foundation_force),
             np.asarray(kept.rotor_speed),
             names=self.scene.machine.structure().coordinates,

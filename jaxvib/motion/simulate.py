@@ -282,7 +282,7 @@ def last_state(scene: Scene, run: Run) -> State:
     """Where a run under a constant speed ended, as a state to go on from: angles within a turn keep their digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), run.window.state)
     _, together = wrap_angles(scene, last.displacement.dtype)
-    first = np.ravel(last.angle[0])[0]
+    first = np.ravel(last.azimuth)[0]
     inside = tuple(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi)) for x in last.angle)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, rotor_angle, rotor_speed, vector_field
+from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import _extremum, _places
@@ -81,8 +81,8 @@ class Measured(AbstractMeasured):
 def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
     """States at times, with the forces and rotor speeds that belong to them."""
     force = jax.vmap(lambda s: foundation_force(scene, s))(states)
-    angle = jax.vmap(lambda t, s: rotor_angle(scene.drive, t, s))(times, states)
-    speed = jax.vmap(lambda t, s: rotor_speed(scene.drive, t, s))(times, states)
+    angle = jax.vmap(lambda t, s: scene.drive.rotor_angle(t, s.rotor))(times, states)
+    speed = jax.vmap(lambda t, s: scene.drive.rotor_speed(t, s.rotor))(times, states)
     return Trajectory(times, states, force, angle, speed)
 
 
@@ -96,7 +96,7 @@ def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured
     early, late, whole = _spans(scene, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
-    phi, rate = states.angle[0], states.rate[0]
+    phi, rate = states.azimuth, states.azimuth_rate
     turning = jax.vmap(lambda p, w: _mean_speed(times, p, w), in_axes=1)
     speeds = turning(phi, rate)
     late_speeds = jax.vmap(lambda p, w: _mean_speed(times[half:], p, w), in_axes=1)(phi[half:], rate[half:])

@@ -138,7 +138,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     (True, 1)
     """
     times, state = stretch.time, stretch.state
-    phi, rate = state.angle[0], state.rate[0]
+    phi, rate = state.azimuth, state.azimuth_rate
     half = times.shape[0] // 2
     turn = stretch.rotor_angle
 

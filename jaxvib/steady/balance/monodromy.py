@@ -44,9 +44,9 @@ def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
     def rate(turn: Array, x: Array) -> Array:
         base = balanced_motion(scene, angles, turn)
         e = x * sizes
-        state = State(e[:nd], e[nd : 2 * nd], (base.angle[0] + e[2 * nd : 2 * nd + n],), (base.rate[0] + e[2 * nd + n :],))
+        state = State(e[:nd], e[nd : 2 * nd], (base.azimuth + e[2 * nd : 2 * nd + n],), (base.azimuth_rate + e[2 * nd + n :],))
         change = field(turn / speed, state)
-        return jnp.concatenate([change.displacement, change.velocity, change.angle[0], change.rate[0]]) / (sizes * speed)
+        return jnp.concatenate([change.displacement, change.velocity, change.azimuth, change.azimuth_rate]) / (sizes * speed)
 
     def generator(turn: Array) -> Array:
         return jax.jacfwd(lambda x: rate(turn, x))(jnp.zeros_like(sizes))

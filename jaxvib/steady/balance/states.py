@@ -371,7 +371,7 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
     speed = float(scene.drive.speed)
     for turn in (0.0, 1.0, 2.0):
         change = field(jnp.asarray(turn / speed), balanced_motion(scene, jnp.asarray(angles), jnp.asarray(turn)))
-        if float(jnp.max(jnp.abs(change.rate[0]))) > 1e-9 * speed**2:
+        if float(jnp.max(jnp.abs(change.azimuth_rate))) > 1e-9 * speed**2:
             raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
 
 

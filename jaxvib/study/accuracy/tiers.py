@@ -21,10 +21,10 @@ from jaxvib.steady.orbits.orbit import Orbit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Tier", "Tiers", "compare_tiers"]
+__all__ = ["TierValues", "Tiers", "compare_tiers"]
 
 
-class Tier(eqx.Module):
+class TierValues(eqx.Module):
     """One tier's answers, NaN where it has none: `omega` (n,) rad/s, `amplitude` (n, nd) m, `foundation_force` (n,) N,
     `stable` (n,); `message` (n sentences) says of each whether it is there, or why not."""
 
@@ -41,8 +41,8 @@ class Tiers(Result):
     status = Computed.done
 
     mass: np.ndarray = eqx.field(metadata=in_unit("kg", "mass"))
-    leading: Tier = eqx.field(metadata=part(prefix="leading_"))
-    exact: Tier = eqx.field(metadata=part(prefix="exact_"))
+    leading: TierValues = eqx.field(metadata=part(prefix="leading_"))
+    exact: TierValues = eqx.field(metadata=part(prefix="exact_"))
 
     def summary(self) -> str:
         """A line for each mass: the load speed by both tiers, or why there is none, for a person to read."""
@@ -98,10 +98,10 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
         now = eqx.tree_at(lambda s: s.loads, scene, heavier)
         answers.append((jam_modes(now).select(mode, throw=False), jam_orbit(now, mode=mode, throw=False)))
 
-    def tier(which: int) -> Tier:
+    def tier(which: int) -> TierValues:
         jams = [answer[which] for answer in answers]
         names = ("omega", "amplitude", "foundation_force", "stable")
         numbers = (np.stack([np.asarray(getattr(jam, name)) for jam in jams]) for name in names)
-        return Tier(*numbers, message=tuple(jam.message for jam in jams))
+        return TierValues(*numbers, message=tuple(jam.message for jam in jams))
 
     return Tiers(float(jnp.mean(loads.mass)) * np.asarray(factors, dtype=float), tier(0), tier(1))

@@ -12,9 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.collected import has_half_turn
 from jaxvib.equations.dynamics import State
-from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
@@ -26,8 +24,9 @@ from jaxvib.motion.start import initial_state
 from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
+from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, ExactJam, collocation_points, exact_jam, slow_period, unstable
+from jaxvib.study.accuracy.gradient_precision import gradient_precision
 from jaxvib.units import Number, count, number
 
 __all__ = ["QUANTITIES", "SOLVERS", "work_precision"]
@@ -44,14 +43,6 @@ _AVERAGED = (1e-3, 1e-6)
 
 _SINGLE = 2e-6
 """The smallest tolerance that single precision is asked for."""
-
-_GRADIENT_TOLERANCE = 1e-8
-
-_MOST_NOTED = 2**17
-"""Steps that a run may take whose derivatives are asked for: the end of each is noted."""
-
-_SLOW_PERIODS, _MOST_PERIODS = 20.0, 2000.0
-"""The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
 
 
 def work_precision(
@@ -120,18 +111,14 @@ def work_precision(
     if quantity == "final_state":
         return _final_state(ask, end)
     if quantity == "gradient":
-        return _gradient(scene, _exact_jam(scene, mode), end, repeats)
+        return gradient_precision(scene, exact_jam(scene, mode), end, repeats)
     try:
-        jam = _exact_jam(scene, mode)
+        jam = exact_jam(scene, mode)
     except InputError as problem:
         if mode is not None:
             raise
         return _at_the_end(ask, quantity, end, f"leading order, exact orbit: {problem}")
     return _steady(ask, quantity, jam, end)
-
-
-_Way = tuple[str, str, str, Callable[..., Any]]
-"""Tier, method and setting in words, and the gradient at stiffnesses."""
 
 
 class _Ask(NamedTuple):
@@ -141,48 +128,12 @@ class _Ask(NamedTuple):
     repeats: int
 
 
-class _Jam(NamedTuple):
-    """A jam mode exactly, with many points and fewer."""
-
-    mode: int
-    fine: Orbit
-    coarse: Orbit
-
-    def length(self, scene: Scene, tolerance: float) -> float:
-        """How long a run takes to forget its start to the tolerance, s, the measuring window after that; of a stable jam."""
-        rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
-        window = _slow_period(scene) * _SLOW_PERIODS
-        return min(window + np.log(1.0 / tolerance) / rate, _slow_period(scene) * _MOST_PERIODS)
-
-
-def _exact_jam(scene: Scene, mode: int | None) -> _Jam:
-    if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
-    modes = jam_modes(scene)
-    if mode is None:
-        rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
-        if not rising:
-            raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
-        mode = rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
-    return _Jam(mode, *(jam_orbit(scene, mode=mode, points=_whole(scene, points)) for points in (32, 24)))
-
-
-def _whole(scene: Scene, points: int) -> int:
-    """So many points on half a period, or as close together on a whole one where that is needed."""
-    return points if has_half_turn(scene) else 2 * points + 1
-
-
-def _slow_period(scene: Scene) -> float:
-    frequencies = natural_frequencies(scene)
-    return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
-
-
 def _single(tree: Any) -> Any:
     """A scene, or more, in single precision; goes with `jax.enable_x64(False)`."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
 
-def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
+def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     scene, mode = ask.scene, jam.mode
 
     def read(found: Any) -> Any:
@@ -208,11 +159,11 @@ def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
         start = State(*jam.fine.at(jnp.zeros(())))
         left_out.append(f"leading order: {light.message}; runs start on the exact motion in its place")
     for few in _POINTS:
-        points = _whole(scene, few)
+        points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
         rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
     if not bool(jam.fine.stable):
-        left_out.append(_unstable("envelope, full", jam))
+        left_out.append(unstable("envelope, full", jam))
     else:
 
         def length(tolerance: float) -> float:
@@ -225,7 +176,7 @@ def _steady(ask: _Ask, quantity: str, jam: _Jam, end: float | None) -> Cost:
 
 def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
     """Of a motion that is no jam: as measured at the end of a run from rest."""
-    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+    end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
 
     def read(found: Any) -> Any:
         return getattr(found, quantity)
@@ -287,7 +238,7 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
                 max_steps=steps,
                 throw=False,
             )
-            return simulate(scene, ends[tolerance], start=start, save="window", **asked)  # pyright: ignore[reportArgumentType]
+            return simulate(scene, ends[tolerance], start=start, **asked)  # pyright: ignore[reportArgumentType]
 
         return [
             row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
@@ -308,7 +259,7 @@ def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], An
 
 
 def _final_state(ask: _Ask, end: float | None) -> Cost:
-    end = _SLOW_PERIODS * _slow_period(ask.scene) if end is None else end
+    end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
     best = functools.cache(lambda: simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(1e-13)))
 
     @functools.cache
@@ -329,73 +280,3 @@ def _final_state(ask: _Ask, end: float | None) -> Cost:
 
 def _last(run: Run) -> State:
     return jax.tree.map(lambda leaf: np.asarray(leaf[-1], float), run.window.state)
-
-
-def _gradient(scene: Scene, jam: _Jam, end: float | None, repeats: int) -> Cost:
-    mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
-    stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
-    few, more, most = (_whole(scene, points) for points in (16, 24, 32))
-
-    def at(k: Any) -> Scene:
-        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
-
-    def exact(k: Any, points: int = few) -> Any:
-        return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
-
-    def leading(k: Any) -> Any:
-        return jnp.max(jam_modes(at(k)).select(mode).amplitude)
-
-    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
-    ways: list[_Way] = [
-        ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
-        ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
-    ]
-    left_out: list[str] = []
-    light = jam_modes(scene).select(mode, throw=False)
-    if not bool(light.status == JamStatus.found):
-        left_out = [f"leading order, full, which starts from it: {light.message}"]
-    else:
-        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
-        if not bool(jam.fine.stable):
-            left_out = [_unstable("full", jam)]
-        else:
-            ways += _by_runs(scene, at, jam, end)
-    rows = [
-        row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
-        for tier, method, setting, f in ways
-    ]
-    return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
-
-
-def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: _Jam, end: float | None) -> list[_Way]:
-    """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
-    until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
-    max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
-
-    def full(k: Any, adjoint: Any = None) -> Any:
-        asked = dict(save="window", stepsize_controller=Tolerance(_GRADIENT_TOLERANCE), max_steps=max_steps, throw=False)
-        run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
-        return jnp.max(run.amplitude)
-
-    value = eqx.filter_jit(full)
-    ways: list[tuple[str, Callable[..., Any]]] = [
-        ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
-        ("reverse", jax.jit(jax.grad(full))),
-        ("finite differences", lambda k: _differences(value, k)),
-    ]
-    return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
-
-
-def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
-    """Central differences, each number moved by 1e-5 of itself; 0 for those that are 0."""
-    steps = 1e-5 * np.asarray(at)
-    whole = np.zeros(len(steps))
-    for k in np.flatnonzero(steps):
-        move = np.eye(len(steps))[k] * steps[k]
-        whole[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
-    return whole
-
-
-def _unstable(tiers: str, jam: _Jam) -> str:
-    largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
-    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

@@ -154,7 +154,7 @@ def run_ups(
     elif starts is not None:
         sets = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
     else:
-        sets = np.asarray(initial_state(scene).angle[0])[None]
+        sets = np.asarray(initial_state(scene).azimuth)[None]
     count(batch, "batch")
 
     grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))

@@ -1,0 +1,69 @@
+"""Exact jams as references of work-precision diagrams."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit
+
+__all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_period", "unstable"]
+
+
+SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
+"""The measuring window at the end of a run, and the longest run that is asked for, in slow periods."""
+
+
+class ExactJam(NamedTuple):
+    """A jam mode exactly, with many points and fewer."""
+
+    mode: int
+    fine: Orbit
+    coarse: Orbit
+
+    def length(self, scene: Scene, tolerance: float) -> float:
+        """How long a run takes to forget its start to the tolerance, s, the measuring window after that; of a stable jam."""
+        rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
+        window = slow_period(scene) * SLOW_PERIODS
+        return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
+
+
+def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
+    """The exact jam of a mode, the last but one that is stable by its slope where none is named.
+
+    **Raises** `InputError` for a drive whose speed is not constant, and where no mode is stable.
+    """
+    if not scene.drive.constant:
+        raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
+    modes = jam_modes(scene)
+    if mode is None:
+        rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
+        if not rising:
+            raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
+        mode = rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
+    return ExactJam(mode, *(jam_orbit(scene, mode=mode, points=collocation_points(scene, points)) for points in (32, 24)))
+
+
+def collocation_points(scene: Scene, points: int) -> int:
+    """So many points on half a period, or as close together on a whole one where that is needed."""
+    return points if has_half_turn(scene) else 2 * points + 1
+
+
+def slow_period(scene: Scene) -> float:
+    """The longest period of the carrier's natural motions, s."""
+    frequencies = natural_frequencies(scene)
+    return float(2.0 * jnp.pi / jnp.min(jnp.where(frequencies > 0.0, frequencies, scene.drive.speed)))
+
+
+def unstable(tiers: str, jam: ExactJam) -> str:
+    """Why tiers that integrate in time cannot answer for an unstable jam, a sentence."""
+    largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
+    return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

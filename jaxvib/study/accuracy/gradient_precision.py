@@ -1,0 +1,97 @@
+"""Work-precision of gradients: implicit, through time, and by finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.steps import Tolerance
+from jaxvib.steady.jams.jam import JamStatus, jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.study.accuracy.cost import Cost, relative, row_of
+from jaxvib.study.accuracy.exact_reference import ExactJam, collocation_points, unstable
+
+__all__ = ["gradient_precision"]
+
+
+_GRADIENT_TOLERANCE = 1e-8
+
+_MOST_NOTED = 2**17
+"""Steps that a run may take whose derivatives are asked for: the end of each is noted."""
+
+_Way = tuple[str, str, str, Callable[..., Any]]
+"""Tier, method and setting in words, and the gradient at stiffnesses."""
+
+
+def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: int) -> Cost:
+    """The gradient of a jam's largest amplitude by the supports' stiffnesses, in every way there is; see `work_precision`."""
+    mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
+    stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
+    few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
+
+    def at(k: Any) -> Scene:
+        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
+
+    def exact(k: Any, points: int = few) -> Any:
+        return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
+
+    def leading(k: Any) -> Any:
+        return jnp.max(jam_modes(at(k)).select(mode).amplitude)
+
+    fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
+    ways: list[_Way] = [
+        ("exact orbit", "implicit, reverse", f"{few} points", jax.jit(jax.grad(exact))),
+        ("exact orbit", "implicit, forward", f"{few} points", jax.jit(jax.jacfwd(exact))),
+    ]
+    left_out: list[str] = []
+    light = jam_modes(scene).select(mode, throw=False)
+    if not bool(light.status == JamStatus.found):
+        left_out = [f"leading order, full, which starts from it: {light.message}"]
+    else:
+        ways.insert(0, ("leading order", "implicit, reverse", "", jax.jit(jax.grad(leading))))
+        if not bool(jam.fine.stable):
+            left_out = [unstable("full", jam)]
+        else:
+            ways += _by_runs(scene, at, jam, end)
+    rows = [
+        row_of(tier, method, setting, lambda f=f: f(stiffness), lambda slope: relative(slope, fine), repeats)
+        for tier, method, setting, f in ways
+    ]
+    return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
+
+
+def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
+    """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
+    until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
+    max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
+
+    def full(k: Any, adjoint: Any = None) -> Any:
+        asked = dict(save="window", stepsize_controller=Tolerance(_GRADIENT_TOLERANCE), max_steps=max_steps, throw=False)
+        run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
+        return jnp.max(run.amplitude)
+
+    value = eqx.filter_jit(full)
+    ways: list[tuple[str, Callable[..., Any]]] = [
+        ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
+        ("reverse", jax.jit(jax.grad(full))),
+        ("finite differences", lambda k: _differences(value, k)),
+    ]
+    return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
+
+
+def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
+    """Central differences, each number moved by 1e-5 of itself; 0 for those that are 0."""
+    steps = 1e-5 * np.asarray(at)
+    whole = np.zeros(len(steps))
+    for k in np.flatnonzero(steps):
+        move = np.eye(len(steps))[k] * steps[k]
+        whole[k] = (float(value(at + move)) - float(value(at - move))) / (2.0 * steps[k])
+    return whole

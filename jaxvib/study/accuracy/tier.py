@@ -1,0 +1,79 @@
+"""The tiers: ways to compute the jam of a scene, each with the scenes that it can answer for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from jax import Array
+
+from jaxvib.equations.averaged import averaged_loads
+from jaxvib.equations.collected import bodies
+from jaxvib.equations.linear import jammed_loads
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.motion.settle import settle
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+
+__all__ = ["TIERS", "JamValues", "Tier"]
+
+
+class JamValues(Protocol):
+    """The quantities that every tier names alike."""
+
+    @property
+    def omega(self) -> Array:
+        """Speed of the loads, rad/s."""
+        ...
+
+    @property
+    def amplitude(self) -> Array:
+        """(nd,) m, of tilts rad, zero to peak."""
+        ...
+
+    @property
+    def foundation_force(self) -> Array:
+        """N, zero to peak."""
+        ...
+
+
+class Tier(NamedTuple):
+    """A way to compute a jam.
+
+    **Attributes**: `name`; `require(scene)` raises `InputError`, which names the property that a part of the scene lacks, where
+    the tier cannot answer; `jam(scene, mode, until)` the jam mode's result, until a time (s) where the tier integrates in time.
+    """
+
+    name: str
+    require: Callable[[Scene], object]
+    jam: Callable[[Scene, int, float], JamValues]
+
+    def refusal(self, scene: Scene) -> str | None:
+        """The sentence by which the tier refuses the scene; None where it answers.
+
+        >>> import jaxvib as jv
+        >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+        ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.DCMotor("60 rad/s", 20.0, 0.1))
+        >>> [tier.name for tier in TIERS if tier.refusal(scene) is None]
+        ['full']
+        """
+        try:
+            self.require(scene)
+        except InputError as problem:
+            return str(problem)
+        return None
+
+
+TIERS = (
+    Tier("leading order", jammed_loads, lambda scene, mode, until: jam_modes(scene).select(mode, throw=False)),
+    Tier("exact orbit", bodies, lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False)),
+    Tier(
+        "envelope",
+        averaged_loads,
+        lambda scene, mode, until: envelope(scene, until, start="jam", mode=mode, save="window", throw=False),
+    ),
+    Tier("full", lambda scene: None, lambda scene, mode, until: settle(scene, mode=mode, throw=False)),
+)
+"""From the cheapest to the one that answers for every scene."""
