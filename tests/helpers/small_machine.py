@@ -1,4 +1,4 @@
-"""A machine whose motion is of order 1 in 20 s."""
+"""A machine whose motion is of order 1 in 20 s, and its runs: all of one length and of so many samples, for one program."""
 
 import jax.numpy as jnp
 
@@ -18,3 +18,8 @@ def small_start():
     return jv.State(
         jnp.asarray([0.05, -0.03]), jnp.asarray([0.1, 0.2]), (jnp.asarray([0.3, -1.0, 2.0]),), (jnp.asarray([1.0, 0.5, -0.5]),)
     )
+
+
+def small_run(effects=(), **given):
+    """20 s of it, 21 samples unless only the window is saved."""
+    return jv.simulate(small_machine(effects), 20.0, **{"start": small_start(), "samples": 21, **given})

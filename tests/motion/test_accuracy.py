@@ -20,6 +20,10 @@ def test_equal_steps_are_of_order_8():
     assert np.all(orders > 7.0), (error, orders)
 
 
+MAX_STEPS = 2**18
+"""Enough for the longest run here: the number is part of the program, and one program serves all."""
+
+
 def _runs(s, start, steps):
     return [
         jv.simulate(s, 40.0, start=start, stepsize_controller=jv.EqualSteps(n), save="window", estimate=False) for n in steps
@@ -28,8 +32,8 @@ def _runs(s, start, steps):
 
 def test_the_estimate_is_above_the_error_and_near_it():
     s = published(speed=5.0, eps=0.05).scene()
-    start = some_state(s)
-    best = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(1e-13), save="window").window.state
+    asked = dict(start=some_state(s), save="window", max_steps=MAX_STEPS)
+    best = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Tolerance(1e-13)).window.state
 
     def apart(run):
         a, b = run.window.state, best
@@ -40,22 +44,22 @@ def test_the_estimate_is_above_the_error_and_near_it():
         )
 
     for tolerance in (1e-5, 1e-7, 1e-9, 1e-11):
-        run = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window")
+        run = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Tolerance(tolerance))
         assert apart(run) <= float(run.error) <= 300.0 * apart(run), (tolerance, apart(run), float(run.error))
-        alone = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window", estimate=False)
+        alone = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Tolerance(tolerance), estimate=False)
         assert int(alone.evaluations) == 13 * int(alone.steps) == 13 * int(run.steps) and np.isnan(alone.error)
         # What the estimate cost is counted: the run with larger steps takes at least half as many, at most all.
         assert 1.5 * int(alone.evaluations) < int(run.evaluations) < 2 * int(alone.evaluations)
         assert float(run.seconds) > 0.0
     for accuracy in (1e-3, 1e-8):
-        run = jv.simulate(s, 60.0, start=start, stepsize_controller=jv.Accuracy(accuracy), save="window")
+        run = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Accuracy(accuracy))
         assert bool(run.status == jv.RunStatus.done) and apart(run) <= float(run.error) <= accuracy
 
 
 def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     s = published(speed=5.0, eps=0.05).scene()
     monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)
-    asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12))
+    asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12), max_steps=MAX_STEPS)
     # So long that rounding alone makes more than this error.
     run = jv.simulate(s, 400.0, **asked, throw=False)
     assert bool(run.status == jv.RunStatus.not_accurate) and float(run.error) > 1e-12

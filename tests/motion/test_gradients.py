@@ -55,6 +55,11 @@ def jam_outputs(s, mode=3):
     return outputs, jnp.ones_like(x0)
 
 
+def with_value(derivative, f):
+    """One program for a derivative of f and for its value: what differences of f need is compiled already."""
+    return jax.jit(derivative(lambda x: (f(x),) * 2, has_aux=True))
+
+
 def central(f, x, h):
     """Central differences. Noise floor: eps |f| / h; truncation: h^2 f'''/6, narrow peaks making f''' large."""
     columns = []
@@ -68,17 +73,17 @@ def central(f, x, h):
 def case(request):
     s = published(natural=(0.3, 0.36)).scene() if request.param == "published" else scene("three_mass", "balls", 35.0)
     mode = 3 if request.param == "published" else jv.jam_modes(s).mode_numbers()[0]
-    outputs, x = jam_outputs(s, mode)
-    return outputs, x
+    return jam_outputs(s, mode)
 
 
 def test_implicit_gradient_is_the_finite_difference(case):
     """Forward, reverse, jitted: all numbers of the machine, loads and drive; the step 1e-5 leaves an error of 1e-6."""
     outputs, x = case
-    forward, reverse = jax.jit(jax.jacfwd(outputs))(x), jax.jit(jax.jacrev(outputs))(x)
+    both = with_value(jax.jacfwd, outputs)
+    forward, reverse = both(x)[0], jax.jit(jax.jacrev(outputs))(x)
     scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
     np.testing.assert_allclose(forward / scale, reverse / scale, atol=1e-12)
-    difference = central(jax.jit(outputs), x, 1e-5)
+    difference = central(lambda x: both(x)[1], x, 1e-5)
     np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-6)
     assert np.isfinite(forward).all() and (np.abs(forward).max(axis=0) > 0.0).all()
 
@@ -98,21 +103,20 @@ def test_hessian_is_the_finite_difference_of_the_gradient():
         return jv.jam_modes(moved).select(3, throw=False).foundation_force
 
     k = jnp.concatenate([s.machine.stiffness, s.machine.link_stiffness])
-    exact = jax.jit(jax.hessian(force))(k)
+    both = with_value(jax.jacfwd, jax.grad(force))
+    exact = both(k)[0]
     np.testing.assert_allclose(exact, exact.T, rtol=1e-9)
-    difference = central(jax.jit(jax.grad(force)), k, 1e-6)
+    difference = central(lambda k: both(k)[1], k, 1e-6)
     np.testing.assert_allclose(exact, difference, rtol=1e-5, atol=1e-6 * float(jnp.max(jnp.abs(exact))))
 
 
 @eqx.filter_jit
+@eqx.filter_value_and_grad
 def everything(values, s, mode):
     moved = with_numbers(s, values)
     modes = jv.jam_modes(moved)
     frequencies = jnp.sum(jv.natural_frequencies(moved))
     return jnp.sum(modes.amplitude[mode - 1]) + modes.foundation_force[mode - 1] + frequencies
-
-
-gradient_of_everything = eqx.filter_jit(eqx.filter_grad(everything))
 
 
 def test_gradient_is_finite_where_machines_degenerate():
@@ -124,12 +128,12 @@ def test_gradient_is_finite_where_machines_degenerate():
     floating = eqx.tree_at(lambda x: x.machine.stiffness, s, jnp.zeros(2))
     for machine, mode in ((decoupled, mode5), (s, mode3), (undamped, mode3), (floating, mode3)):
         base = numbers(machine)
-        gradient = gradient_of_everything(base, machine, mode)
+        _, gradient = everything(base, machine, mode)
         assert all(np.isfinite(g).all() for g in gradient.values())
         if machine is floating:  # a frequency starts from 0 as a root: it is counted as if it stayed there
             continue
         h = 1e-6
-        up, down = (everything({**base, "stiffness": base["stiffness"].at[0].add(d)}, machine, mode) for d in (h, -h))
+        up, down = (everything({**base, "stiffness": base["stiffness"].at[0].add(d)}, machine, mode)[0] for d in (h, -h))
         np.testing.assert_allclose(gradient["stiffness"][0], (up - down) / (2 * h), rtol=1e-5)
 
 
@@ -185,12 +189,11 @@ def relative(gradient):
 
 def test_forward_gradient_through_time_is_the_implicit_one():
     """The jam is reached; the two differ by the order of the loads' share of the mass, eps = 2e-3."""
-    run, x = through_time(diffrax.ForwardMode(), 1000.0), jnp.ones(6)
-    gradient = jax.jit(jax.jacfwd(run))(x)
-    np.testing.assert_allclose(relative(gradient), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)
+    both, x = with_value(jax.jacfwd, through_time(diffrax.ForwardMode(), 1000.0)), jnp.ones(6)
+    gradient = both(x)[0]
+    np.testing.assert_allclose(relative(gradient), relative(jax.jit(jax.jacfwd(from_algebra))(x)), atol=10 * EPS)
     # The difference of two runs: steps that come out otherwise leave 1e-9 tolerance / 1e-3 step = 1e-6 of noise or more.
-    value = jax.jit(run)
-    ahead = (value(x.at[4].add(1e-3)) - value(x.at[4].add(-1e-3))) / 2e-3
+    ahead = (both(x.at[4].add(1e-3))[1] - both(x.at[4].add(-1e-3))[1]) / 2e-3
     np.testing.assert_allclose(gradient[:, 4], ahead, atol=1e-4 * float(jnp.max(jnp.abs(gradient))))
 
 

@@ -11,7 +11,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from scenes import published
 from scipy.integrate import solve_ivp
-from small_machine import GRAVITY, small_machine, small_start
+from small_machine import GRAVITY, small_machine, small_run, small_start
 
 import jaxvib as jv
 
@@ -56,7 +56,7 @@ def test_motion_is_mujocos(gravity):
     for _ in range(20):
         mujoco.mj_step(model, data, nstep=1000)
         states.append(np.concatenate([data.qpos[:2] - sag, data.qpos[2:], data.qvel]))
-    run = jv.simulate(s, 20.0, start=start, samples=21, stepsize_controller=jv.Tolerance(1e-11))
+    run = small_run(s.effects, stepsize_controller=jv.Tolerance(1e-11))
     y = run.trajectory.state
     ours = np.concatenate([y.displacement, y.angle[0], y.velocity, y.rate[0]], axis=1)[1:]
     np.testing.assert_allclose(ours, states, atol=1e-6)
@@ -114,7 +114,7 @@ def test_smaller_tolerance_means_smaller_error():
     exact = solve_ivp(lambda t, y: np.asarray(right(t, y)), (0.0, 20.0), flat, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     error = []
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
-        run = jv.simulate(s, 20.0, start=start, samples=2, stepsize_controller=jv.Tolerance(tolerance))
+        run = small_run(stepsize_controller=jv.Tolerance(tolerance))
         last = jax.tree.map(lambda leaf: leaf[-1], run.trajectory.state)
         error.append(np.max(np.abs(ravel_pytree(last)[0] - exact)))
     assert all(b < 0.1 * a for a, b in itertools.pairwise(error)), error

@@ -3,14 +3,19 @@
 import jax
 import numpy as np
 import pytest
-from small_machine import small_machine, small_start
+from small_machine import small_run
 
 import jaxvib as jv
 
 
 @pytest.fixture(scope="module")
 def run():
-    return jv.simulate(small_machine((jv.Gravity(),)), 20.0, start=small_start(), samples=101)
+    return small_run((jv.Gravity(),))
+
+
+@pytest.fixture(scope="module")
+def window():
+    return small_run((jv.Gravity(),), save="window")
 
 
 def same(a, b):
@@ -20,14 +25,13 @@ def same(a, b):
         assert x.dtype == y.dtype
 
 
-def test_a_saved_run_is_read_back_bit_for_bit(run, tmp_path):
+def test_a_saved_run_is_read_back_bit_for_bit(run, window, tmp_path):
     again = jv.Run.load(run.save(tmp_path / "run"))
     same(again, run)
     assert again.summary() == run.summary()
-    short = jv.simulate(small_machine(), 2.0, start=small_start(), save="window")
-    back = jv.Run.load(short.save(tmp_path / "short.npz"))
+    back = jv.Run.load(window.save(tmp_path / "window.npz"))
     assert back.trajectory is None
-    same(back, short)
+    same(back, window)
 
 
 def test_reading_what_is_no_run_is_an_input_error(tmp_path):
@@ -42,7 +46,7 @@ def test_reading_what_is_no_run_is_an_input_error(tmp_path):
 
 def test_to_xarray_has_names_and_units(run):
     data = run.to_xarray()
-    assert dict(data.sizes) == {"time": 101, "coordinate": 2, "load": 3, "direction": 1}
+    assert dict(data.sizes) == {"time": 21, "coordinate": 2, "load": 3, "direction": 1}
     assert data["displacement"].attrs["units"] == "m" and data["time"].attrs["units"] == "s"
     np.testing.assert_array_equal(data["displacement"].sel(coordinate="y2"), run.trajectory.state.displacement[:, 1])
     assert data.attrs["status"] == "the run reached its end"
@@ -53,8 +57,7 @@ def test_summary_and_plot_show_the_run(run):
     assert len(run.plot().axes) == 3
 
 
-def test_window_alone_measures_the_same(run):
-    window = jv.simulate(small_machine((jv.Gravity(),)), 20.0, start=small_start(), save="window")
+def test_window_alone_measures_the_same(run, window):
     assert window.trajectory is None and len(window.plot().axes) == 3
     np.testing.assert_allclose(window.amplitude, run.amplitude, rtol=1e-12)
     np.testing.assert_allclose(window.omega, run.omega, rtol=1e-12)

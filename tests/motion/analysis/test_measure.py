@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scenes import scene
 from scipy.optimize import brentq
-from small_machine import small_machine, small_start
+from small_machine import small_run
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import measure
@@ -76,5 +76,5 @@ def test_derivatives_of_an_amplitude_move_its_extrema_along():
 
 
 def test_a_growing_motion_is_not_settled():
-    run = jv.simulate(small_machine(), 5.0, start=small_start())
+    run = small_run()
     assert not bool(run.settled) and "not settled" in run.summary()
