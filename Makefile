@@ -6,7 +6,7 @@ OUT ?= out/demo
 JAXVIB = $(BIN)/jaxvib
 EXAMPLE = examples/antiphase
 
-.PHONY: demo test test-slow check clean
+.PHONY: demo test test-slow test-versions check clean
 
 demo: $(VENV)/installed
 	@echo "--- how the first drawing can jam"
@@ -23,6 +23,17 @@ test: $(VENV)/installed
 
 test-slow: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 -m slow
+
+# The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
+LOWEST_PYTHON ?= python3.11
+HIGHEST_PYTHON ?= python3.13
+VERSION_TESTS = tests/runtime tests/equations tests/ode/test_engine.py tests/steady/jams/test_jam.py tests/motion/test_endings.py
+
+test-versions:
+	$(MAKE) .venv-lowest/installed VENV=.venv-lowest PYTHON=$(LOWEST_PYTHON) PIP_CONSTRAINT=.ci/lowest.txt
+	$(MAKE) .venv-highest/installed VENV=.venv-highest PYTHON=$(HIGHEST_PYTHON)
+	.venv-lowest/bin/python -m pytest $(VERSION_TESTS)
+	.venv-highest/bin/python -m pytest $(VERSION_TESTS)
 
 check: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -87,18 +87,23 @@ def test_zeros_of_both_signs_and_options_are_other_programs(folder):
     assert len(list(folder.iterdir())) == 3
 
 
+def test_a_scalar_without_a_type_of_its_own_is_another_program(folder):
+    """Python's numbers as arrays take the type of what they meet; a program for them must not serve those with a type."""
+    pair = Pair(jnp.arange(3.0, dtype=jnp.float32), "a")
+    kinds = [programs.cached(doubled)(pair, two)[0].first.dtype for two in (jnp.asarray(2.0), jnp.asarray(2.0, "float64"))]
+    assert kinds == ["float32", "float64"]
+
+
 def with_sign(x, sign):
     return jnp.copysign(x, sign)
 
 
-def test_the_key_holds_the_sources_of_the_whole_package(monkeypatch):
-    """Another size of any module makes another key; the text of the key names the versions."""
-    package = pathlib.Path(jv.__file__).parent
-    before = programs._sources.__wrapped__()
-    assert importlib.metadata.version("jaxlib") in before
-    files = list(package.rglob("*.py"))
-    monkeypatch.setattr(pathlib.Path, "rglob", lambda self, _: files[1:] if self == package else [])
-    assert programs._sources.__wrapped__() != before
+def test_the_key_holds_the_sources_of_the_whole_package_and_the_versions():
+    """Size and time of a module of any folder, and of one at the top."""
+    text = programs._sources()
+    for path in (pathlib.Path(jam.__file__), pathlib.Path(jv.__file__)):
+        assert str((path.stat().st_size, path.stat().st_mtime_ns)) in text
+    assert importlib.metadata.version("jaxlib") in text and importlib.metadata.version("diffrax") in text
 
 
 @pytest.mark.parametrize(
