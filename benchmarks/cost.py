@@ -86,11 +86,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--out", type=Path, help="folder for the figure and the numbers")
+    parser.add_argument("--quick", action="store_true", help="two tolerances of one scene, to see that it runs")
     options = parser.parse_args()
     print(machine_line())
     costs: dict[str, jv.Cost] = {}
-    for name in options.only:
+    for name in ["jam"] if options.quick else options.only:
         title, ask = SCENES[name]
+        if options.quick:
+            ask = lambda: jv.work_precision(jam(), mode=3, tolerances=(1e-3, 1e-6), solvers=("Dopri8",), repeats=1)  # noqa: E731
         begun = time.perf_counter()
         costs[title] = ask()
         print(f"\n{title} ({time.perf_counter() - begun:.0f} s)\n{cost_table(costs[title])}", flush=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -27,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 from jax.extend import core  # noqa: E402
-from parts.common import machine_line  # noqa: E402
+from parts.common import busy, machine_line  # noqa: E402
 
 from jaxvib.errors import InputError  # noqa: E402
 from jaxvib.motion.analysis.measure import measure  # noqa: E402
@@ -127,17 +126,6 @@ def operations(jaxpr: core.Jaxpr) -> int:
         else:
             total += operations(getattr(inner, "jaxpr", inner))
     return total
-
-
-def busy(call: Callable[[], object], runs: int = 5) -> float:
-    """Seconds of the processor that the cheapest of so many calls takes, the first one not counted."""
-    jax.block_until_ready(call())
-    found = []
-    for _ in range(runs):
-        begun = time.process_time()
-        jax.block_until_ready(call())
-        found.append(time.process_time() - begun)
-    return min(found)
 
 
 def cost(s: jv.Scene, steps: int) -> Cost:

@@ -55,6 +55,17 @@ def best(call: Callable[[], Any], runs: int = 7) -> float:
     return min(first(call) for _ in range(runs))
 
 
+def busy(call: Callable[[], Any], runs: int = 5) -> float:
+    """Seconds of the processor that the cheapest of so many calls takes, the first one not counted."""
+    jax.block_until_ready(call())
+    found = []
+    for _ in range(runs):
+        begun = time.process_time()
+        jax.block_until_ready(call())
+        found.append(time.process_time() - begun)
+    return min(found)
+
+
 def best_in_turn(calls: Sequence[Callable[[], Any]], rounds: int = 15) -> list[float]:
     """Seconds of the fastest call of each; they take turns, so that a slow moment of the machine is nobody's."""
     found = [np.inf] * len(calls)

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import lax
 from jax.extend import core
 
 __all__ = ["NotScalarizable", "Scalars", "elementwise", "inlined", "is_known", "joined", "primitive_of", "rules", "to_scalars"]
@@ -168,7 +168,7 @@ def elementwise(rule: Callable[..., Scalar]) -> Rule:
     """A rule for scalars as one for arrays of them; an array of one entry stands for one of any shape, as `clamp` has it."""
 
     def apply(*given: Scalars, **params: Any) -> Scalars:
-        whole = np.broadcast_arrays(*given) if len(given) > 1 else given
+        whole = np.broadcast_arrays(*given) if len(given) > 1 else list(given)
         out = np.empty(whole[0].shape, dtype=object)
         for index in np.ndindex(*out.shape):
             out[index] = rule(*(scalars[index] for scalars in whole), **params)
@@ -271,7 +271,7 @@ def rules() -> dict[core.Primitive, Rule]:
     """
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)
-    maps: list[tuple[Callable[..., Array], tuple[Any, ...], Callable[..., Scalar]]] = [
+    maps: list[tuple[Callable[..., Any], tuple[Any, ...], Callable[..., Scalar]]] = [
         (lax.add, (x, x), _add),
         # JAX's sum of cotangents.
         (lambda y: jax.linear_transpose(lambda x: (x, x), x)((y, y))[0], (x,), _add),

