@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.extend import core
 
 from jaxvib.equations.dynamics import Dynamics, State
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
+from jaxvib.runtime.compat import jaxpr_as_fun
 
 __all__ = ["PackedSystem"]
 
@@ -144,4 +144,4 @@ class PackedSystem(eqx.Module):
     def _plain_rates(self, t: Any, y: Any, args: Any) -> Any:
         if self.program is None:
             return args(t, y)
-        return tuple(core.jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))
+        return tuple(jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))

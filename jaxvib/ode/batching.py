@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.runtime.compat import custom_vmap
+
 __all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
 
 VECTOR = 8
@@ -79,7 +81,7 @@ def batch_last(function: Callable[[Any], Any], batched: Callable[[Any, Any], Any
             given = dict(zip(places, arrays, strict=True))
             return jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
 
-        mapped = jax.custom_batching.custom_vmap(lambda *arrays: function(unflatten(arrays)))
+        mapped = custom_vmap(lambda *arrays: function(unflatten(arrays)))
 
         @mapped.def_vmap
         def _(size: int, is_mapped: Any, *arrays: Array) -> Any:
@@ -109,7 +111,7 @@ def _tangents_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
         y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))
         return y, jax.tree.map(lambda dy: dy[..., 0], out)
 
-    mapped = jax.custom_batching.custom_vmap(single)
+    mapped = custom_vmap(single)
 
     @mapped.def_vmap
     def _(size: int, is_mapped: Any, x: Any, tangents: Any) -> Any:

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend import core
+
+from jaxvib.runtime.compat import Primitive
 
 __all__ = ["NotScalarizable", "Scalars", "elementwise", "inlined", "is_known", "joined", "primitive_of", "rules", "to_scalars"]
 
@@ -159,7 +160,7 @@ def _choice(*cases: Scalar, which: Scalar) -> Scalar:
     return lax.select_n(which, *(jnp.asarray(case) for case in cases))
 
 
-def _bound(primitive: core.Primitive) -> Callable[..., Scalar]:
+def _bound(primitive: Primitive) -> Callable[..., Scalar]:
     """The operation itself, on scalars."""
     return lambda *x, **params: primitive.bind(*(jnp.asarray(joined(v)) for v in x), **params)
 
@@ -246,7 +247,7 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Any) -> Scalars:
     return out
 
 
-def primitive_of(function: Callable[..., Any], *arguments: Any) -> core.Primitive:
+def primitive_of(function: Callable[..., Any], *arguments: Any) -> Primitive:
     """The one primitive that a public function of JAX is made of.
 
     **Raises** `NotScalarizable` where it is made of several, or of none.
@@ -258,13 +259,13 @@ def primitive_of(function: Callable[..., Any], *arguments: Any) -> core.Primitiv
 
 
 @functools.cache
-def inlined() -> tuple[core.Primitive, ...]:
+def inlined() -> tuple[Primitive, ...]:
     """Primitives whose inner program, their parameter `jaxpr`, stands for themselves."""
     return primitive_of(jax.jit(jnp.negative), 1.0), primitive_of(jax.checkpoint(lax.neg), 1.0)
 
 
 @functools.cache
-def rules() -> dict[core.Primitive, Rule]:
+def rules() -> dict[Primitive, Rule]:
     """The rule of each primitive that has one; primitives are found by tracing public functions, not by their names.
 
     A function that another version of JAX makes of several operations has no rule: programs with it stay on arrays.
@@ -315,7 +316,7 @@ def rules() -> dict[core.Primitive, Rule]:
         (lambda v: lax.reduce_min(v, (0,)), (v,), _reduce(lambda a, b: lax.min(jnp.asarray(a), jnp.asarray(b)))),
         (lambda v: lax.dot_general(v, v, (((1,), (1,)), ((), ()))), (v,), _dot_general),
     ]
-    found: dict[core.Primitive, Rule] = {}
+    found: dict[Primitive, Rule] = {}
     for function, arguments, rule in (
         *((f, given, elementwise(rule)) for f, given, rule in maps),
         *((f, given, None) for f, given in bound),

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.extend import core
 
 from jaxvib.ode.scalar_rules import NotScalarizable, Scalars, elementwise, inlined, is_known, joined, primitive_of, rules
 from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
 from jaxvib.ode.sincos import sine_and_cosine
+from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
 
 __all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", "scalarized_vmap", "scalars_of"]
 
@@ -65,11 +65,14 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Callable[..., An
     return run
 
 
-def scalarized_program(function: Callable[..., Any], *arguments: Any) -> core.ClosedJaxpr | None:
+def scalarized_program(function: Callable[..., Any], *arguments: Any) -> ClosedJaxpr | None:
     """`scalarize`, traced: a program that takes the numbers of all arguments and gives those of the result, in order.
 
-    **Returns** None where an operation has no rule on scalars, or where there are too many of them.
+    **Returns** None where an operation has no rule on scalars, where there are too many of them, or where this version of JAX
+    lets nobody read its programs.
     """
+    if not HAS_JAXPRS:
+        return None
     leaves, structure = jax.tree.flatten(arguments)
 
     def run(*numbers: Array) -> list[Array]:
@@ -139,7 +142,7 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
     return run
 
 
-def _fenced(program: core.ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
+def _fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
     """The results of a program on scalars, none of whose values the compiler computes many times over.
 
     XLA's fusion on a CPU computes a value anew for each use of it. Where shared parts are made of shared parts, as in a
@@ -151,13 +154,13 @@ def _fenced(program: core.ClosedJaxpr, arguments: Sequence[Array]) -> list[Array
     one = lax.stop_gradient(jnp.where(jnp.abs(first) < jnp.inf, jnp.ones_like(first), first))
     cost: dict[int, int] = {}
 
-    def run(jaxpr: core.Jaxpr, consts: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-        uses: dict[core.Var, int] = {}
+    def run(jaxpr: Jaxpr, consts: Sequence[Any], given: Sequence[Any]) -> list[Any]:
+        uses: dict[Var, int] = {}
         for atom in (*(a for equation in jaxpr.eqns for a in equation.invars), *jaxpr.outvars):
-            if isinstance(atom, core.Var):
+            if isinstance(atom, Var):
                 uses[atom] = uses.get(atom, 0) + 1
         known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *given), strict=True))
-        read = lambda atom: atom.val if isinstance(atom, core.Literal) else known[atom]  # noqa: E731
+        read = lambda atom: atom.val if isinstance(atom, Literal) else known[atom]  # noqa: E731
         for equation in jaxpr.eqns:
             values = [read(atom) for atom in equation.invars]
             inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
@@ -181,12 +184,12 @@ def _fenced(program: core.ClosedJaxpr, arguments: Sequence[Array]) -> list[Array
 
 
 @functools.cache
-def _angles() -> dict[core.Primitive, int]:
+def _angles() -> dict[Primitive, int]:
     """The sine and the cosine, and the place of each in what `sine_and_cosine` returns."""
     return {primitive_of(lax.sin, np.float32(1.0)): 0, primitive_of(lax.cos, np.float32(1.0)): 1}
 
 
-def _require_rules(jaxpr: core.Jaxpr) -> None:
+def _require_rules(jaxpr: Jaxpr) -> None:
     for equation in jaxpr.eqns:
         if equation.primitive in inlined():
             _require_rules(_inner(equation)[0])
@@ -194,16 +197,16 @@ def _require_rules(jaxpr: core.Jaxpr) -> None:
             raise NotScalarizable(equation.primitive.name)
 
 
-def _inner(equation: core.JaxprEqn) -> tuple[core.Jaxpr, Sequence[Any]]:
+def _inner(equation: JaxprEqn) -> tuple[Jaxpr, Sequence[Any]]:
     inner = equation.params["jaxpr"]
     return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
 
-def _run(jaxpr: core.Jaxpr, consts: Sequence[Any], arguments: list[Scalars], sines: dict[int, Any]) -> list[Scalars]:
-    known: dict[core.Var, Scalars] = {}
+def _run(jaxpr: Jaxpr, consts: Sequence[Any], arguments: list[Scalars], sines: dict[int, Any]) -> list[Scalars]:
+    known: dict[Var, Scalars] = {}
 
-    def read(atom: core.Var | core.Literal) -> Scalars:
-        if isinstance(atom, core.Literal):
+    def read(atom: Var | Literal) -> Scalars:
+        if isinstance(atom, Literal):
             return _to_scalars(np.asarray(atom.val, getattr(atom.aval, "dtype", None)))
         return known[atom]
 

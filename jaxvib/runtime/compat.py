@@ -21,7 +21,10 @@ __all__ = [
     "HAS_JAXPRS",
     "ClosedJaxpr",
     "Jaxpr",
+    "JaxprEqn",
     "Literal",
+    "Primitive",
+    "Var",
     "accepted_flags",
     "backend_started",
     "custom_vmap",
@@ -34,13 +37,13 @@ _TESTED = ((0, 10), (0, 12))
 """The first and the last version of jaxlib (major, minor) that knows all flags of `prepare_cpu`."""
 
 try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
 
     HAS_JAXPRS = True
 except ImportError:
     HAS_JAXPRS = False
     if not TYPE_CHECKING:
-        ClosedJaxpr = Jaxpr = Literal = jaxpr_as_fun = None
+        ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
 
 

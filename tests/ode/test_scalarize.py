@@ -174,3 +174,10 @@ def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machi
     assert program is not None
     numbers = [*scalars_of(moment), *scalars_of(field)]
     assert expanded(jax.make_jaxpr(lambda *x: module._fenced(program, x))(*numbers).jaxpr) < 200 < expanded(program.jaxpr)
+
+
+def test_without_readable_programs_everything_stays_on_arrays(monkeypatch):
+    monkeypatch.setattr(module, "HAS_JAXPRS", False)
+    x = jnp.arange(3.0)
+    assert scalarized_program(jnp.sin, x) is None
+    np.testing.assert_array_equal(scalarized_vmap(lambda y, shared: jnp.sin(y) * shared)(x, 2.0), 2.0 * jnp.sin(x))
