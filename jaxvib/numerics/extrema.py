@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = []
+__all__ = ["extremum_value", "locate_extrema"]
 
 
-def _places(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+def locate_extrema(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
     """Where the quintics through evenly spaced samples are least and greatest, over their first half, their second and all.
 
     x, v, a (n,) are samples and their first two derivatives, in units of the sampling step. **Returns** values there, the
@@ -50,7 +50,7 @@ def _places(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
     return values, k, places
 
 
-def _extremum(begin: Sequence[Array], end: Sequence[Array], share: Array) -> Array:
+def extremum_value(begin: Sequence[Array], end: Sequence[Array], share: Array) -> Array:
     """The quintic's value at an extremum, which stays one: where it is inside the step it moves with what it is made of."""
     quintic = _quintic(begin, end)
     slope = _derived(quintic)

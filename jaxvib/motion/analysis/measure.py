@@ -1,4 +1,4 @@
-"""What is read off a motion: amplitudes, jam speed, forces, energy."""
+"""Quantities measured from a sampled motion: amplitudes, mean speeds, foundation force."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.extrema import _extremum, _places
+from jaxvib.numerics.extrema import extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
@@ -137,7 +137,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
                 found = _outputs(scene, _step(times), state, *_derivatives((times[j], state), field))
                 return [part[output] for part in found]
 
-            return _extremum(sample(k), sample(k + 1), share)
+            return extremum_value(sample(k), sample(k + 1), share)
 
         low, high = jax.vmap(jax.vmap(jax.vmap(extremum)))(outputs, samples, shares)
         return (high - low) / 2.0
@@ -146,10 +146,10 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 def _extrema(scene: Scene, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
-    """Least and greatest values of each output, and their places, see `_places`; (2, 3, outputs) each."""
+    """Least and greatest values of each output, and their places, see `locate_extrema`; (2, 3, outputs) each."""
     first, second = scalarized_vmap(_derivatives)((times, states), field)
     samples = jax.vmap(lambda *y: _outputs(scene, _step(times), *y))(states, first, second)
-    return jax.vmap(_places, in_axes=1, out_axes=-1)(*samples)
+    return jax.vmap(locate_extrema, in_axes=1, out_axes=-1)(*samples)
 
 
 def _derivatives(moment: tuple[Array, State], field: Field) -> tuple[State, State]:
@@ -210,5 +210,5 @@ def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Arr
         values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
     )
     step = _step(stretch.time)
-    (low, high), _, _ = _places(x, v * step, a * step**2)
+    (low, high), _, _ = locate_extrema(x, v * step, a * step**2)
     return (high - low)[2] / 2.0
