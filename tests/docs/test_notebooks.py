@@ -1,8 +1,10 @@
 """Notebooks run from top to bottom, and what they print is what they show."""
 
+import os
 import pathlib
 import re
 
+import jax
 import nbclient
 import nbformat
 import pytest
@@ -31,7 +33,10 @@ def test_there_are_notebooks():
 def test_notebook_runs_and_shows_what_it_showed(path):
     kept = nbformat.read(path, as_version=4)
     fresh = nbformat.read(path, as_version=4)
-    nbclient.NotebookClient(fresh, timeout=900, kernel_name="python3").execute()
+    # The kernel is a process of its own, which shares what the tests compile.
+    shared = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}
+    shared["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+    nbclient.NotebookClient(fresh, timeout=900, kernel_name="python3").execute(env=shared)
     assert figures(fresh) == figures(kept) > 0
     # Words must be the same; numbers may differ in the digits that another processor rounds otherwise.
     assert NUMBER.sub("#", printed(fresh)) == NUMBER.sub("#", printed(kept))

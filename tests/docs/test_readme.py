@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import jax
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -29,7 +30,7 @@ def test_readme_example_runs(block, monkeypatch, tmp_path):
 def run_alone(block):
     """In a process of its own, where JAX has not begun to compute; as strict as `conftest.py` is."""
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    clean |= {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax"), "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    clean |= {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir), "JAX_NUMPY_RANK_PROMOTION": "raise"}
     clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
     words = [sys.executable, "-W", "error", "-c", block]
     done = subprocess.run(words, env=clean, capture_output=True, text=True, timeout=600)
