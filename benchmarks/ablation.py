@@ -163,7 +163,9 @@ def gradients(quick: bool) -> None:
 
     def final(speed: Array, adjoint: Any = None) -> Array:
         moved = eqx.tree_at(lambda s: s.drive.speed, s, speed)
-        found = jv.simulate(moved, end, start=start, save="window", stepsize_controller=jv.Tolerance(1e-6), adjoint=adjoint, max_steps=2**14)
+        found = jv.simulate(
+            moved, end, start=start, save="window", stepsize_controller=jv.Tolerance(1e-6), adjoint=adjoint, max_steps=2**14
+        )
         return found.window.state.displacement[-1, 0]
 
     speed: Array = s.drive.speed  # pyright: ignore[reportAttributeAccessIssue]

@@ -134,7 +134,8 @@ def cost(s: jv.Scene, steps: int) -> Cost:
     end = steps * 2e-4
 
     def run(steps: int) -> Callable[[], jv.Run]:
-        return lambda: jv.simulate(s, end, start=state, steps=steps, estimate=False, save="window", throw=False)
+        equal = jv.EqualSteps(steps)
+        return lambda: jv.simulate(s, end, start=state, stepsize_controller=equal, estimate=False, save="window", throw=False)
 
     window = run(steps)().window
     measured = jax.jit(lambda s, times, states: measure(s, jv.vector_field(s), times, states))

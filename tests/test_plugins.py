@@ -11,7 +11,7 @@ from plugin_load import TorusPoints
 from scenes import machines, published
 
 import jaxvib as jv
-from jaxvib.steady.balance.states import balanced_states
+from jaxvib.equations.averaged import averaged_field
 
 TORQUE = 2e-5
 
@@ -75,7 +75,7 @@ def test_loads_with_two_coordinates_balance_their_power_and_run_in_ensembles():
         return scene, jv.State(start.displacement, start.velocity, (angle[0], across), rate)
 
     many = jv.ensemble(make, angle[1][None], 0.5)
-    one = jv.simulate(scene, 0.5, start=start, tolerance=1e-10, save="all", samples=2, estimate=False)
+    one = jv.simulate(scene, 0.5, start=start, stepsize_controller=jv.Tolerance(1e-10), samples=2, estimate=False)
     np.testing.assert_allclose(many.state.angle[1][0], one.trajectory.state.angle[1][-1], atol=1e-6)
 
 
@@ -86,7 +86,8 @@ def test_gradients_go_through_loads_with_two_coordinates():
         loads = TorusPoints(scene.loads.mass, scene.loads.radius, tube, scene.loads.drag, 1)
         given = jv.Scene(scene.machine, loads, scene.drive)
         start = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1), jnp.ones(1)), (jnp.full(1, 30.0), jnp.zeros(1)))
-        return jv.simulate(given, 0.2, start=start, steps=200, save="all", samples=2).trajectory.state.displacement[-1, 0]
+        run = jv.simulate(given, 0.2, start=start, stepsize_controller=jv.EqualSteps(200), samples=2)
+        return run.trajectory.state.displacement[-1, 0]
 
     slope = jax.grad(end)(scene.loads.tube)
     step = 1e-5
@@ -108,14 +109,14 @@ def test_a_motor_from_outside_turns_the_rotor_and_balances_its_power():
 @pytest.mark.parametrize(
     ("make", "ask", "says"),
     [
-        (with_friction, lambda s: jv.averaged_field(s), r"effects.seal_friction .*property averages_out"),
+        (with_friction, lambda s: averaged_field(s), r"effects.seal_friction .*property averages_out"),
         (with_friction, lambda s: jv.phase_jams(s), r"effects.seal_friction .*property averages_out"),
-        (with_friction, lambda s: balanced_states(s), r"effects.seal_friction .*property averages_out"),
+        (with_friction, lambda s: jv.balanced_states(s), r"effects.seal_friction .*property averages_out"),
         (on_torus, lambda s: jv.jam_modes(s), r"loads.kind is 'torus_point'.*property circular"),
         (on_torus, lambda s: jv.jam_orbit(s, near=50.0), r"loads.kind is 'torus_point'.*property circular"),
         (on_torus, lambda s: jv.initial_state(s, "jam", mode=1), r"loads.kind is 'torus_point'.*property circular"),
         (with_turbine, lambda s: jv.jam_modes(s), r"drive.kind is 'turbine'.*property ideal"),
-        (with_turbine, lambda s: jv.averaged_field(s), r"drive.kind is 'turbine'.*property ideal"),
+        (with_turbine, lambda s: averaged_field(s), r"drive.kind is 'turbine'.*property ideal"),
     ],
 )
 def test_what_a_property_does_not_allow_is_refused_by_its_name(make, ask, says):

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 import jaxvib as jv
 from jaxvib.motion.run import RunStatus
 from jaxvib.results.result import Result
-from jaxvib.results.status import Computed, failure, member, member_names, sentence, status_name, status_names
+from jaxvib.results.status import Computed, failure, member, sentence, status_name, status_names
+from jaxvib.runtime.compat import enumeration_names
 from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import balanced_stability
 from jaxvib.steady.jams.phase_search import phase_branch
@@ -193,7 +194,7 @@ def test_units_of_coordinates_and_labels():
 
 def test_plain_data_of_statuses_complex_and_infinite_numbers():
     plain = RESULTS["JamModes"]().as_dict()
-    assert set(plain["status"]) <= set(member_names(jv.JamStatus)) and len(plain["status"]) == 3
+    assert set(plain["status"]) <= set(enumeration_names(jv.JamStatus)) and len(plain["status"]) == 3
     real, imaginary = plain["displacement"][0][0]
     assert complex(real, imaginary) == RESULTS["JamModes"]().displacement[0, 0]
     assert RESULTS["Criterion"]().as_dict()["balancing"][-1][1] is None
@@ -201,7 +202,6 @@ def test_plain_data_of_statuses_complex_and_infinite_numbers():
 
 
 def test_names_of_statuses():
-    assert member_names(RunStatus)[:2] == ("done", "max_steps_reached"), "equinox keeps names elsewhere now: see status.py"
     assert status_name(RunStatus.no_step) == "no_step" and sentence(Computed.done) == "the answer was computed"
     several = member(RunStatus, [["done", "no_start"], ["done", "done"]])
     assert status_names(several).tolist() == [["done", "no_start"], ["done", "done"]]
@@ -254,6 +254,43 @@ def test_a_class_that_moved_is_found_by_its_public_name(tmp_path):
     arrays["result"] = np.asarray(str(arrays["result"]).replace("jaxvib.steady.jams.jam:", "jaxvib.steady.elsewhere:"))
     np.savez(path, **arrays)
     alike(jv.load(path), RESULTS["JamModes"]())
+
+
+def test_jams_and_arrangements_answer_further_questions():
+    jams = RESULTS["PhaseJams"]()
+    jam = jams.select(jams.omega.shape[0] - 1)
+    near = jv.phase_jams(ROTOR, near=(jam.omega * 1.001, jam.phase))
+    np.testing.assert_allclose(near.omega, jam.omega, rtol=1e-9)
+    branch = jams.follow(jams.omega.shape[0] - 1, jnp.array([float(jam.omega), 172.0]))
+    np.testing.assert_allclose(branch.drag_factor[0], 1.0, rtol=1e-9)
+    states = jv.balanced_states(SCENE)
+    alike(states.stability(), balanced_stability(SCENE, states.angles[0]))
+    (interval,) = states.intervals(29.0, 60.0, points=16)
+    assert (states.growth([25.0, 50.0]) < 0.0).tolist() == [False, True] and interval[1] == 60.0
+    alone = jv.balanced_states(jv.Scene(MACHINE, jv.balls(count=1, mass=0.25, radius=0.1, drag=0.25), SCENE.drive))
+    with pytest.raises(jv.ComputationError, match="alone: a single load has nothing to cancel it"):
+        alone.stability()
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda: jv.settle(SCENE, tolerance=1e-6), "tolerance is no argument of settle any more"),
+        (lambda: jv.envelope(SCENE, 1.0, controller=None), "write stepsize_controller=controller"),
+        (lambda: jv.envelope(SCENE, 1.0, stepsize_controller=jv.EqualSteps(9)), "must be one of: Tolerance"),
+        (lambda: jv.ensemble(at_speed, jnp.ones(2), 1.0, steps=64), "write stepsize_controller=jv.EqualSteps"),
+        (lambda: jv.ensemble(at_speed, jnp.ones(2), 1.0, stepsize_controller=jv.Tolerance(1e-6)), "must be one of: EqualSteps"),
+        (lambda: jv.run_ups(SCENE, 1.0, tolerance=1e-6), "write stepsize_controller=jv.Tolerance"),
+        (lambda: jv.swing(ROD, [0.0, 1.0], angle=0.1, viscous=0.0, tolerance=1e-6), "write stepsize_controller=jv.Tolerance"),
+        (
+            lambda: jv.swing(ROD, [0.0, 1.0], angle=0.1, viscous=0.0, stepsize_controller=9),
+            "stepsize_controller is 9; it must be",
+        ),
+    ],
+)
+def test_former_spellings_and_other_choices_of_steps_are_refused(ask, says):
+    with pytest.raises(jv.InputError, match=says):
+        ask()
 
 
 def test_what_no_file_can_hold():

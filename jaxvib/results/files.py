@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.results.fields import is_named_tuple
-from jaxvib.results.status import enumeration_of, is_status, member, status_names
+from jaxvib.results.status import is_status, member, status_names
+from jaxvib.runtime.compat import enumeration_of
 
 __all__ = ["load", "save"]
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError
+from jaxvib.runtime.compat import enumeration_names, enumeration_of, is_tracer
 
 __all__ = [
     "Computed",
-    "enumeration_of",
     "failure",
     "is_status",
     "member",
-    "member_names",
     "sentence",
     "status_name",
     "status_names",
@@ -29,24 +29,9 @@ class Computed(eqx.Enumeration):
     done = "the answer was computed"
 
 
-def member_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
-    """The names of an enumeration's members in the order of their numbers.
-
-    >>> member_names(Computed)
-    ('done',)
-    """
-    # Equinox has no public way to the names; a test says so where this one goes.
-    return tuple(enumeration._name_to_item)
-
-
 def is_status(value: Any) -> bool:
     """Whether a value is a member of an enumeration, or an array of them."""
     return isinstance(value, type(Computed.done))
-
-
-def enumeration_of(status: Any) -> Any:
-    """The enumeration that a status is a member of."""
-    return status._enumeration
 
 
 def member(enumeration: Any, names: Any) -> Any:
@@ -55,9 +40,9 @@ def member(enumeration: Any, names: Any) -> Any:
     >>> bool(member(Computed, "done") == Computed.done)
     True
     """
-    of_name = {name: k for k, name in enumerate(member_names(enumeration))}
+    of_name = {name: k for k, name in enumerate(enumeration_names(enumeration))}
     numbers = jnp.asarray(np.vectorize(of_name.__getitem__, otypes=[np.int32])(names))
-    return eqx.tree_at(lambda item: item._value, getattr(enumeration, next(iter(of_name))), numbers)
+    return jax.tree.unflatten(jax.tree.structure(getattr(enumeration, next(iter(of_name)))), [numbers])
 
 
 def status_names(status: Any) -> np.ndarray:
@@ -65,9 +50,10 @@ def status_names(status: Any) -> np.ndarray:
 
     **Raises** `TypeError` for a status that is not known yet, under a JAX transformation.
     """
-    if status.is_traced():
+    (numbers,) = jax.tree.leaves(status)
+    if is_tracer(numbers):
         raise TypeError("a status under a JAX transformation has no name yet; look at it outside")
-    return np.asarray(member_names(enumeration_of(status)))[np.asarray(status._value)]
+    return np.asarray(enumeration_names(enumeration_of(status)))[np.asarray(numbers)]
 
 
 def status_name(status: Any) -> str:
@@ -89,7 +75,7 @@ def sentence(status: Any) -> str:
     enumeration = enumeration_of(status)
     if names.ndim == 0:
         return enumeration[status]
-    said = {name: int(np.sum(names == name)) for name in member_names(enumeration)}
+    said = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
     parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in said.items() if k]
     return "; ".join(parts) or "there is none"
 

@@ -1,16 +1,19 @@
-"""All that the project uses of JAX and XLA beyond what they promise to keep, each with what is done without it.
+"""All that the project uses of JAX, Equinox and XLA beyond what they promise to keep, each with what is done without it.
 
 tests/runtime/test_compat.py has a test for each, which fails by its name when a new version changes it.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import importlib.metadata
+import inspect
 import json
 import os
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +31,8 @@ __all__ = [
     "accepted_flags",
     "backend_started",
     "custom_vmap",
+    "enumeration_names",
+    "enumeration_of",
     "is_tracer",
     "jaxpr_as_fun",
     "user_folder",
@@ -114,6 +119,26 @@ def starts_with(flags: list[str]) -> bool:
     environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
+
+
+def enumeration_of(item: object) -> Any:
+    """The `equinox.Enumeration` that a member, or an array of members, is of. Without its attribute, what its text names."""
+    found = getattr(item, "_enumeration", None)
+    if found is None:
+        module, _, name = repr(item).split("<")[0].rpartition(".")
+        found = getattr(sys.modules[module], name)
+    return found
+
+
+def enumeration_names(enumeration: Any) -> tuple[str, ...]:
+    """The names of the members in the order of their numbers. Without Equinox's table of them, those in its source."""
+    known = getattr(enumeration, "_name_to_item", None)
+    if known is not None:
+        return tuple(known)
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(enumeration))).body
+    assert isinstance(definition, ast.ClassDef)
+    targets = [target for node in definition.body if isinstance(node, ast.Assign) for target in node.targets]
+    return tuple(target.id for target in targets if isinstance(target, ast.Name))
 
 
 def user_folder() -> Path:

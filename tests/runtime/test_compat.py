@@ -109,10 +109,35 @@ def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     assert compat.accepted_flags(flags) == flags[:1]
 
 
+def test_members_of_enumerations_have_names():
+    """equinox.Enumeration: _enumeration of a member, _name_to_item of the class; and the fallbacks where they are gone."""
+    status = jv.RunStatus.where(jnp.asarray(True), jv.RunStatus.no_step, jv.RunStatus.done)
+    assert status._enumeration is jv.RunStatus and compat.enumeration_of(status) is jv.RunStatus
+    names = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")
+    assert tuple(jv.RunStatus._name_to_item) == names and compat.enumeration_names(jv.RunStatus) == names
+
+    class Bare:
+        done = "it is done"
+        other = "it is not"
+
+    assert compat.enumeration_names(Bare) == ("done", "other")
+    text = type("Item", (), {"__repr__": lambda self: repr(status)})()
+    assert compat.enumeration_of(text) is jv.RunStatus
+
+
 def test_private_modules_are_used_in_one_file_only():
     """No other module reaches into private or unstable parts of JAX and diffrax."""
     package = pathlib.Path(jv.__file__).parent
-    private = ("jax._src", "jax.extend", "jax.core", "jax.custom_batching", "config.values", "eval_coeffs")
+    private = (
+        "jax._src",
+        "jax.extend",
+        "jax.core",
+        "jax.custom_batching",
+        "config.values",
+        "eval_coeffs",
+        "._enumeration",
+        "_name_to_item",
+    )
     found = {
         f"{path.relative_to(package)}: {name}"
         for path in package.rglob("*.py")

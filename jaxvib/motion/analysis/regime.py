@@ -15,7 +15,8 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, _mean_speed
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-from jaxvib.results.status import member_names, sentence, status_name
+from jaxvib.results.status import sentence, status_name
+from jaxvib.runtime.compat import enumeration_names
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
 
@@ -45,7 +46,7 @@ class RegimeName(eqx.Enumeration):
     unsettled = "the loads have not come to a steady motion"
 
 
-REGIMES = member_names(RegimeName)
+REGIMES = enumeration_names(RegimeName)
 """The words for the members of `RegimeName`, in their order."""
 
 

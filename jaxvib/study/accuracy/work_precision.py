@@ -186,11 +186,8 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
     @functools.cache
     def reference(tolerance: float = 1e-13) -> np.ndarray:
         """Computed when it is first asked for, so that the row of the same program tells how long compiling takes."""
-        return np.ravel(
-            np.asarray(
-                read(simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)), float
-            )
-        )
+        run = simulate(ask.scene, end, save="window", stepsize_controller=Tolerance(tolerance), estimate=False)
+        return np.ravel(np.asarray(read(run), float))
 
     rows, left_out = _integrated(ask, read, lambda value: relative(value, reference()), start, lambda tolerance: end)
     return Cost(quantity, reference().tolist(), relative(reference(1e-11), reference()), rows, (reason, *left_out))
@@ -209,9 +206,8 @@ def _integrated(
         end = length(tolerance)
 
         def averaged(end: float = end, tolerance: float = tolerance) -> Any:
-            return read(
-                envelope(ask.scene, end, start=start, save="window", stepsize_controller=Tolerance(tolerance), throw=False)
-            )
+            chosen = Tolerance(tolerance)
+            return read(envelope(ask.scene, end, start=start, save="window", stepsize_controller=chosen, throw=False))
 
         try:
             rows.append(row_of("envelope", "Rodas4", f"{tolerance:.0e}", averaged, error, ask.repeats))
@@ -230,15 +226,8 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
         solver = None if SOLVERS[name] is None else SOLVERS[name]()
 
         def run(tolerance: float) -> Run:
-            asked = dict(
-                save="window",
-                stepsize_controller=Tolerance(tolerance),
-                solver=solver,
-                estimate=False,
-                max_steps=steps,
-                throw=False,
-            )
-            return simulate(scene, ends[tolerance], start=start, **asked)  # pyright: ignore[reportArgumentType]
+            asked = dict(solver=solver, stepsize_controller=Tolerance(tolerance), max_steps=steps, estimate=False, throw=False)
+            return simulate(scene, ends[tolerance], start=start, save="window", **asked)  # pyright: ignore[reportArgumentType]
 
         return [
             row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)
