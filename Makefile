@@ -27,7 +27,7 @@ test-slow: $(VENV)/installed
 # The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
 LOWEST_PYTHON ?= python3.11
 HIGHEST_PYTHON ?= python3.13
-VERSION_TESTS = tests/runtime tests/equations tests/ode/test_engine.py tests/steady/jams/test_jam.py tests/motion/test_endings.py
+VERSION_TESTS = tests/runtime tests/equations tests/ode/test_scalarize.py tests/ode/test_dopri8.py tests/steady/jams/test_jam.py tests/motion/test_endings.py
 
 test-versions:
 	$(MAKE) .venv-lowest/installed VENV=.venv-lowest PYTHON=$(LOWEST_PYTHON) PIP_CONSTRAINT=.ci/lowest.txt
