@@ -47,18 +47,18 @@ def chain(platforms: int) -> jv.Scene:
 @eqx.filter_jit
 def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: bool):
     """Batches of 100 orbits: rotor speeds, and multipliers where asked."""
-    grid = grid_of(points, True)
+    model, grid = collected_model(linear_model(scene)), grid_of(points, True)
 
     def one(w):
-        motion = periodic_motion(scene, grid, "omega", w, jam_rotor_speed(scene, w))
-        return motion, harmonics_of(scene, grid, motion)
+        motion = periodic_motion(model, grid, "omega", w, rotor_speed_at(model.linear, w))
+        return motion, harmonics_of(model, grid, motion)
 
     def batch(w):
         motion, harmonics = jax.vmap(one, out_axes=-1)(w)
         if not multipliers:
             return motion.rotor_speed, ()
         return motion.rotor_speed, floquet(
-            scene, grid, motion, harmonics, jnp.max(steps_for(scene, w, motion.rotor_speed))
+            model, grid, motion, harmonics, jnp.max(steps_for(model.linear, w, motion.rotor_speed))
         ).roots
 
     return jax.lax.map(batch, omega.reshape(-1, 100))

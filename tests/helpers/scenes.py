@@ -4,6 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
+from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import linear_model
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
@@ -66,3 +68,8 @@ def some_state(s):
     rng = np.random.default_rng(0)
     draw = [jnp.asarray(rng.normal(size=k)) for k in (nd, nd, n, n)]
     return jv.State(draw[0], draw[1], (draw[2],), (30.0 + draw[3],))
+
+
+def assembled(scene):
+    """The scene's carrier with its collected loads, as exact jams take it."""
+    return collected_model(linear_model(scene))

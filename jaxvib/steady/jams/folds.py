@@ -71,7 +71,7 @@ def rotor_speed_at(model: LinearModel, omega: Array, speed: Array | None = None)
         return free
 
     def residual(n: Array) -> Array:
-        return loads.drag_sum() * (n - omega) + light_friction(scene, omega, n) - torque
+        return loads.drag_sum() * (n - omega) + light_friction(loads, scene.effects, omega, n) - torque
 
     return bracketed_root(residual, omega, free)
 

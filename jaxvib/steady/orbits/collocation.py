@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import bodies, circle, load_torque, torque_slopes
-from jaxvib.equations.linear import LinearModel, jammed_loads
+from jaxvib.equations.collected import CollectedModel
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.linalg import small_solve
 
@@ -23,24 +22,24 @@ _STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
 
-def receptance(model: LinearModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+def receptance(model: CollectedModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
     """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
 
     D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
     """
-    port = model.carrier.port.T.astype(complex)
+    port = model.linear.carrier.port.T.astype(complex)
 
     def at(k: Array) -> Array:
         w = k * omega
-        return small_solve(model.dynamic_stiffness(w, speed), w**2 * port)
+        return small_solve(model.linear.dynamic_stiffness(w, speed), w**2 * port)
 
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _answer(model: LinearModel, grid: Grid, omega: Array, speed: Array) -> Array:
+def _answer(model: CollectedModel, grid: Grid, omega: Array, speed: Array) -> Array:
     """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
-    return -(w**2)[:, None, None] * (model.carrier.port @ receptance(model, omega, speed, grid.orders))
+    return -(w**2)[:, None, None] * (model.linear.carrier.port @ receptance(model, omega, speed, grid.orders))
 
 
 def _feedback(grid: Grid, answer: Array) -> Array:
@@ -60,16 +59,15 @@ class _Balance(NamedTuple):
     pull: Array
 
 
-def _balance(model: LinearModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
-    scene, whole = model.scene, bodies(model.scene)
+def _balance(model: CollectedModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
-    point, moving = circle(scene, phi)
-    along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", whole.unbalance, point) @ grid.analysis)
+    point, moving = model.circle(phi)
+    along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", model.unbalance, point) @ grid.analysis)
     acceleration = (along_port @ grid.synthesis).real
-    size, unit = whole.unbalance[:, None], (whole.drag * omega)[:, None]
+    size, unit = model.unbalance[:, None], (model.drag * omega)[:, None]
     vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
-    torque = load_torque(scene, phi, rate, speed, acceleration)
-    inertia = (whole.inertia * omega**2)[:, None] * (deviation @ grid.second.T)
+    torque = model.torque(phi, rate, speed, acceleration)
+    inertia = (model.inertia * omega**2)[:, None] * (deviation @ grid.second.T)
     largest = jnp.max((jnp.abs(inertia) + jnp.abs(torque) + jnp.abs(vibration)) / unit)
     return _Balance(
         (inertia - torque + vibration) / unit,
@@ -81,20 +79,19 @@ def _balance(model: LinearModel, grid: Grid, answer: Array, deviation: Array, om
 
 
 def _jacobian(
-    model: LinearModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+    model: CollectedModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
     """d residual / d deviation (G M, G M)."""
-    scene, whole = model.scene, bodies(model.scene)
     g, m = deviation.shape
-    unit = (whole.drag * omega)[:, None]
+    unit = (model.drag * omega)[:, None]
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
-    by_angle, by_rate, by_acceleration = torque_slopes(scene, phi, rate, speed, balance.acceleration)
+    by_angle, by_rate, by_acceleration = model.torque_slopes(phi, rate, speed, balance.acceleration)
     own = (
-        (whole.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
+        (model.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
         + (balance.pull - by_angle / unit)[:, :, None] * np.eye(m)[None]
         - (omega * by_rate / unit)[:, :, None] * grid.first[None]
     )
-    shake = whole.unbalance[None, :, None] * balance.moving
+    shake = model.unbalance[None, :, None] * balance.moving
     # Dry friction answers to the acceleration that the others cause as well.
     answers = (shake - by_acceleration) / unit[None]
     coupling = jnp.einsum("agi,abij,bhj->gihj", answers, _feedback(grid, answer), shake)
@@ -112,7 +109,7 @@ class PeriodicSolution(NamedTuple):
 
 
 def periodic_motion(
-    model: LinearModel, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
+    model: CollectedModel, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
 ) -> PeriodicSolution:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
@@ -128,9 +125,7 @@ def periodic_motion(
     Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
     if deviation is None:
-        deviation = jnp.zeros(
-            (1 if jammed_loads(model.scene).alike else model.scene.loads.count, grid.theta.size), dtype=value.dtype
-        )
+        deviation = jnp.zeros((*model.unbalance.shape, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, deviation))
     psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
     omega, speed = _both(given, value, x)
@@ -161,12 +156,12 @@ class _State(NamedTuple):
 
 @eqx.filter_custom_jvp
 def _newton(
-    model: LinearModel, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
+    model: CollectedModel, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
 ) -> tuple[Array, Array]:
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
-    fixed = given == "omega" and model.carrier.gyroscopic is None
+    fixed = given == "omega" and model.linear.carrier.gyroscopic is None
     known = _answer(model, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
@@ -213,7 +208,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
     deviation, x = _newton(model, value, start, deviation, grid=grid, given=given)
     on = grid_of(*grid)
 
-    def equations(model: LinearModel, value: Array) -> Array:
+    def equations(model: CollectedModel, value: Array) -> Array:
         omega, speed = _both(given, value, x)
         residual = _balance(model, on, _answer(model, on, omega, speed), deviation, omega, speed).residual
         return jnp.append(residual, 0.0)
@@ -224,7 +219,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
 
 
 def _linearised(
-    model: LinearModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
+    model: CollectedModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
     if known is None:
@@ -250,7 +245,7 @@ class BranchTangent(NamedTuple):
     deviation_error: Array
 
 
-def branch_tangent(model: LinearModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
+def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """How the branch goes on from a periodic motion, and how good the motion is.
 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
@@ -299,11 +294,11 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(model: LinearModel, grid: Grid, motion: PeriodicSolution) -> Harmonics:
+def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> Harmonics:
     """The harmonics of psi and of everything that the carrier does."""
-    carrier, scene = model.carrier, model.scene
-    point, _ = circle(scene, grid.theta[None] + motion.deviation)
-    force = jnp.einsum("g,agi->ai", bodies(scene).unbalance, point) @ grid.analysis
+    carrier = model.linear.carrier
+    point, _ = model.circle(grid.theta[None] + motion.deviation)
+    force = jnp.einsum("g,agi->ai", model.unbalance, point) @ grid.analysis
     answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders)
     displacement = jnp.einsum("kdp,pk->dk", answer, force)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.collected import collected_model, has_half_turn
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -180,7 +180,7 @@ def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
     model = linear_model(scene)
     start = jax.vmap(lambda w: light_rotor_speed(model, w))(omega)
     steps = jnp.max(jax.vmap(lambda w, n: steps_for(model, w, n))(omega, start))
-    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy)
+    orbit, growth = orbits(collected_model(model), omega, start, "omega", many, steps, accuracy)
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import bodies, circle, has_half_turn, torque_slopes
-from jaxvib.equations.linear import LinearModel, jammed_loads
+from jaxvib.equations.collected import CollectedModel, has_half_turn
+from jaxvib.equations.linear import LinearModel
 from jaxvib.numerics.fourier import Grid
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
@@ -64,7 +64,7 @@ class _Coefficients(NamedTuple):
     by_rate: Array
 
 
-def floquet(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
+def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
     """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
@@ -80,37 +80,36 @@ def floquet(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics:
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
     derivatives exist) or a scalar array.
     """
-    scene, carrier, mass = model.scene, model.carrier, model.mass
-    whole = bodies(scene)
-    nd, count = mass.shape[0], whole.inertia.shape[0]
+    carrier, mass = model.linear.carrier, model.linear.mass
+    nd, count = mass.shape[0], model.inertia.shape[0]
     inverse = jnp.linalg.inv(mass)
     stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping
     gyroscopic = None if carrier.gyroscopic is None else inverse @ carrier.gyroscopic
-    total = jnp.sum(whole.unbalance)
-    share = whole.unbalance / total
+    total = jnp.sum(model.unbalance)
+    share = model.unbalance / total
     shift = inverse @ carrier.port.T * total
     length = jnp.max(jnp.abs(shift))
     shift = shift / length
     port = carrier.port * length
     mobility = port @ shift
     # What a body of loads gives way with, per share of the unbalance.
-    lever = (total / whole.inertia)[None, :, None, None]
+    lever = (total / model.inertia)[None, :, None, None]
     omega, speed = motion.omega, motion.rotor_speed
     lanes, w, n = omega.shape[0], omega[None, None], speed[None, None]
-    turn = np.pi if has_half_turn(scene) else 2.0 * np.pi
+    turn = np.pi if model.half_turn else 2.0 * np.pi
     h = turn / steps
 
     def coefficients(theta: Array) -> _Coefficients:
         deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, theta, k) for k in range(3))
         phi, rate = theta[None, :, None] + deviation, 1.0 + deviation1
-        point, moving = circle(scene, phi)
+        point, moving = model.circle(phi)
         acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
-        slopes = jax.vmap(lambda p, r, w, n, a: torque_slopes(scene, p, w * r, n, a), in_axes=-1, out_axes=-1)
+        slopes = jax.vmap(lambda p, r, w, n, a: model.torque_slopes(p, w * r, n, a), in_axes=-1, out_axes=-1)
         by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
-        stiff = by_angle + whole.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
+        stiff = by_angle + model.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
         moving2 = -point * deviation2[None] - moving * rate[None] ** 2
         s = share[None, :, None, None]
-        unit = whole.inertia[:, None, None] * omega[None, None] ** 2
+        unit = model.inertia[:, None, None] * omega[None, None] ** 2
         by_rate = by_rate * omega[None, None] / unit
         giving = s * moving - by_acceleration / total
         return _Coefficients(s * moving, giving, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
@@ -139,7 +138,7 @@ def floquet(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics:
     def start(n: int) -> Array:
         return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
 
-    loads = jammed_loads(scene)
+    loads = model.loads
     parting = loads.alike and loads.count > 1 and loads.own_radius is None
     sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
     fields = (full, apart)[: len(sizes)]
@@ -162,14 +161,14 @@ def floquet(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics:
 
     rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
     end = jax.lax.fori_loop(0, steps, step, begin)
-    flip = np.concatenate([np.full(2 * nd, -1.0 if has_half_turn(scene) else 1.0), np.ones(2 * count)])
+    flip = np.concatenate([np.full(2 * nd, -1.0 if model.half_turn else 1.0), np.ones(2 * count)])
     monodromy = flip[:, None, None] * end[0]
 
     # A shift in time: q' and phi' along the orbit itself.
     zero = jnp.zeros((1,), dtype=omega.dtype)
     at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
     deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, zero, k) for k in range(3))
-    _, moving = circle(scene, deviation)
+    _, moving = model.circle(deviation)
     along = jnp.concatenate([
         at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + deviation1)[None], axis=1)),
         -damped(at1, w, n) - _times(stiffness, at) / w**2,

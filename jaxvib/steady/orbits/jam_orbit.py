@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.collected import collected_model, has_half_turn
 from jaxvib.equations.linear import jammed_loads, linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -181,10 +181,10 @@ def _orbit(
     settle: bool = False,
 ) -> Orbit:
     """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
-    model, deviation = linear_model(scene), None
+    model, deviation = collected_model(linear_model(scene)), None
     if settle:
-        grid = grid_of(points, has_half_turn(scene))
-        deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model, start)).deviation[None]
+        grid = grid_of(points, model.half_turn)
+        deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
     lanes, _ = orbits(model, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, deviation)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
@@ -237,10 +237,11 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 @eqx.filter_jit
 def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds and slopes of exact jams at load speeds, in batches; NaN where there is none."""
-    model, grid = linear_model(scene), grid_of(*((16, True) if has_half_turn(scene) else (33, False)))
+    model = collected_model(linear_model(scene))
+    grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:
-        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model, w))
+        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
         there = motion.residual < 4096.0 * jnp.finfo(w.dtype).eps
         return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(
             there, branch_tangent(model, grid, motion).slope, jnp.nan

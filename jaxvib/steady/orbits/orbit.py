@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import bodies, circle, each_load, has_half_turn, load_torque, rotor_torque, torque_of_each
-from jaxvib.equations.linear import LinearModel, jammed_loads
+from jaxvib.equations.collected import CollectedModel
+from jaxvib.equations.linear import LinearModel
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -158,7 +158,7 @@ def light_rotor_speed(model: LinearModel, omega: Array) -> Array:
 
 
 def orbits(
-    model: LinearModel,
+    model: CollectedModel,
     value: Array,
     start: Array,
     given: Parameter,
@@ -172,8 +172,7 @@ def orbits(
 
     **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
     """
-    scene = model.scene
-    grid = grid_of(points, has_half_turn(scene))
+    grid = grid_of(points, model.half_turn)
 
     def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
         motion = periodic_motion(model, grid, given, v, s, deviation)
@@ -224,37 +223,37 @@ def orbits(
         force_harmonics=or_nan(harmonics.force),
         deviation_orders=tuple(map(int, grid.deviation_orders)),
         orders=tuple(map(int, grid.orders)),
-        units=model.carrier.units,
-        offsets=jnp.broadcast_to(bodies(scene).offsets, (value.shape[0], scene.loads.count)),
+        units=model.linear.carrier.units,
+        offsets=jnp.broadcast_to(model.offsets, (value.shape[0], model.loads.count)),
     )
     return orbit, growth
 
 
-def _measured(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
+def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
     """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
-    scene, branch = model.scene, branch_tangent(model, grid, motion)
+    branch = branch_tangent(model, grid, motion)
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real
-    drive = jnp.mean(jnp.sum(load_torque(scene, phi, rate, motion.rotor_speed, acceleration, rotor_torque), axis=0))
+    drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
     push = _least_push(model, grid, motion, harmonics)
     return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
 
 
-def _least_push(model: LinearModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
+def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
     vibration that holds a jam presses the loads together at every instant.
     """
-    scene, loads = model.scene, jammed_loads(model.scene)
+    loads = model.loads
     if loads.own_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
-    phi, rate = each_load(scene, grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))
+    phi, rate = model.each_load(grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))
     acceleration = (harmonics.acceleration @ grid.synthesis).real
-    vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", circle(scene, phi)[1], acceleration)
-    needed = jnp.mean(vibration - torque_of_each(scene, phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)
+    vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", model.circle(phi)[1], acceleration)
+    needed = jnp.mean(vibration - model.torque_of_each(phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)
     return jnp.min(-jnp.cumsum(needed)[:-1])
 
 

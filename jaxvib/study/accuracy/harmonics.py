@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.draw.comparison import convergence_chart
-from jaxvib.equations.collected import has_half_turn
+from jaxvib.equations.collected import collected_model, has_half_turn
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -84,10 +84,11 @@ def harmonic_convergence(
 
 @eqx.filter_jit
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    model, grid = linear_model(scene), grid_of(points, has_half_turn(scene))
+    model = collected_model(linear_model(scene))
+    grid = grid_of(points, model.half_turn)
 
     def one(w: Array) -> tuple[Array, Array]:
-        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model, w))
+        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
         return motion.rotor_speed, branch_tangent(model, grid, motion).speed_error
 
     return jax.vmap(one)(omega)

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from jax import Array
 
 from jaxvib.equations.averaged import averaged_loads
-from jaxvib.equations.collected import bodies
+from jaxvib.equations.collected import require_collected
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -68,7 +68,7 @@ class Tier(NamedTuple):
 
 TIERS = (
     Tier("leading order", jammed_loads, lambda scene, mode, until: jam_modes(scene).select(mode, throw=False)),
-    Tier("exact orbit", bodies, lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False)),
+    Tier("exact orbit", require_collected, lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False)),
     Tier(
         "envelope",
         averaged_loads,

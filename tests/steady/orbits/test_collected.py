@@ -8,7 +8,7 @@ import pytest
 from gyroscopic_rotor import rotor
 from jax.flatten_util import ravel_pytree
 from periodic import integrate, monodromy, ordered
-from scenes import machines, scene
+from scenes import assembled, machines, scene
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
@@ -54,8 +54,10 @@ def test_orbit_and_multipliers_are_those_of_the_full_equations(name):
 def test_gyroscopic_jam_at_a_given_rotor_speed():
     scene = CASES["gyroscopic"][0]()
     grid = grid_of(12, True)
-    given = periodic_motion(scene, grid, "omega", jnp.asarray(135.0), light_rotor_speed(scene, jnp.asarray(135.0)))
-    again = periodic_motion(scene, grid, "rotor_speed", given.rotor_speed, jnp.asarray(135.2))
+    given = periodic_motion(
+        assembled(scene), grid, "omega", jnp.asarray(135.0), light_rotor_speed(assembled(scene).linear, jnp.asarray(135.0))
+    )
+    again = periodic_motion(assembled(scene), grid, "rotor_speed", given.rotor_speed, jnp.asarray(135.2))
     np.testing.assert_allclose(again.omega, 135.0, rtol=1e-9)
 
 
@@ -79,7 +81,7 @@ def test_gradient_with_gyroscopic_coupling_by_differences():
     @jax.jit
     @jax.value_and_grad
     def f(x):
-        motion = periodic_motion(restore(x), grid_of(8, True), "omega", jnp.asarray(135.0), jnp.asarray(140.0))
+        motion = periodic_motion(assembled(restore(x)), grid_of(8, True), "omega", jnp.asarray(135.0), jnp.asarray(140.0))
         return motion.rotor_speed + motion.deviation[0, 1]
 
     direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))

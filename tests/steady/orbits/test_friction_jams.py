@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from gyroscopic_rotor import rotor
 from periodic import integrate, monodromy, ordered
-from scenes import machines
+from scenes import assembled, machines
 
 import jaxvib as jv
-from jaxvib.equations.collected import has_half_turn, load_torque, torque_slopes
+from jaxvib.equations.collected import has_half_turn
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.balance.criterion import criterion_functional
 from jaxvib.steady.jams.folds import jam_rotor_speed
@@ -81,7 +81,7 @@ def test_orbit_multipliers_and_power_are_those_of_the_full_equations(name):
 def test_dry_friction_keeps_the_half_turn_and_gravity_does_not():
     assert has_half_turn(alike(dry())) and not has_half_turn(alike(dry(), jv.Gravity()))
     # On a whole period, where the symmetry is not put in, it comes out.
-    motion = periodic_motion(alike(dry()), grid_of(33, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
+    motion = periodic_motion(assembled(alike(dry())), grid_of(33, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
     deviation = np.fft.rfft(motion.deviation[0])
     assert np.max(np.abs(deviation[1::2])) < 1e-10 * np.max(np.abs(deviation)) and float(motion.residual) < 1e-12
 
@@ -93,7 +93,7 @@ def test_gradient_by_the_coefficient_by_differences():
     @jax.value_and_grad
     def f(coefficient):
         scene = alike(dry(coefficient), jv.Gravity())
-        motion = periodic_motion(scene, grid_of(17, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
+        motion = periodic_motion(assembled(scene), grid_of(17, False), "omega", jnp.asarray(26.5), jnp.asarray(45.0))
         return motion.rotor_speed + 1e2 * motion.deviation[0, 1]
 
     x, h = jnp.asarray(0.1), 1e-5
@@ -114,8 +114,8 @@ def test_loads_side_by_side_take_the_friction_of_each_at_its_place():
         drag = 0.7 * 0.01 * (50.0 - rate) - 0.5 * 9.81 * 0.1 * np.cos(each)
         return np.sum(drag + 0.1 * 0.01 * np.abs(normal))
 
-    np.testing.assert_allclose(load_torque(scene, phi, rate, n, a)[0, 0], by_hand(0.3, 20.0, 40.0), rtol=1e-13)
-    by_angle, by_rate, by_a = torque_slopes(scene, phi, rate, n, a)
+    np.testing.assert_allclose(assembled(scene).torque(phi, rate, n, a)[0, 0], by_hand(0.3, 20.0, 40.0), rtol=1e-13)
+    by_angle, by_rate, by_a = assembled(scene).torque_slopes(phi, rate, n, a)
     h = 1e-4
     for value, d in ((by_angle, (h, 0, 0)), (by_rate, (0, h, 0)), (by_a[0], (0, 0, h))):
         p, r, x = d
@@ -174,6 +174,6 @@ def test_exact_branch_of_a_gyroscopic_rotor():
     (fold,) = (p for p in diagram.special if p.kind == "fold")
     grid = grid_of(16, True)
     at = fold.omega * (1.0 + jnp.asarray([-1e-3, -1e-6, 1e-6, 1e-3]))
-    n = jax.vmap(lambda w: periodic_motion(scene, grid, "omega", w, jnp.asarray(fold.rotor_speed)).rotor_speed)(at)
+    n = jax.vmap(lambda w: periodic_motion(assembled(scene), grid, "omega", w, jnp.asarray(fold.rotor_speed)).rotor_speed)(at)
     assert n[0] > n[1] and n[2] < n[3]
     np.testing.assert_allclose(n[1:3], fold.rotor_speed, rtol=1e-7)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from periodic import integrate
-from scenes import machines, published
+from scenes import assembled, machines, published
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -143,7 +143,7 @@ def test_stable_motion_stays_and_unstable_one_leaves():
 @eqx.filter_jit
 def many(scene, omega, points):
     def one(w):
-        motion = periodic_motion(scene, grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
+        motion = periodic_motion(assembled(scene), grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
         return motion.rotor_speed, motion.residual, branch_tangent(scene, grid_of(points, True), motion).speed_error
 
     return jax.vmap(one)(omega)
