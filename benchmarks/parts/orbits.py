@@ -20,9 +20,10 @@ from jax.flatten_util import ravel_pytree
 from parts.common import best, first, published, say
 
 import jaxvib as jv
-from jaxvib.equations.linear import steady_displacement
+from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import linear_model, steady_displacement
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
 from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
 from jaxvib.steady.orbits.floquet import floquet, steps_for
 
