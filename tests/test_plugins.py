@@ -12,6 +12,8 @@ from scenes import machines, published
 
 import jaxvib as jv
 from jaxvib.equations.averaged import averaged_field
+from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.study.accuracy.tier import TIERS
 
 TORQUE = 2e-5
 
@@ -35,12 +37,27 @@ def test_an_effect_with_friction_runs_in_every_tier_that_has_friction():
     scene = with_friction()
     jam, orbit = jv.jam_modes(scene).select(3), jv.jam_orbit(scene, mode=3)
     # The seal turns the load as well: the drag has less to do than the balance without it says.
-    bare = jv.jam_rotor_speed(jv.Scene(scene.machine, scene.loads, scene.drive), jam.omega)
+    bare = jam_rotor_speed(jv.Scene(scene.machine, scene.loads, scene.drive), jam.omega)
     np.testing.assert_allclose(bare - scene.drive.speed, TORQUE / scene.loads.drag_sum(), rtol=1e-9)
     np.testing.assert_allclose(orbit.omega, jam.omega, rtol=1e-3)
     run = jv.simulate(scene, 100.0, start=jv.State(*orbit.at(0.0)), save="window", estimate=False)
     np.testing.assert_allclose(run.omega, orbit.omega, rtol=1e-8)
     np.testing.assert_allclose(run.amplitude, orbit.amplitude, rtol=1e-7)
+
+
+def test_every_tier_answers_or_refuses_by_a_property():
+    scene = with_friction()
+    light, exact = (tier.jam(scene, 3, 100.0) for tier in TIERS[:2])
+    np.testing.assert_allclose(light.omega, exact.omega, rtol=1e-3)
+    np.testing.assert_allclose(light.amplitude, exact.amplitude, rtol=0.1)
+    for make, answering in (
+        (with_friction, [True, True, False, True]),
+        (on_torus, [False] * 3 + [True]),
+        (with_turbine, [False] * 3 + [True]),
+    ):
+        refusals = [tier.refusal(make()) for tier in TIERS]
+        assert [refusal is None for refusal in refusals] == answering
+        assert all("(property " in refusal for refusal in refusals if refusal is not None)
 
 
 def test_the_power_of_an_effect_from_outside_balances_the_energy():

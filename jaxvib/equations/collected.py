@@ -94,11 +94,12 @@ def collected_model(linear: LinearModel) -> CollectedModel:
     loads = require_collected(linear.scene)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
     if loads.alike:
-        numbers = loads.unbalance()[None], loads.count * inertia[None], loads.drag_sum()[None]
+        unbalance, whole, drag = loads.unbalance()[None], loads.count * inertia[None], loads.drag_sum()[None]
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
-        numbers = tuple(jnp.broadcast_to(x, (loads.count,)) for x in each)
-    return CollectedModel(linear, loads, linear.scene.effects, *numbers, loads.offsets(), has_half_turn(linear.scene))
+        unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
+    half_turn = has_half_turn(linear.scene)
+    return CollectedModel(linear, loads, linear.scene.effects, unbalance, whole, drag, loads.offsets(), half_turn)
 
 
 def require_collected(scene: Scene) -> CircularLoads:
