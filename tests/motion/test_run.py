@@ -40,16 +40,16 @@ def test_reading_what_is_no_run_is_an_input_error(tmp_path):
     (tmp_path / "text.npz").write_text("no run")
     np.savez(tmp_path / "other.npz", x=np.zeros(2))
     for name in ("text.npz", "other.npz"):
-        with pytest.raises(jv.InputError, match=r"it is no run written by Run\.save"):
+        with pytest.raises(jv.InputError, match=r"it is no result written by save"):
             jv.Run.load(tmp_path / name)
 
 
 def test_to_xarray_has_names_and_units(run):
     data = run.to_xarray()
-    assert dict(data.sizes) == {"time": 21, "coordinate": 2, "load": 3, "direction": 1}
+    assert dict(data.sizes) == {"time": 21, "window_time": 4096, "coordinate": 2, "load": 3, "direction": 1}
     assert data["displacement"].attrs["units"] == "m" and data["time"].attrs["units"] == "s"
     np.testing.assert_array_equal(data["displacement"].sel(coordinate="y2"), run.trajectory.state.displacement[:, 1])
-    assert data.attrs["status"] == "the run reached its end"
+    assert data.attrs["message"] == "the run reached its end"
 
 
 def test_summary_and_plot_show_the_run(run):

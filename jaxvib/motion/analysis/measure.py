@@ -90,8 +90,8 @@ def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
-    samples. `field` gives the rates of a state at a time; arrays that carry derivatives it has as a tree, not as a function's
-    closure.
+    samples. `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
+    `jax.tree_util.Partial`, and no plain function.
     """
     early, late, whole = _spans(scene, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2

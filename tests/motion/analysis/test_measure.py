@@ -28,7 +28,7 @@ def test_measure_reads_a_known_motion():
     def field(_, y):
         return jv.State(y.velocity, -(w**2) * (y.displacement - 0.7), y.rate, (jnp.zeros(n),))
 
-    measured = measure(s, field, t, states)
+    measured = measure(s, jax.tree_util.Partial(field), t, states)
     force = np.abs(np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * a * np.exp(1j * c)))
     np.testing.assert_allclose(measured.amplitude, a, rtol=1e-6)
     np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-6)
