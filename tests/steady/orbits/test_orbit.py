@@ -142,9 +142,11 @@ def test_stable_motion_stays_and_unstable_one_leaves():
 
 @eqx.filter_jit
 def many(scene, omega, points):
+    model = assembled(scene)
+
     def one(w):
-        motion = periodic_motion(assembled(scene), grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
-        return motion.rotor_speed, motion.residual, branch_tangent(scene, grid_of(points, True), motion).speed_error
+        motion = periodic_motion(model, grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
+        return motion.rotor_speed, motion.residual, branch_tangent(model, grid_of(points, True), motion).speed_error
 
     return jax.vmap(one)(omega)
 
