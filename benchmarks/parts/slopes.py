@@ -43,8 +43,8 @@ def gradient(quick: bool = False) -> None:
 
         ways: list[tuple[str, Any]] = [
             ("the run itself, jitted", run),
-            ("forward mode", jax.jit(jax.jacfwd(lambda x, s=steps: value(x, diffrax.ForwardMode(), **s)))),
-            ("reverse mode", jax.jit(jax.grad(lambda x, s=steps: value(x, **s)))),
+            ("forward mode", jax.jit(jax.jacfwd(lambda x, s=steps: value(x, diffrax.ForwardMode(), s)))),
+            ("reverse mode", jax.jit(jax.grad(lambda x, s=steps: value(x, steps=s)))),
             ("finite differences, 12 runs", differences),
         ]
         compiling = [first(lambda call=call: call(values)) for _, call in ways]
