@@ -144,8 +144,6 @@ def samples(quick: bool) -> None:
         row("scalarize: on arrays", call(), base)
     with mock.patch.object(scalarize, "_fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)):
         row("fence in the program on scalars: none", call(), base)
-    with mock.patch.object(scalarize, "_BLOCK", count):
-        row("blocks: all samples at once", call(), base)
 
 
 @contextlib.contextmanager

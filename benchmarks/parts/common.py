@@ -56,13 +56,20 @@ def best(call: Callable[[], Any], runs: int = 7) -> float:
 
 
 def busy(call: Callable[[], Any], runs: int = 5) -> float:
-    """Seconds of the processor that the cheapest of so many calls takes, the first one not counted."""
+    """Seconds of the processor that a call takes, the least of so many measurements; the first call is not counted.
+
+    A measurement repeats the call for 50 ms: systems count a process's time in ticks that may be milliseconds long.
+    """
     jax.block_until_ready(call())
+    begun = time.perf_counter()
+    jax.block_until_ready(call())
+    repeats = max(1, int(0.05 / max(time.perf_counter() - begun, 1e-6)))
     found = []
     for _ in range(runs):
         begun = time.process_time()
-        jax.block_until_ready(call())
-        found.append(time.process_time() - begun)
+        for _ in range(repeats):
+            jax.block_until_ready(call())
+        found.append((time.process_time() - begun) / repeats)
     return min(found)
 
 

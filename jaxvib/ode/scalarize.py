@@ -26,8 +26,8 @@ __all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", 
 MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
 """With more numbers in a state, or operations on them, equations on scalars take too long to compile for what they save."""
 
-_BLOCK = 128
-"""So many entries of a batch go through a program on scalars together: its values, a vector each, stay in the cache."""
+_BLOCK = 4096
+"""So many entries of a batch go through a program on scalars together: it may hold a thousand values of each in memory."""
 
 _MAX_RECOMPUTED = 8
 """A value used more than once that takes more operations than these is fenced: see `_fenced`."""
@@ -106,7 +106,7 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
     """`jax.vmap(function, in_axes=(0, None))`, on single numbers where `function` is small enough; for values only.
 
     The program on scalars is fenced, so that its time grows with the number of its operations whatever they are, and it goes
-    through the batch in blocks that stay in the cache. Its derivatives are right but need not be fast.
+    through a large batch in blocks, so that its memory does not grow with the batch. Its derivatives are right but need not be fast.
 
     **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
 
@@ -131,7 +131,8 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
         def single(x: Any) -> Array:
             return jnp.stack(_fenced(program, [*scalars_of(x), *constants]))
 
-        rows = lax.map(single, batch, batch_size=_BLOCK)
+        count = jax.tree.leaves(batch)[0].shape[0]
+        rows = jax.vmap(single)(batch) if count <= _BLOCK else lax.map(single, batch, batch_size=_BLOCK)
         ends = np.cumsum([leaf.size for leaf in shapes])
         parts = [
             rows[:, end - leaf.size : end].reshape(len(rows), *leaf.shape).astype(leaf.dtype)
