@@ -25,6 +25,10 @@ def __getattr__(name: str) -> Any:
         return version("jaxvib")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if not _HOMES[name].startswith(("jaxvib.errors", "jaxvib.runtime")):
+        from jaxvib.runtime.startup import start
+
+        start()
     value = globals()[name] = getattr(importlib.import_module(_HOMES[name]), name)
     return value
 

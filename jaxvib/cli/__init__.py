@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import sys
 
 __all__ = ["main"]
@@ -24,19 +23,12 @@ def main() -> None:
 
 def prepare() -> None:
     """Float64, and compiled programs cached on disk, so that the second call of a command answers at once."""
-    # Equinox turns runtime checks into host callbacks, which keep a program out of the cache; results carry a status instead.
-    os.environ.setdefault("EQX_ON_ERROR", "nan")
-    from jaxvib.runtime.cpu import prepare_cpu
+    from jaxvib.runtime.startup import start
 
-    prepare_cpu()
+    problem = start()
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxvib.errors import InputError
-    from jaxvib.runtime.cache import use_cache
-
-    try:
-        use_cache()
-    except InputError as error:
-        print(f"jaxvib: programs are not cached: {error}", file=sys.stderr)
+    if problem:
+        print(f"jaxvib: programs are not cached: {problem}", file=sys.stderr)
         jax.config.update("jax_compilation_cache_dir", None)

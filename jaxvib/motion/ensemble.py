@@ -27,6 +27,7 @@ from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
@@ -183,12 +184,12 @@ def _made(make: Callable[..., Any], values: Any) -> tuple[Scene, State]:
     return eqx.filter_vmap(one)(values)
 
 
-@eqx.filter_jit
+@cached
 def _fastest(scenes: Scene) -> Array:
     return jax.vmap(lambda scene: fastest_and_slowest(scene)[0])(scenes)
 
 
-@eqx.filter_jit
+@cached
 def _all(
     parts: list[Array], end: Array, counts: Any, shared: tuple[bool, ...], rest: Any, lanes: int, runs: int
 ) -> tuple[State, Array, Array, Array, Array]:

@@ -30,10 +30,11 @@ PER_TURN = 16
 
 
 class StepControl(eqx.Module):
-    """How steps are chosen: to `tolerance`, or so many of them, all equal, if `steps` is given (a scalar each)."""
+    """How steps are chosen: to `tolerance`, `max_steps` of them at most, or so many, all equal, if `steps` is given (scalars)."""
 
     tolerance: Array | None = None
     steps: Array | None = None
+    max_steps: Array | None = None
 
 
 @cached
@@ -68,7 +69,7 @@ def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepC
     units = motion.pack(spread(unit))
     if motion.wrapped:  # the count of turns has no error, and any unit
         units = (units[0], jax.tree.map(jnp.ones_like, units[1]))
-    return PIController(tolerance=tolerance, unit=units, relative=motion.pack(spread(relative)))  # pyright: ignore[reportCallIssue]
+    return PIController(tolerance=tolerance, unit=units, relative=motion.pack(spread(relative)), max_steps=control.max_steps)  # pyright: ignore[reportCallIssue]
 
 
 def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeController:
@@ -101,7 +102,7 @@ def integrate(
     controller: diffrax.AbstractStepSizeController | StepControl,
     adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
-    turns: int,
+    turns: Array,
     max_steps: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Run:

@@ -20,6 +20,7 @@ from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
+from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Run", "RunStatus"]
 
 
-_named = eqx.filter_jit(regime)
+_named = cached(regime)
 
 
 class RunStatus(eqx.Enumeration):

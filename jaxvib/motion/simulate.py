@@ -31,6 +31,8 @@ __all__ = ["enough_steps", "simulate"]
 
 _MOST_STEPS = 2**31 - 1
 
+_FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
+
 _COARSER = 100.0
 """The run whose difference to the run itself is its error estimate makes steps to so many times the tolerance."""
 
@@ -67,8 +69,8 @@ def simulate(
     - `until`: end time, s or text such as "20 s"
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
       over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
-    - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16 or more for each turn of the rotor, but 2000
-      under a JAX transformation and 262144 at most); "window" keeps no trajectory, only what is measured
+    - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16384, for runs of more than 1024 turns of the
+      rotor 262144, and 2000 under a JAX transformation); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
       and 256 turns of the rotor)
     - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
@@ -110,7 +112,7 @@ def simulate(
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
-    count(turns, "turns")
+    periods = jnp.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
@@ -126,11 +128,13 @@ def simulate(
     def run(chosen: StepControl | diffrax.AbstractStepSizeController) -> Run:
         kept = samples if save == "all" else 0
         allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
+        if known and adjoint is None:
+            chosen, allowed = _limited(chosen, allowed)
         stretches = _stretches(scene, end, state, save)
         if stretches > 1:
-            return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, turns, allowed)
+            return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, periods, allowed)
         begun = time.perf_counter()
-        found = integrate(scene, end, state, solver, chosen, adjoint, kept, turns, allowed, progress_meter)
+        found = integrate(scene, end, state, solver, chosen, adjoint, kept, periods, allowed, progress_meter)
         if traced(found.steps):
             return found
         jax.block_until_ready(found.steps)
@@ -149,6 +153,16 @@ def simulate(
     if throw and not traced(found.steps):
         _raise_if_failed(found, max_steps, stepsize_controller)
     return found
+
+
+def _limited(
+    chosen: StepControl | diffrax.AbstractStepSizeController, most: int
+) -> tuple[StepControl | diffrax.AbstractStepSizeController, int]:
+    """The control with the limit of its steps as a number of the program, as far as it can be, and what limits the loop."""
+    if not isinstance(chosen, StepControl) or (chosen.steps is not None and float(chosen.steps) > most):
+        return chosen, most
+    limit = None if chosen.tolerance is None else jnp.asarray(most, jnp.int32)
+    return StepControl(chosen.tolerance, chosen.steps, limit), _MOST_STEPS
 
 
 def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> StepControl | diffrax.AbstractStepSizeController:
@@ -246,7 +260,7 @@ def _in_stretches(
     solver: Any,
     controller: Any,
     adjoint: Any,
-    turns: int,
+    turns: Array,
     max_steps: int,
 ) -> Run:
     """The run of the last of several stretches; each begins at time 0 after whole turns of the rotor, angles within one."""
@@ -288,13 +302,13 @@ def last_state(scene: Scene, run: Run) -> State:
 
 
 def _enough_samples(scene: Scene, end: Array) -> int:
-    """So many that a picture shows the vibration and no beat of it with the samples; a power of 2: few compilations."""
+    """So many that a picture shows the vibration and no beat of it with the samples; two numbers, so two programs, will do."""
     wanted = PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
-    return 2000 if traced(wanted) else 2 ** math.ceil(math.log2(max(min(2.0**18, float(wanted)), 2000.0)))
+    return 2000 if traced(wanted) else _FEW_SAMPLES if float(wanted) <= _FEW_SAMPLES else _MANY_SAMPLES
 
 
 def enough_steps(scene: Scene, end: Array) -> int:
-    """500 steps for each turn of what moves fastest, rounded up to a power of 2 so that few numbers need few compilations."""
+    """500 steps for each turn of what moves fastest, rounded up to a power of 2 (where it is part of a program: few of them)."""
     turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
     if traced(turns):
         return 2**20

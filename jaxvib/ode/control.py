@@ -23,11 +23,12 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = 0.9 / e^(1/8) h. The exponents
     are products of square roots, which cost less than a power. h_next / h lies between 0.2 and 5. A step whose error is not a
     number is rejected with e = infinity; where no shorter step advances the time in its dtype, the run ends with
-    `diffrax.RESULTS.dt_min_reached`.
+    `diffrax.RESULTS.dt_min_reached`, after `max_steps` steps with `diffrax.RESULTS.max_steps_reached`: a limit that is a number
+    of the program, so that another one needs no other program.
 
     **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state, of what counts as 1 in each
     of its numbers (in its unit) and of which share of |y| is added to it. `relative` is 0 for angles: they grow without end,
-    and an error relative to them would let a long run lose its phase.
+    and an error relative to them would let a long run lose its phase. `max_steps` a whole number, or None.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -41,6 +42,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     tolerance: Array
     unit: PyTree[Array]
     relative: PyTree[Array]
+    max_steps: Array | None = None
 
     @property
     def rtol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -63,12 +65,14 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
         """The first step ends at t0 + dt0."""
-        return t0 + dt0, jnp.ones_like(self.tolerance)
+        return t0 + dt0, (jnp.ones_like(self.tolerance), self.max_steps)
 
     def adapt_step_size(
         self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
     ) -> Any:
         """Whether the step is accepted, where the next one begins and ends, and the controller's new state."""
+
+        root_before, left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
             size = self.tolerance * (unit + relative * jnp.maximum(jnp.abs(a), jnp.abs(b)))
@@ -82,12 +86,16 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
         accept = e <= 1.0
         cube = root * root * root
-        factor = 0.9 * jnp.where(accept, controller_state * controller_state, 1.0 / root) / cube
+        factor = 0.9 * jnp.where(accept, root_before * root_before, 1.0 / root) / cube
         factor = jnp.clip(factor, 0.2, jnp.where(accept, 5.0, 0.9))
         start = jnp.where(accept, t1, t0)
         end = start + factor * (t1 - t0)
-        before = jnp.where(accept, root, controller_state)
-        return accept, start, end, False, before, moved_on(accept, start, t1, end)
+        root = jnp.where(accept, root, root_before)
+        result = moved_on(accept, start, t1, end)
+        if left is not None:
+            left = left - 1
+            result = diffrax.RESULTS.where(left > 0, result, diffrax.RESULTS.max_steps_reached)
+        return accept, start, end, False, (root, left), result
 
 
 def moved_on(accept: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.ode.control import WrappedController
+from jaxvib.runtime.compat import no_host_checks
 
 __all__ = ["solve"]
 
@@ -50,6 +51,7 @@ def solve(
     return _with_replay(inputs, eqx.combine(jax.lax.stop_gradient(numbers), others), *rest)
 
 
+@no_host_checks()
 def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: int, progress: Any) -> diffrax.Solution:
     end, first_step, y0, args, saveat, term = inputs
     return diffrax.diffeqsolve(

@@ -106,7 +106,8 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
     """`jax.vmap(function, in_axes=(0, None))`, on single numbers where `function` is small enough; for values only.
 
     The program on scalars is fenced, so that its time grows with the number of its operations whatever they are, and it goes
-    through a large batch in blocks, so that its memory does not grow with the batch. Its derivatives are right but need not be fast.
+    through a large batch in blocks, so that its memory does not grow with the batch. Its derivatives are right but need not be
+    fast.
 
     **Arguments**: `function(x, shared)` gives a tree of arrays; the first leaf of x is a time or another finite scalar.
 

@@ -16,19 +16,18 @@ __all__ = ["default_folder", "use_cache"]
 _folder: list[Path] = []
 
 
-def use_cache(folder: str | os.PathLike[str] | None = None) -> Path:
+def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
     """Caches compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
 
     Two caches are used: jaxvib's own in `folder/programs`, of traced programs, and JAX's compilation cache, of what XLA makes
-    of them, in `folder` itself (where `jax_compilation_cache_dir` is set already, it stays). The command line does this by
-    itself; from Python it is one line at the start. Programs that differ in shapes, in options, in a version of jaxvib or JAX,
-    or in the processor are kept apart. The folder may be deleted at any time.
+    of them, in `folder` itself (where `jax_compilation_cache_dir` is set already, it stays). jaxvib does this by itself with
+    the default folder, unless the environment has JAXVIB_AUTOMATIC=off. Programs that differ in shapes, in options, in a
+    version of jaxvib or JAX, or in the processor are kept apart. The folder may be deleted at any time.
 
-    A program that calls back into Python cannot be stored. Those of `simulate` do, for the run-time checks of Equinox, unless
-    the environment has EQX_ON_ERROR=nan before Equinox is imported; statuses of results do not depend on them.
+    A program that calls back into Python, such as a progress meter's, cannot be stored.
 
     **Arguments**: `folder`, made where it does not exist; None: the one that JAX caches in already, else
-    `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`.
+    `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`; `only_if_unset` leaves a folder that was chosen before.
 
     **Returns** the folder. **Raises** `InputError` for a folder that cannot be made, that belongs to another user, or in which
     others may write: whoever can write there can run code as you.
@@ -39,6 +38,8 @@ def use_cache(folder: str | os.PathLike[str] | None = None) -> Path:
         ...
     jaxvib.errors.InputError: folder is '/dev/null'; it must be a folder that can be written to (Not a directory)
     """
+    if only_if_unset and _folder:
+        return _folder[0].parent
     path = (default_folder() if folder is None else Path(folder)).expanduser().absolute()
     programs = path / "programs"
     try:

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,7 @@ __all__ = [
     "enumeration_of",
     "is_tracer",
     "jaxpr_as_fun",
+    "no_host_checks",
     "user_folder",
 ]
 
@@ -119,6 +120,25 @@ def starts_with(flags: list[str]) -> bool:
     environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
+
+
+@contextlib.contextmanager
+def no_host_checks() -> Iterator[None]:
+    """What is traced in here has Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
+
+    Errors need a callback into Python, which keeps a program from being stored on disk. Equinox's own switch, EQX_ON_ERROR in
+    the environment, is read when it is imported and holds for the whole process. Without the attribute checks stay as they are.
+    """
+    errors = sys.modules.get("equinox._errors")
+    before = getattr(errors, "EQX_ON_ERROR", None)
+    if before != "raise":  # someone's choice stays
+        yield
+        return
+    try:
+        setattr(errors, "EQX_ON_ERROR", "nan")  # noqa: B010
+        yield
+    finally:
+        setattr(errors, "EQX_ON_ERROR", before)  # noqa: B010
 
 
 def enumeration_of(item: object) -> Any:

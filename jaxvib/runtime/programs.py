@@ -21,11 +21,14 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax import Array, export
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import is_tracer
+from jaxvib.runtime.compat import is_tracer, no_host_checks
 from jaxvib.runtime.cpu import processor
+from jaxvib.runtime.startup import start
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Undescribable, describe, rebuild
 
 __all__ = ["cached"]
@@ -41,7 +44,7 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promo
 
 
 def cached(function: Callable[P, T]) -> Callable[P, T]:
-    """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk after `use_cache`.
+    """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `use_cache`.
 
     Under a JAX transformation it is just the compiled function. The key of a program on disk holds all that it depends on: the
     shapes and types of arrays, the static parts of the arguments, JAX's options, the versions, when the sources were changed,
@@ -53,13 +56,15 @@ def cached(function: Callable[P, T]) -> Callable[P, T]:
 
 class _CachedFunction(Generic[P, T]):
     def __init__(self, function: Callable[P, T]):
-        self.function = function
-        self.jitted = eqx.filter_jit(function)
+        self.function = no_host_checks()(function)
+        self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
+        start()
         leaves, treedef = jax.tree.flatten((args, kwargs))
+        leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         folder = program_folder()
         if folder is None or any(is_tracer(leaf) for leaf in leaves) or _is_debugging():
             return self.jitted(*args, **kwargs)

@@ -28,6 +28,7 @@ from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -172,7 +173,7 @@ def envelope(
     return run
 
 
-@eqx.filter_jit
+@cached
 def _run(
     scene: Scene,
     end: Array,

@@ -17,6 +17,7 @@ from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
@@ -157,7 +158,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     return _characteristic_speeds(scene)
 
 
-@eqx.filter_jit
+@cached
 def _characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)

@@ -20,6 +20,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
 from jaxvib.steady.balance.stability import BalancedStability
 
@@ -278,7 +279,7 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
-@eqx.filter_jit
+@cached
 def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
     def flow(speed: Array) -> Array:
         return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
@@ -375,6 +376,6 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
             raise InputError("effects", "disturb the balanced motion (gravity does); leave them out, or simulate")
 
 
-@eqx.filter_jit
+@cached
 def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
     return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)

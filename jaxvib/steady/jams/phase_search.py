@@ -16,6 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
 from jaxvib.results.fields import in_unit
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
@@ -220,7 +221,7 @@ def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndar
     return np.log(np.where(good, factor, 1.0)), angles, good
 
 
-@eqx.filter_jit
+@cached
 def _followed_phases(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
     return jax.vmap(lambda w, start: _phases(parts, influence_of(parts, w)[0], w, start))(omega, phase)
 
@@ -230,10 +231,13 @@ def _power_of_2(n: int) -> np.ndarray:
     return np.resize(np.arange(n), 2 ** int(np.ceil(np.log2(max(n, 1024)))))
 
 
-_many = eqx.filter_jit(eqx.filter_vmap(balanced, in_axes=(None, 0, 0)))
+@cached
+def _many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
+    """`balanced` from many speeds and phases."""
+    return eqx.filter_vmap(balanced, in_axes=(None, 0, 0))(parts, omega, phase)
 
 
-@eqx.filter_jit
+@cached
 def _phases_at(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
     """`_phases` at load speeds (no,) from starts (ns, count): drag multiples (no, ns), phases (no, ns, count), success."""
     influences = jax.vmap(lambda w: influence_of(parts, w)[0])(omega)
@@ -299,7 +303,7 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     return PhaseBranch(jnp.asarray(speeds), *values, rotor_speed=scene.drive.speed, drag=drag)
 
 
-@eqx.filter_jit
+@cached
 def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
     """The pattern at load speeds (n,), each from that of the one before, or from `phase` itself where `anew` (n,)."""
     parts = parts_of(scene)

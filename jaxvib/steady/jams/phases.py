@@ -20,6 +20,7 @@ from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.units import traced
 
@@ -158,7 +159,7 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     return _phase_torques(scene, jnp.asarray(omega, dtype=scene.drive.speed.dtype), jnp.asarray(phase))
 
 
-@eqx.filter_jit
+@cached
 def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     parts = parts_of(scene)
     return torques_at(parts, influence_of(parts, omega)[0], omega, phase)
@@ -220,7 +221,7 @@ def balanced(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
     return x[0] * frozen.speed, jnp.concatenate([jnp.zeros(1, x.dtype), jnp.arctan2(jnp.sin(x[1:]), jnp.cos(x[1:]))])
 
 
-@eqx.filter_jit
+@cached
 def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     """`phase_jam` of arguments that are known to be right."""
     parts = parts_of(scene)

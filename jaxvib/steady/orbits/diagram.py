@@ -18,6 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, steps_for
@@ -170,12 +171,12 @@ def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     return old
 
 
-@eqx.filter_jit
+@cached
 def _fold_points(scene: Scene) -> tuple[Array, Array]:
     return fold_points(linear_model(scene), 64)
 
 
-@eqx.filter_jit
+@cached
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
     model = linear_model(scene)
     start = jax.vmap(lambda w: light_rotor_speed(model, w))(omega)

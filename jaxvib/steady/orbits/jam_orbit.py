@@ -14,6 +14,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
@@ -152,22 +153,22 @@ def jam_orbit(
     return found
 
 
-@eqx.filter_jit
+@cached
 def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
     return light_rotor_speed(linear_model(scene), omega)
 
 
-@eqx.filter_jit
+@cached
 def _steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
     return steps_for(linear_model(scene), omega, speed)
 
 
-@eqx.filter_jit
+@cached
 def _fold_points(scene: Scene) -> tuple[Array, Array]:
     return fold_points(linear_model(scene), _SEARCH)
 
 
-@eqx.filter_jit
+@cached
 def _orbit(
     scene: Scene,
     value: Array,
@@ -234,7 +235,7 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
     return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
 
 
-@eqx.filter_jit
+@cached
 def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds and slopes of exact jams at load speeds, in batches; NaN where there is none."""
     model = collected_model(linear_model(scene))

@@ -21,6 +21,7 @@ from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
 from jaxvib.steady.orbits.orbit import light_rotor_speed
 from jaxvib.units import Number, number
@@ -82,7 +83,7 @@ def harmonic_convergence(
     return HarmonicConvergence(np.asarray(speeds), highest, np.abs(n[:-1] / n[-1] - 1.0), known[:-1])
 
 
-@eqx.filter_jit
+@cached
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
     model = collected_model(linear_model(scene))
     grid = grid_of(points, model.half_turn)

@@ -18,6 +18,7 @@ from jaxvib.draw.record import record_chart
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, interval, ten_periods, turning_points
 from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
@@ -215,7 +216,7 @@ def steps_for(start: Unknowns, time: Any) -> int:
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 
 
-@eqx.filter_jit
+@cached
 def fit_swing(
     pendulum: BearingPendulum, time: Array, angle: Array, weight: Array, start: Unknowns, width: Array, max_steps: int
 ) -> Fit:

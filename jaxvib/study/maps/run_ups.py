@@ -23,6 +23,7 @@ from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, numbers
 
 if TYPE_CHECKING:
@@ -182,7 +183,7 @@ def run_ups(
     )
 
 
-@eqx.filter_jit
+@cached
 def _all(
     scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:

@@ -1,0 +1,110 @@
+"""What an answer takes the first time: in a fresh process with an empty cache, in one with a warm cache, and when asked again.
+
+    python benchmarks/first_answers.py [--only WORD ...]
+
+Every question is asked from plain Python, without `jit`, in processes of its own; times are seconds beyond importing JAX,
+Equinox and diffrax (what jaxvib itself imports counts), building the scene counted, the second call in milliseconds (the best
+of 5). Scene: the two-mass machine of the antiphase paper with three balls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+
+from parts.common import machine_line
+
+PRELUDE = """
+import time
+import jax, equinox, diffrax, optimistix
+jax.config.update("jax_enable_x64", True)
+begun = time.perf_counter()
+import jaxvib as jv
+scene = jv.Scene(jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5,
+                             link_damping=60.0), jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0))
+def stiffer(k):
+    return equinox.tree_at(lambda s: s.machine.stiffness, scene, k)
+K = scene.machine.stiffness
+"""
+
+QUESTIONS = {
+    "jam_modes": "call = lambda: jv.jam_modes(scene)",
+    "jam_modes, gradient": (
+        "call = lambda: jax.grad(lambda k: jv.jam_modes(stiffer(k)).select(3, throw=False).foundation_force)(K)"
+    ),
+    "branches": "call = lambda: jv.branches(scene)",
+    "branches(exact=True)": "call = lambda: jv.branches(scene, exact=True)",
+    "jam_orbit": "call = lambda: jv.jam_orbit(scene, mode=3)",
+    "jam_orbit, gradient": "call = lambda: jax.grad(lambda k: jv.jam_orbit(stiffer(k), mode=3).foundation_force)(K)",
+    "phase_jams": "call = lambda: jv.phase_jams(scene)",
+    "criterion": "call = lambda: jv.criterion(scene)",
+    "simulate, 5 s, window": "call = lambda: jv.simulate(scene, 5.0, start='jam', mode=3, save='window')",
+    "simulate, 5 s": "call = lambda: jv.simulate(scene, 5.0, start='jam', mode=3)",
+    "simulate, gradient forward": (
+        "call = lambda: jax.jacfwd(lambda k: jv.simulate(stiffer(k), 5.0, start='jam', mode=3, save='window', "
+        "adjoint=diffrax.ForwardMode()).foundation_force)(K)"
+    ),
+    "simulate, gradient reverse": (
+        "call = lambda: jax.grad(lambda k: jv.simulate(stiffer(k), 5.0, start='jam', mode=3, save='window', "
+        "max_steps=4096).foundation_force)(K)"
+    ),
+    "settle": "call = lambda: jv.settle(scene, start='jam', mode=3)",
+    "envelope": "call = lambda: jv.envelope(scene, 5.0, start='jam', mode=3)",
+    "ensemble of 64": (
+        "speeds = jax.numpy.linspace(100.0, 120.0, 64)\n"
+        "make = lambda n: equinox.tree_at(lambda s: s.drive.speed, scene, n)\n"
+        "call = lambda: jv.ensemble(make, speeds, 5.0)"
+    ),
+    "synthesize, 64 starts": (
+        "from optimize import DesignSpace, force_per_amplitude, hold, jam_frequency, synthesize\n"
+        "space = DesignSpace(scene, free={'machine.stiffness': (1e4, 1e5), 'machine.link_stiffness': (1e5, 4e5)}, "
+        "hold=[hold(jam_frequency(mode=3), 70.0)])\n"
+        "call = lambda: synthesize(space, force_per_amplitude(mode=3), starts=64, verify=False)"
+    ),
+}
+
+MEASURE = """
+jax.block_until_ready(jax.tree.leaves(call()))
+first = time.perf_counter() - begun
+again = []
+for _ in range(5):
+    begun = time.perf_counter()
+    jax.block_until_ready(jax.tree.leaves(call()))
+    again.append(time.perf_counter() - begun)
+print("TIMES", first, min(again))
+"""
+
+
+def asked(name: str, cache: str) -> tuple[float, float]:
+    """Seconds of the first and of a later call in a process of its own."""
+    code = PRELUDE + QUESTIONS[name] + MEASURE
+    clean = {
+        key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | {"XDG_CACHE_HOME": cache}, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"{name}: {done.stderr}")
+    first, again = next(line for line in done.stdout.splitlines() if line.startswith("TIMES")).split()[1:]
+    return float(first), float(again)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", choices=list(QUESTIONS), default=list(QUESTIONS))
+    options = parser.parse_args()
+    print(machine_line())
+    print(f"{'question':32s} {'empty cache, s':>15s} {'warm cache, s':>15s} {'again, ms':>12s}")
+    for name in options.only:
+        with tempfile.TemporaryDirectory() as cache:
+            empty, _ = asked(name, cache)
+            warm, again = asked(name, cache)
+        print(f"{name:32s} {empty:15.1f} {warm:15.1f} {1e3 * again:12.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""What is set once in a process before the first question: XLA's options for the CPU, and the cache of compiled programs."""
+
+from __future__ import annotations
+
+import functools
+import os
+import warnings
+
+from jaxvib.errors import InputError
+from jaxvib.runtime.cache import use_cache
+from jaxvib.runtime.compat import backend_started
+from jaxvib.runtime.cpu import has_flags, prepare_cpu
+
+__all__ = ["start"]
+
+
+@functools.cache
+def start() -> str:
+    """Does what `prepare_cpu()` and `use_cache()` do, unless they were called or the environment has JAXVIB_AUTOMATIC=off.
+
+    It is called when the first public name of jaxvib is asked for, errors and those two apart. Where JAX has begun to compute
+    already, so that XLA's options come too late, a warning says what that costs.
+
+    **Returns** why programs are not cached, empty where they are or need not be.
+    """
+    if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
+        return ""
+    if not has_flags():
+        if backend_started():
+            warnings.warn(
+                "JAX began to compute before jaxvib was used: time integration takes up to 50 times as long in this process, "
+                "and compiling 1.5 times. Call jaxvib.prepare_cpu() before any array is made, or silence this by "
+                "JAXVIB_AUTOMATIC=off in the environment",
+                stacklevel=4,
+            )
+        else:
+            prepare_cpu()
+    try:
+        use_cache(only_if_unset=True)
+    except InputError as error:
+        return str(error)
+    return ""
