@@ -30,7 +30,7 @@ PER_TURN = 16
 
 
 class StepControl(eqx.Module):
-    """How steps are chosen: to `tolerance`, `max_steps` of them at most, or so many, all equal, if `steps` is given (scalars)."""
+    """How steps are chosen: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
 
     tolerance: Array | None = None
     steps: Array | None = None

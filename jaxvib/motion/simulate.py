@@ -308,7 +308,7 @@ def _enough_samples(scene: Scene, end: Array) -> int:
 
 
 def enough_steps(scene: Scene, end: Array) -> int:
-    """500 steps for each turn of what moves fastest, rounded up to a power of 2 (where it is part of a program: few of them)."""
+    """500 steps for each turn of what moves fastest, rounded up to a power of 2: few programs where it is part of one."""
     turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
     if traced(turns):
         return 2**20

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-__all__ = ["bracketed_root"]
+__all__ = ["bracketed_root", "next_share"]
+
+Point = tuple[Any, Any]
 
 
 def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: tuple[Array, Array] | None = None) -> Array:
@@ -41,13 +44,7 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
             c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
             b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
             a, fa = x, fx
-            # Between a (newest) and b lies the root; c was there before.
-            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
-            safe = (1.0 - jnp.sqrt(1.0 - xi) < phi) & (phi < jnp.sqrt(xi))
-            guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-            edge = jnp.minimum(0.5 * tolerance * jnp.abs(a) / jnp.abs(b - a), 0.5)
-            share = jnp.where(safe, jnp.clip(guess, edge, 1.0 - edge), 0.5)
-            return steps + 1, a, fa, b, fb, share, best, least
+            return steps + 1, a, fa, b, fb, next_share(jnp, (a, fa), (b, fb), (c, fc), tolerance), best, least
 
         # Both ends at once: one copy of g in the program, not two.
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high])) if ends is None else ends
@@ -60,6 +57,19 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
 
     low, high, ends = jax.lax.stop_gradient((low, high, ends))
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
+
+
+def next_share(xp: Any, newest: Point, other: Point, before: Point, tolerance: float) -> Any:
+    """Where to look next for a root between `newest` and `other`, as a share of the way; `before` is the point before these.
+
+    Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` relative.
+    """
+    (a, fa), (b, fb), (c, fc) = newest, other, before
+    xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+    safe = (1.0 - xp.sqrt(1.0 - xi) < phi) & (phi < xp.sqrt(xi))
+    guess = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+    edge = xp.minimum(0.5 * tolerance * xp.abs(a) / xp.abs(b - a), 0.5)
+    return xp.where(safe, xp.clip(guess, edge, 1.0 - edge), 0.5)
 
 
 def _nonzero(slope: Array) -> Array:

@@ -16,6 +16,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.numerics.roots import next_share
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
-_LANES = 100
+_LANES = 32
 """Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
 
 _POINTS = (8, 16, 32, 64)
@@ -215,28 +216,26 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
         return ()
     solve = _Solver(scene, accuracy)
     pick = np.arange(row.size)
-    low, high = grid.omega[row].copy(), grid.omega[row + 1].copy()
-    f_low, f_high = tests[row, which], tests[row + 1, which]
-    middle, values = low, grid
-    # False position that never keeps an end twice (Illinois), with a halving now and then.
-    for turn in range(60):
-        before = middle
-        with np.errstate(all="ignore"):
-            aim = (low * f_high - high * f_low) / (f_high - f_low)
-        middle = np.where((turn % 5 == 4) | ~((aim > low) & (aim < high)), (low + high) / 2.0, aim)
-        values = solve(middle)
+    a, b = grid.omega[row], grid.omega[row + 1]
+    fa, fb = tests[row, which], tests[row + 1, which]
+    share, values, done = np.full(row.size, 0.5), grid, np.zeros(row.size, bool)
+    while not np.all(done):
+        # A root that is found stays where it is until all are.
+        x = np.where(done, a, a + share * (b - a))
+        values = solve(x)
         f = read(values)[pick, which]
-        if np.all((np.abs(middle - before) < 1e-10 * middle) | ~np.isfinite(f)):
-            break
-        left = f * f_low > 0.0
-        f_high = np.where(left, f_high / 2.0, f)
-        f_low = np.where(left, f, f_low / 2.0)
-        low, high = np.where(left, middle, low), np.where(left, high, middle)
+        done |= (np.abs(x - a) <= 1e-10 * a) | ~np.isfinite(f)
+        same = (f > 0.0) == (fa > 0.0)
+        before = np.where(same, a, b), np.where(same, fa, fb)
+        other = np.where(same, b, a), np.where(same, fb, fa)
+        with np.errstate(all="ignore"):
+            share = next_share(np, (x, f), other, before, 1e-12)
+        (a, fa), (b, fb) = (x, f), other
     points = []
     for k in range(row.size):
         s = values.multipliers[k]
         # Two real multipliers with product 1 pass the torus test without being a bifurcation.
         real = which[k] == 1 and not np.any((np.abs(np.abs(s) - 1.0) < 1e-4) & (np.abs(s.imag) > 1e-6))
         if np.isfinite(values.rotor_speed[k]) and not real:
-            points.append(SpecialPoint(kinds[which[k]], float(middle[k]), float(values.rotor_speed[k])))
+            points.append(SpecialPoint(kinds[which[k]], float(a[k]), float(values.rotor_speed[k])))
     return tuple(sorted(points, key=lambda point: point.omega))
