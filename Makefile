@@ -6,7 +6,7 @@ OUT ?= out/demo
 JAXVIB = $(BIN)/jaxvib
 EXAMPLE = examples/antiphase
 
-.PHONY: demo test test-slow test-versions check clean
+.PHONY: demo test test-slow test-versions check bench-guard clean
 
 demo: $(VENV)/installed
 	@echo "--- how the first drawing can jam"
@@ -40,6 +40,10 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# Ratios of times beside recorded ones: fails where something became three times slower.
+bench-guard: $(VENV)/installed-bench
+	$(BIN)/python benchmarks/guard.py
+
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -48,6 +52,10 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[test,dev]'
+	@touch $@
+
+$(VENV)/installed-bench: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[test,bench]'
 	@touch $@
 
 clean:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import warnings
 
 __all__ = ["main"]
 
@@ -25,10 +26,12 @@ def prepare() -> None:
     """Float64, and compiled programs cached on disk, so that the second call of a command answers at once."""
     from jaxvib.runtime.startup import start
 
-    problem = start()
+    with warnings.catch_warnings(record=True) as found:
+        start()
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    if problem:
-        print(f"jaxvib: programs are not cached: {problem}", file=sys.stderr)
+    for warning in found:
+        print(f"jaxvib: {warning.message}", file=sys.stderr)
+    if found:  # nor in a folder that was refused
         jax.config.update("jax_compilation_cache_dir", None)

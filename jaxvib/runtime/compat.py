@@ -127,18 +127,25 @@ def no_host_checks() -> Iterator[None]:
     """What is traced in here has Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
 
     Errors need a callback into Python, which keeps a program from being stored on disk. Equinox's own switch, EQX_ON_ERROR in
-    the environment, is read when it is imported and holds for the whole process. Without the attribute checks stay as they are.
+    the environment, is read when it is imported and holds for the whole process; another choice than its default stays. Without
+    the two attributes checks stay as they are.
     """
     errors = sys.modules.get("equinox._errors")
-    before = getattr(errors, "EQX_ON_ERROR", None)
-    if before != "raise":  # someone's choice stays
+    compiled = getattr(errors, "branched_error_if_impl_jit", None)
+    plain = getattr(errors, "branched_error_if_impl", None)
+    if compiled is None or plain is None or getattr(errors, "EQX_ON_ERROR", None) != "raise":
         yield
         return
+
+    def to_nan(*args: Any, on_error: str) -> Any:
+        # Not the compiled one: what it is traced to would be found again outside.
+        return plain(*args, on_error="nan" if on_error == "default" else on_error)
+
+    setattr(errors, "branched_error_if_impl_jit", to_nan)  # noqa: B010
     try:
-        setattr(errors, "EQX_ON_ERROR", "nan")  # noqa: B010
         yield
     finally:
-        setattr(errors, "EQX_ON_ERROR", before)  # noqa: B010
+        setattr(errors, "branched_error_if_impl_jit", compiled)  # noqa: B010
 
 
 def enumeration_of(item: object) -> Any:

@@ -15,7 +15,7 @@ __all__ = ["start"]
 
 
 @functools.cache
-def start() -> str:
+def start() -> None:
     """Does what `prepare_cpu()` and `use_cache()` do, unless they were called or the environment has JAXVIB_AUTOMATIC=off.
 
     It is called when the first public name of jaxvib is asked for, errors and those two apart. Where JAX has begun to compute
@@ -24,7 +24,7 @@ def start() -> str:
     **Returns** why programs are not cached, empty where they are or need not be.
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
-        return ""
+        return
     if not has_flags():
         if backend_started():
             warnings.warn(
@@ -38,5 +38,4 @@ def start() -> str:
     try:
         use_cache(only_if_unset=True)
     except InputError as error:
-        return str(error)
-    return ""
+        warnings.warn(f"programs are not cached: {error}", stacklevel=4)

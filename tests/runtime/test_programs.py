@@ -148,6 +148,19 @@ def test_what_cannot_be_stored_still_runs(folder):
     assert not list(folder.iterdir())
 
 
+def test_checks_at_run_time_keep_no_program_from_the_disk(folder):
+    """Those of Equinox and diffrax become NaN in place of errors, which need a callback."""
+    function = programs.cached(checked)
+    assert float(function(jnp.asarray(2.0))) == 2.0 and np.isnan(function(jnp.asarray(-2.0)))
+    assert len(list(folder.iterdir())) == 1
+    with pytest.raises(RuntimeError, match="negative"):
+        eqx.filter_jit(checked)(jnp.asarray(-2.0))  # elsewhere they stay errors
+
+
+def checked(x):
+    return eqx.error_if(x, x < 0.0, "negative")
+
+
 def test_an_error_of_the_function_is_raised_once(folder):
     def fails(x):
         traces.append("fails")

@@ -1,0 +1,183 @@
+"""Whether something became slow: times of what users wait for, as ratios in one run, beside recorded ones.
+
+    python benchmarks/guard.py [--record] [--limit 3]
+
+Run times are in units of one native run (numba: 5000 steps of Dormand and Prince's method of order 8, two masses and one load),
+first calls in units of what the compiler takes for a small fixed program, both measured here; so the machine hardly matters.
+Fails where a ratio is more than `limit` times the recorded one, of benchmarks/guard.json; --record writes that file anew. It
+says only that something went wrong, not how fast things are: the other benchmarks compare at equal errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ["JAXVIB_AUTOMATIC"] = "off"  # no program comes from a cache
+
+import jaxvib as jv
+
+jv.prepare_cpu()
+
+import diffrax  # noqa: E402
+import equinox as eqx  # noqa: E402
+import jax  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_enable_compilation_cache", False)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from parts import native  # noqa: E402
+from parts.common import best, first, flat, machine_line, published, thrown  # noqa: E402
+
+from jaxvib.study.maps.published_rotor import published_rotor  # noqa: E402
+
+RECORD = Path(__file__).with_suffix(".json")
+
+Call = Callable[[], Any]
+
+
+def platforms(*effects: jv.Effect) -> jv.Scene:
+    """Two platforms with three loads."""
+    machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
+    loads = jv.pendulums if effects else jv.balls
+    return jv.Scene(machine, loads(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0), effects)
+
+
+def planar() -> jv.Scene:
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    return jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.14), jv.ConstantSpeed(460.0))
+
+
+def run_of(scene: jv.Scene, until: float, start: Any = "rest") -> Call:
+    """`simulate` as a user calls it, its window measured."""
+    return lambda: jv.simulate(scene, until, start=start, save="window", estimate=False).foundation_force
+
+
+def slopes(kind: Callable[..., Any], **options: Any) -> Call:
+    """The end of a run by two numbers."""
+    scene = published()
+
+    def end(k: jax.Array) -> jax.Array:
+        moved = eqx.tree_at(lambda s: s.machine.stiffness, scene, k)
+        run = jv.simulate(moved, 100.0, start=thrown(), save="window", max_steps=2**12, **options)
+        return run.window.state.displacement[-1, 0]
+
+    call = jax.jit(kind(end))
+    k: jax.Array = scene.machine.stiffness  # pyright: ignore[reportAttributeAccessIssue]
+    return lambda: call(k)
+
+
+def orbits_with_multipliers() -> Call:
+    scene = published()
+    return lambda: jv.branches(scene, exact=True, points=200, least=0.5, most=0.9).multiplier
+
+
+def designs() -> Call:
+    scene = published()
+
+    def one(k: jax.Array) -> jax.Array:
+        return jv.jam_modes(eqx.tree_at(lambda s: s.machine.stiffness, scene, k)).foundation_force
+
+    many = jnp.asarray(np.random.default_rng(0).uniform(0.05, 0.2, (1000, 2)))
+    call = jax.jit(jax.vmap(one))
+    return lambda: call(many)
+
+
+def many_runs() -> Call:
+    scene = published()
+    make = lambda n: eqx.tree_at(lambda s: s.drive.speed, scene, n)  # noqa: E731
+    speeds = jnp.linspace(4.0, 5.0, 256)
+    return lambda: jv.ensemble(make, speeds, 100.0, estimate=False).load_speed
+
+
+def small_program() -> Call:
+    """What compile times are measured by: 120 operations that have nothing to do with jaxvib, compiled anew at each call."""
+    matrix = np.eye(7)
+
+    def chain(x: jax.Array) -> jax.Array:
+        for k in range(40):
+            x = jnp.sin(matrix @ x) + float(k)
+        return x
+
+    return lambda: jax.jit(lambda x: chain(x)).lower(jnp.ones(7)).compile() and ()
+
+
+RUNS: dict[str, Callable[[], Call]] = {
+    "single run, window measured": lambda: run_of(published(), 1000.0, thrown()),
+    "three balls on two platforms": lambda: run_of(platforms(), 5.0),
+    "dry friction": lambda: run_of(platforms(jv.DryFriction(0.05, diameter="20 mm")), 5.0),
+    "planar rotor": lambda: run_of(planar(), 2.0),
+    "rotor with loads at stations": lambda: run_of(published_rotor(), 3.0),
+    "ensemble of 256": many_runs,
+    "gradient, forward": lambda: slopes(jax.jacfwd, adjoint=diffrax.ForwardMode()),
+    "gradient, reverse": lambda: slopes(jax.grad),
+    "200 orbits with multipliers": orbits_with_multipliers,
+    "1000 designs": designs,
+    "envelope": lambda: lambda: jv.envelope(published(eps=1e-3), 1000.0).foundation_force,
+    "jam_modes": lambda: lambda: jv.jam_modes(platforms()).foundation_force,
+}
+"""What is timed in units of a native run; the first call of each is not counted."""
+
+FIRST_CALLS = {
+    "jam_modes, first call": lambda: jax.jit(lambda s: jv.jam_modes(s).foundation_force).lower(platforms()).compile() and (),
+    "jam_orbit, first call": lambda: (
+        jax.jit(lambda s: jv.jam_orbit(s, mode=3).foundation_force).lower(platforms()).compile() and ()
+    ),
+    "simulate, first call": lambda: (
+        jax.jit(lambda s: jv.simulate(s, 5.0, save="window", max_steps=4096).foundation_force).lower(platforms()).compile()
+        and ()
+    ),
+}
+"""Traced and compiled, in units of the small program."""
+
+
+def measured() -> dict[str, float]:
+    """Each ratio; the units are measured before and after everything, and the less time of both counts."""
+    scene = published()
+    loop, par, y0 = native.single(), native.numbers(scene), flat(thrown())
+    unit_run: Call = lambda: loop(y0, float(scene.drive.speed), par, 1000.0, 5000)  # noqa: E731
+    loop(y0, 1.0, par, 1.0, 5)
+    compiles = small_program()
+    units = [(best(unit_run, 20), best(compiles, 3))]
+    seconds: dict[str, float] = {}
+    for name, make in RUNS.items():
+        call = make()
+        once = max(first(call), first(call))
+        seconds[name] = best(call, 3 if once > 1.0 else 10)
+        print(f"  {name:36s} {1e3 * seconds[name]:10.2f} ms", flush=True)
+    for name, call in FIRST_CALLS.items():
+        jax.clear_caches()
+        seconds[name] = first(call)
+        print(f"  {name:36s} {1e3 * seconds[name]:10.0f} ms", flush=True)
+    units.append((best(unit_run, 20), best(compiles, 3)))
+    run_unit, compile_unit = (min(pair) for pair in zip(*units, strict=True))
+    print(f"  a native run {1e3 * run_unit:.3f} ms, the small program {1e3 * compile_unit:.0f} ms")
+    return {name: s / (compile_unit if name in FIRST_CALLS else run_unit) for name, s in seconds.items()}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", action="store_true", help="write the ratios of this run as those to compare with")
+    parser.add_argument("--limit", type=float, default=3.0, help="how many times the recorded ratio is too much")
+    options = parser.parse_args()
+    print(machine_line())
+    found = measured()
+    if options.record:
+        RECORD.write_text(json.dumps({name: float(f"{ratio:.3g}") for name, ratio in found.items()}, indent=2) + "\n")
+    recorded = json.loads(RECORD.read_text())
+    slow = [name for name, ratio in found.items() if not ratio <= options.limit * recorded[name]]
+    print(f"\n{'':38s}{'ratio':>10s}{'recorded':>10s}")
+    for name, ratio in found.items():
+        print(f"{name:38s}{ratio:10.3g}{recorded[name]:10.3g}{'  TOO SLOW' if name in slow else ''}")
+    return 1 if slow else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

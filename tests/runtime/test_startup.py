@@ -1,0 +1,51 @@
+"""What jaxvib sets by itself at the first question."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+QUESTION = """
+import os, warnings
+warnings.simplefilter("always")
+import jax
+{before}
+import jaxvib as jv
+assert "XLA_FLAGS" not in os.environ  # nothing is set by the import alone
+jv.one_mass, jv.balls
+print("flags" if "loop_byte_threshold" in os.environ.get("XLA_FLAGS", "") else "no flags", jax.config.jax_compilation_cache_dir)
+"""
+
+
+def asked(before="", **variables):
+    unset = ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "JAXVIB_AUTOMATIC")
+    environment = {name: value for name, value in os.environ.items() if name not in unset} | variables
+    command = [sys.executable, "-c", QUESTION.format(before=before)]
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+
+
+def test_the_first_public_name_prepares_the_processor_and_the_cache(tmp_path):
+    done = asked(XDG_CACHE_HOME=str(tmp_path))
+    assert done.stdout.split() == ["flags", str(tmp_path / "jaxvib")] and not done.stderr
+    assert (tmp_path / "jaxvib" / "programs").is_dir()
+
+
+def test_one_setting_switches_both_off(tmp_path):
+    done = asked(XDG_CACHE_HOME=str(tmp_path), JAXVIB_AUTOMATIC="off")
+    assert done.stdout.split() == ["no", "flags", "None"] and not list(tmp_path.iterdir()) and not done.stderr
+
+
+def test_who_computed_before_is_warned_once(tmp_path):
+    done = asked("jax.numpy.zeros(1)", XDG_CACHE_HOME=str(tmp_path))
+    assert done.stdout.split()[:2] == ["no", "flags"]
+    assert done.stderr.count("UserWarning: JAX began to compute before jaxvib") == 1 and "prepare_cpu" in done.stderr
+    assert "File" not in done.stderr or "<string>" in done.stderr  # it points to the user's line
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="a folder has one owner on POSIX only")
+def test_a_folder_that_is_refused_stops_nobody(tmp_path):
+    (tmp_path / "jaxvib").mkdir()
+    (tmp_path / "jaxvib").chmod(0o777)
+    done = asked(XDG_CACHE_HOME=str(tmp_path))
+    assert done.stdout.split() == ["flags", "None"] and "programs are not cached" in done.stderr

@@ -1,0 +1,68 @@
+"""How large programs may be: what a question costs before it is answered the first time grows with its operations.
+
+A budget is what was counted when it was written down, with a tenth to spare. One that is broken says that something is traced
+more often than before: make it less, or raise the budget together with the reason.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import pytest
+from operations import operations
+from scenes import scene
+
+import jaxvib as jv
+
+SCENE = scene("two_mass", "balls")
+START = jv.initial_state(SCENE, "rest")
+
+
+def stiffer(k):
+    return eqx.tree_at(lambda s: s.machine.stiffness, SCENE, k)
+
+
+def field(k):
+    return jv.vector_field(stiffer(k))(0.0, START)
+
+
+def modes(k):
+    return jv.jam_modes(stiffer(k)).foundation_force[2]
+
+
+def orbit(k):
+    return jv.jam_orbit(stiffer(k), mode=3).foundation_force
+
+
+def run(k, **options):
+    found = jv.simulate(stiffer(k), 5.0, start=START, save="window", max_steps=4096, **options)
+    return found.foundation_force
+
+
+def forward_run(k):
+    return run(k, adjoint=diffrax.ForwardMode())
+
+
+BUDGETS = {
+    "vector field": (field, 1),
+    "jam_modes": (modes, 1),
+    "jam_modes, gradient": (jax.grad(modes), 1),
+    "jam_orbit": (orbit, 1),
+    "jam_orbit, gradient": (jax.grad(orbit), 1),
+    "simulate": (run, 1),
+    "simulate, forward derivatives": (jax.jacfwd(forward_run), 1),
+    "simulate, reverse derivatives": (jax.grad(run), 1),
+}
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_a_program_keeps_its_budget(name):
+    question, budget = BUDGETS[name]
+    counted = operations(question, SCENE.machine.stiffness)
+    assert counted <= budget, f"{name}: {counted} operations"
+    assert counted > 0.8 * budget, f"{name}: {counted} operations, far fewer than its budget: lower the budget"
+
+
+def test_a_larger_program_is_noticed():
+    """Traced twice, a question has twice the operations."""
+    once = operations(field, SCENE.machine.stiffness)
+    assert operations(lambda k: (field(k), field(2.0 * k)), SCENE.machine.stiffness) > 1.8 * once
