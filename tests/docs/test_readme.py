@@ -21,14 +21,14 @@ def test_readme_has_examples():
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
 def test_readme_example_runs(block, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    if "prepare_cpu" in block:
+    if block == BLOCKS[0]:
         run_alone(block)
     else:
         exec(compile(block, str(README), "exec"), {})
 
 
 def run_alone(block):
-    """In a process of its own, where JAX has not begun to compute; as strict as `conftest.py` is."""
+    """In a process of its own, as a user's script: jaxvib prepares JAX by itself. As strict as `conftest.py` is."""
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     clean |= {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir), "JAX_NUMPY_RANK_PROMOTION": "raise"}
     clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
