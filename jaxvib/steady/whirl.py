@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.whirl import campbell_diagram
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
@@ -84,6 +83,8 @@ class Whirl(Result):
 
     def plot(self) -> Figure:
         """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line."""
+        from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
+
         return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)))
 
 

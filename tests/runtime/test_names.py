@@ -21,6 +21,12 @@ assert "jax" in sys.modules and not {"matplotlib", "diffrax", "pint", "rich", "o
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_no_name_loads_pictures():
+    """Who draws nothing does not wait for matplotlib."""
+    code = "import sys, jaxvib; [getattr(jaxvib, name) for name in jaxvib.__all__]; assert 'matplotlib' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_every_public_name_is_there():
     """The stub is the one list of names: each is found, and __all__ of the stub leaves none out."""
     stub = ast.parse(pathlib.Path(jv.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.comparison import convergence_chart
 from jaxvib.equations.collected import collected_model, has_half_turn
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
@@ -52,6 +51,8 @@ class HarmonicConvergence(Result):
     def plot(self) -> Figure:
         """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed."""
         names = [f"{w:.4g} rad/s" for w in self.omega]
+        from jaxvib.draw.comparison import convergence_chart  # slow to import: only who draws pays
+
         return convergence_chart(self.harmonics, self.error, self.known, names=names)
 
 

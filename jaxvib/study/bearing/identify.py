@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.record import record_chart
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -113,6 +112,8 @@ class Identified(Result):
 
     def plot(self) -> Figure:
         """The record with the fit, and what the fit leaves."""
+        from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
+
         return record_chart(self.record.time, self.record.angle, self.fitted, self.noise)
 
 

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.regimes import regime_chart
 from jaxvib.errors import InputError
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -83,6 +82,8 @@ class RunUps(Result):
         """Shares of the kinds of motion, and the speeds of the loads, over drag. **Returns** a matplotlib figure."""
         shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
         rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
+        from jaxvib.draw.regimes import regime_chart  # slow to import: only who draws pays
+
         return regime_chart(self.drag, shares, self.omega, float(rotor))
 
 

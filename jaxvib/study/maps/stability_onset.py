@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
-from jaxvib.draw.comparison import stability_chart
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
@@ -47,6 +46,8 @@ class StabilityMap(Result):
         for x, points in zip(self.value, self.special, strict=True):
             for point in points:
                 marks.setdefault(point.kind.replace("_", " "), []).append((point.omega, float(x)))
+        from jaxvib.draw.comparison import stability_chart  # slow to import: only who draws pays
+
         return stability_chart(self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label)
 
 
