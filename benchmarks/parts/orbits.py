@@ -23,6 +23,7 @@ import jaxvib as jv
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import linear_model, steady_displacement
 from jaxvib.numerics.fourier import grid_of
+from jaxvib.steady.balance.monodromy import magnus
 from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
 from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
 from jaxvib.steady.orbits.floquet import floquet, steps_for
@@ -234,10 +235,76 @@ def orbits(quick: bool = False) -> None:
             note,
         )
 
+    by_differentiation(scene, quick)
     few = omega[:: max(1, count // 5)][1:]
     with_jaxcont(scene, few, base, runs)
     with_solve_bvp(few[:2] if quick else few, base)
     value_and_gradient(quick, runs)
+
+
+def by_differentiation(scene: jv.Scene, quick: bool) -> None:
+    """Multipliers alone, of 100 motions: `floquet`, whose linearised equations are written by hand, and the full equations
+    differentiated along the same motions, both by a Magnus method of order 6 over half a period."""
+    group, omega = "multipliers of an exact orbit", jnp.linspace(0.6, 0.9, 100)
+    model, grid = collected_model(linear_model(scene)), grid_of(16, True)
+    print(f"{group}; error: of the largest modulus, to many steps")
+
+    @jax.jit
+    def motions(w: jax.Array) -> Any:
+        def one(w: jax.Array) -> Any:
+            motion = periodic_motion(model, grid, "omega", w, rotor_speed_at(model.linear, w))
+            return motion, harmonics_of(model, grid, motion)
+
+        return jax.vmap(one, out_axes=-1)(w)
+
+    motion, harmonics = motions(omega)
+    k, j = np.asarray(grid.orders), np.asarray(grid.deviation_orders)
+
+    def along(theta: jax.Array, w: jax.Array, q: jax.Array, psi: jax.Array) -> jax.Array:
+        wave, lag = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
+        angle, rate = theta + (psi @ lag).real, w * (1.0 + (psi @ (1j * j * lag)).real)
+        return jnp.concatenate([(q @ wave).real, w * (q @ (1j * k * wave)).real, angle, rate])
+
+    def differentiated(steps: int) -> Callable[[], Any]:
+        def one(w: jax.Array, n: jax.Array, q: jax.Array, psi: jax.Array) -> jax.Array:
+            field = jv.vector_field(eqx.tree_at(lambda s: s.drive.speed, scene, n))
+
+            def rates(y: jax.Array) -> jax.Array:
+                change = field(0.0, jv.State(y[:2], y[2:4], (y[4:5],), (y[5:6],)))
+                return ravel_pytree(change)[0] / w
+
+            def step(flow: jax.Array, at: jax.Array) -> tuple[jax.Array, None]:
+                points = (at + 0.5 + np.sqrt(0.15) * np.asarray([-1.0, 0.0, 1.0])) * h
+                return magnus(*jax.vmap(lambda t: jax.jacfwd(rates)(along(t, w, q, psi)))(points), h) @ flow, None
+
+            h = np.pi / steps
+            return jax.lax.scan(step, jnp.eye(6), jnp.arange(steps) * 1.0)[0]
+
+        call = jax.jit(jax.vmap(one, in_axes=(0, 0, -1, -1)))
+        return lambda: call(motion.omega, motion.rotor_speed, harmonics.displacement, harmonics.deviation)
+
+    def largest(flow: Any) -> np.ndarray:
+        """Half a period turns the directions of the carrier: an orbit comes back to its mirror image."""
+        mirrored = np.asarray(flow) * np.asarray([-1.0] * 4 + [1.0] * 2)[None, :, None]
+        values = np.sort(np.abs(np.linalg.eigvals(mirrored)), axis=1)
+        return values[:, -2]  # the one before the trivial 1, where the motion is stable
+
+    @jax.jit
+    def written(steps: jax.Array) -> jax.Array:
+        return floquet(model, grid, motion, harmonics, steps).roots
+
+    exact = largest(differentiated(128)())
+    stable = exact < 1.0 - 1e-6
+    base = None
+    for steps in (8, 16) if quick else (8, 16, 32):
+        for name, call, modulus in (
+            ("floquet", lambda n=float(steps): written(jnp.asarray(n)), lambda x: np.max(np.abs(np.asarray(x)), axis=0)),
+            ("full equations differentiated", differentiated(steps), largest),
+        ):
+            compiling, each = first(call), best(call, 5) / omega.size
+            base = each if base is None else base
+            off = float(np.max(np.abs(modulus(call()) / exact - 1.0)[stable]))
+            say(group, f"{name}, {steps} steps", each, base, off, compiling)
 
 
 def value_and_gradient(quick: bool, runs: int) -> None:

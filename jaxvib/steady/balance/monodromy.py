@@ -5,13 +5,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.equations.linear import circular_loads
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
 
-__all__ = ["at_constant_speed", "balanced_motion", "monodromy"]
+__all__ = ["at_constant_speed", "balanced_motion", "magnus", "monodromy"]
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
@@ -54,15 +55,18 @@ def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
     h = 2.0 * jnp.pi / steps
 
     def step(flow: Array, k: Array) -> tuple[Array, None]:
-        # Three Gauss points a step.
-        a, b, c = jax.vmap(generator)((k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h)
-        a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
-        c1 = _commutator(a1, a2)
-        c2 = -_commutator(a1, 2.0 * a3 + c1) / 60.0
-        omega = a1 + a3 / 12.0 + _commutator(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0
-        return _exponential(omega) @ flow, None
+        points = (k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h
+        return magnus(*jax.vmap(generator)(points), h) @ flow, None
 
     return jax.lax.scan(step, jnp.eye(sizes.shape[0], dtype=sizes.dtype), jnp.arange(steps) * 1.0)[0]
+
+
+def magnus(a: Array, b: Array, c: Array, h: ArrayLike) -> Array:
+    """The flow of x' = A x over a step `h`, from A at its three Gauss points, by a Magnus method of order 6."""
+    a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
+    c1 = _commutator(a1, a2)
+    c2 = -_commutator(a1, 2.0 * a3 + c1) / 60.0
+    return _exponential(a1 + a3 / 12.0 + _commutator(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0)
 
 
 def _exponential(a: Array) -> Array:
