@@ -298,7 +298,7 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
     base = None
     for steps in (8, 16) if quick else (8, 16, 32):
         for name, call, modulus in (
-            ("floquet", lambda n=float(steps): written(jnp.asarray(n)), lambda x: np.max(np.abs(np.asarray(x)), axis=0)),
+            ("floquet", lambda n=steps: written(jnp.asarray(n)), lambda x: np.max(np.abs(np.asarray(x)), axis=0)),
             ("full equations differentiated", differentiated(steps), largest),
         ):
             compiling, each = first(call), best(call, 5) / omega.size
