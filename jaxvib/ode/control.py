@@ -13,7 +13,7 @@ import optimistix
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.ode.types import VF, Args, BoolScalarLike, Norm, RealScalarLike, Terms, Y
+from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, RealScalarLike, Terms, Y
 
 __all__ = ["Decision", "PIController", "WrappedController"]
 
@@ -66,7 +66,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         """As `rtol`."""
         return optimistix.rms_norm
 
-    def wrap(self, direction: RealScalarLike) -> PIController:
+    def wrap(self, direction: IntScalarLike) -> PIController:
         """Time runs forward only."""
         return self
 
@@ -123,7 +123,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return accept, start, end, False, (root, left), result
 
 
-def moved_on(accept: Array, start: Array, before: RealScalarLike, end: Array) -> diffrax.RESULTS:
+def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
     """Whether the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.ode.control import Decision, WrappedController
-from jaxvib.ode.types import VF, Args, RealScalarLike, Terms, Y
+from jaxvib.ode.types import VF, Args, IntScalarLike, RealScalarLike, Terms, Y
 from jaxvib.runtime.compat import no_host_checks
 
 __all__ = ["solve"]
@@ -157,7 +157,7 @@ class RecordedSteps(WrappedController):
     controller: diffrax.AbstractStepSizeController
     times: Array
 
-    def wrap(self, direction: RealScalarLike) -> RecordedSteps:
+    def wrap(self, direction: IntScalarLike) -> RecordedSteps:
         return self
 
     def init(

@@ -15,6 +15,7 @@ __all__ = [
     "Args",
     "BoolScalarLike",
     "DenseInfo",
+    "IntScalarLike",
     "Mapped",
     "Norm",
     "RealScalarLike",
@@ -26,6 +27,9 @@ __all__ = [
 
 RealScalarLike: TypeAlias = int | float | Array | np.ndarray
 """A time, a tolerance, an order: a number, or an array ()."""
+
+IntScalarLike: TypeAlias = int | Array | np.ndarray
+"""A direction, a whole number."""
 
 BoolScalarLike: TypeAlias = bool | Array | np.ndarray
 """Yes or no: a truth value, or an array ()."""

@@ -15,8 +15,8 @@ from jaxvib.errors import InputError
 from jaxvib.results.status import is_status, sentence, status_names
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
     import xarray
+    from _typeshed import DataclassInstance
 
 __all__ = ["as_dict", "as_text", "in_unit", "is_named_tuple", "part", "to_xarray"]
 
@@ -25,7 +25,7 @@ EACH = "*"
 
 T = TypeVar("T")
 
-Plain: TypeAlias = "None | bool | int | float | str | list[Plain] | dict[str, Plain]"
+Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
 """What JSON can hold."""
 
 Labels: TypeAlias = Mapping[str, Sequence[str]]

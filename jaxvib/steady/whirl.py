@@ -18,7 +18,7 @@ from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.units import Number, numbers, traced
+from jaxvib.units import Numbers, numbers, traced
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +88,7 @@ class Whirl(Result):
         return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)))
 
 
-def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "fixed") -> Whirl:
+def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
     """Whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
