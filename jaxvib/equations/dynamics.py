@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.machine.drive import Drive, IdealDrive, Motor
+from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, Friction, total_gravity
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
@@ -180,19 +180,21 @@ class Dynamics(eqx.Module):
         self, part: _Eliminated, throw: tuple[list[Array], list[Array]] | None, speed: Array
     ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
         """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
-        if not isinstance(self.drive, Motor):
+        motor = self.drive.torque_and_inertia(speed)
+        if motor is None:
             if throw is None:
                 return part.weight, part.reaction, None
             return part.weight, [g + b for g, b in zip(part.reaction, throw[1], strict=True)], None
-        free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
+        torque, inertia = motor
+        free = (torque - self._total(part.drag)) / inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
             arms = self._arms()
-            row = [self._total(part.pull[i], *arms[1:2] * n) / self.drive.inertia for n in range(len(arms)) for i in self.axes]
+            row = [self._total(part.pull[i], *arms[1:2] * n) / inertia for n in range(len(arms)) for i in self.axes]
         if throw is None:
             return part.weight, part.reaction, (free, row)
         along, bend = throw
-        row = [r + d / self.drive.inertia for r, d in zip(row, along, strict=True)]
+        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
         weight = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(part.weight, along, strict=True)]
         reaction = [g + b + d * free for g, b, d in zip(part.reaction, bend, along, strict=True)]
         return weight, reaction, (free, row)
@@ -218,8 +220,8 @@ class Dynamics(eqx.Module):
 
         along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
         push = [b * rate**2 for b in bend]
-        if isinstance(self.drive, IdealDrive):
-            change = self.drive.acceleration_at(t)
+        change = self.drive.rotor_acceleration(t)
+        if change is not None:
             push = [p + d * change for p, d in zip(push, along, strict=True)]
         return list(along), push
 

@@ -33,6 +33,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
@@ -87,11 +88,14 @@ class Ensemble(Result):
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
 
-    def plot(self) -> Figure:
-        """The mean speed of each load, over the runs. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The mean speed of each load, over the runs.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
 
-        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s")
+        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s", ax=ax)
 
 
 @refuse_former(steps=FORMER["steps"])

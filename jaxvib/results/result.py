@@ -54,7 +54,7 @@ class Result(eqx.Module):
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """What came out, as a matplotlib figure."""
+        """What came out, as a matplotlib figure. Where it has one panel, `plot(ax=axes)` draws onto axes that are there."""
 
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":
