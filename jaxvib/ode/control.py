@@ -17,9 +17,12 @@ from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, Real
 
 __all__ = ["Decision", "PIController", "WrappedController"]
 
-Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, Array, diffrax.RESULTS]
+Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
 """Whether a step is accepted, where the next one begins and ends, whether the field jumps there, the controller's new state,
 whether the run can go on."""
+
+_State: TypeAlias = tuple[Array, Array | None]
+"""Of `PIController`: the 32nd root of the last accepted step's error, the steps that are left where they are limited."""
 
 
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
@@ -80,7 +83,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         args: Args,
         func: Callable[[Terms, RealScalarLike, Y, Args], VF],
         error_order: RealScalarLike | None,
-    ) -> tuple[RealScalarLike, Array]:
+    ) -> tuple[RealScalarLike, _State]:
         """The first step ends at t0 + dt0."""
         return t0 + dt0, (jnp.ones_like(self.tolerance), self.max_steps)
 
@@ -93,10 +96,9 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         args: Args,
         y_error: Y,
         error_order: RealScalarLike,
-        controller_state: Array,
+        controller_state: _State,
     ) -> Decision:
         """Whether the step is accepted, where the next one begins and ends, and the controller's new state."""
-
         root_before, left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
