@@ -14,7 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxvib.errors import InputError
-from jaxvib.runtime.compat import is_tracer
+from jaxvib.runtime.compat import traced
 
 __all__ = ["FIELD_UNITS", "Number", "Numbers", "count", "number", "numbers", "to_float", "traced"]
 
@@ -61,15 +61,6 @@ FIELD_UNITS = {
     "speed": "rad/s",
 }
 """The unit of each number of a scene that a design may free or hold."""
-
-
-def traced(value: Any) -> bool:
-    """Whether JAX is transforming the computation this value is part of, so that it has no number to look at.
-
-    >>> traced(1.0)
-    False
-    """
-    return is_tracer(value)
 
 
 def _unit_name(unit: str) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -200,7 +200,7 @@ def _fastest(scenes: Scene) -> Array:
 
 @cached
 def _all(
-    parts: list[Array], end: Array, counts: np.ndarray, shared: tuple[bool, ...], rest: Any, lanes: int, runs: int
+    parts: list[Array], end: Array, counts: np.ndarray, shared: tuple[bool, ...], rest: Hashable, lanes: int, runs: int
 ) -> _Ends:
     """All runs in chunks over all devices, (runs, ...); see `_run`."""
     devices = jax.devices()

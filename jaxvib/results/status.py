@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError
-from jaxvib.runtime.compat import enumeration_names, enumeration_of, is_tracer
+from jaxvib.runtime.compat import enumeration_names, enumeration_of, traced
 
 __all__ = [
     "Computed",
@@ -54,7 +54,7 @@ def status_names(status: eqx.Enumeration) -> np.ndarray:
     **Raises** `TypeError` for a status that is not known yet, under a JAX transformation.
     """
     (numbers,) = jax.tree.leaves(status)
-    if is_tracer(numbers):
+    if traced(numbers):
         raise TypeError("a status under a JAX transformation has no name yet; look at it outside")
     return np.asarray(enumeration_names(enumeration_of(status)))[np.asarray(numbers)]
 

@@ -34,8 +34,8 @@ def test_tracers_are_recognized(monkeypatch):
     def answers():
         found = []
         for transform in (jax.jit, jax.grad, jax.jacfwd):
-            transform(lambda x: found.append(compat.is_tracer(x)) or x)(1.0)
-        return [*found, *map(compat.is_tracer, (1.0, None, np.ones(2), jnp.ones(2)))]
+            transform(lambda x: found.append(compat.traced(x)) or x)(1.0)
+        return [*found, *map(compat.traced, (1.0, None, np.ones(2), jnp.ones(2)))]
 
     expected = [True] * 3 + [False] * 4
     assert answers() == expected
