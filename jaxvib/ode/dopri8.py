@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 import operator
 from collections.abc import Callable, Sequence
@@ -118,7 +119,7 @@ class Dopri8Interpolation(StepInterpolation):
 
 
 class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
-    """What the forms of Dormand and Prince's pair share: all but the step, and what finds states within one."""
+    """What the forms of Dormand and Prince's pair share: all but how stages are computed, and what finds states within."""
 
     wrap: Callable[[Y], Y] | None = None
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
@@ -135,6 +136,29 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
     def func(self, terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         """The vector field, for the choice of the first step."""
         return terms.vf(t0, y0, args)
+
+    @abc.abstractmethod
+    def advance(
+        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
+    ) -> tuple[Y, Array, VF, Y]:
+        """From the rates `first` at t0: the state at t1, the rates of all stages (stages, n), those at t1, the error."""
+
+    def step(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: VF,
+        made_jump: BoolScalarLike,
+    ) -> StepResult:
+        """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
+        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
+        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+        end, stages, last, error = self.advance(terms, t0, t1, y0, first, args)
+        end = end if self.wrap is None else self.wrap(end)
+        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
 
 
 class UnrolledDopri8(AbstractDopri8):
@@ -163,19 +187,10 @@ class UnrolledDopri8(AbstractDopri8):
     lanes: bool = eqx.field(static=True, default=False)
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
-    def step(
-        self,
-        terms: Terms,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: VF,
-        made_jump: BoolScalarLike,
-    ) -> StepResult:
-        """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
-        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+    def advance(
+        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
+    ) -> tuple[Y, Array, VF, Y]:
+        """See `AbstractDopri8.advance`."""
         fence = _fence_of(self.lanes, jnp.where(t1 >= t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
         stages = [first]
@@ -184,9 +199,7 @@ class UnrolledDopri8(AbstractDopri8):
             y = fence(_stage_state(y0, dt, row[: len(stages)], stages))
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
-        end = y if self.wrap is None else self.wrap(y)
-        inside = dict(y0=y0, stages=dense_stages(jnp.stack([ravel(k) for k in stages])))
-        return end, error, inside, stages[-1], diffrax.RESULTS.successful
+        return y, jnp.stack([ravel(k) for k in stages]), stages[-1], error
 
 
 def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:

@@ -7,7 +7,6 @@ import operator
 from collections.abc import Callable
 from typing import TypeAlias, TypeVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,12 +21,11 @@ from jaxvib.ode.dopri8 import (
     ROWS,
     AbstractDopri8,
     Dopri8Interpolation,
-    dense_stages,
     linear_combination,
     ravel,
     unravel,
 )
-from jaxvib.ode.types import VF, Args, BoolScalarLike, Mapped, RealScalarLike, StepResult, Tangents, Terms, Y
+from jaxvib.ode.types import VF, Args, Mapped, RealScalarLike, Tangents, Terms, Y
 
 __all__ = ["LoopDopri8"]
 
@@ -66,22 +64,10 @@ class LoopDopri8(AbstractDopri8):
         """The interpolation that finds states within a step."""
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
-    def step(
-        self,
-        terms: Terms,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: VF,
-        made_jump: BoolScalarLike,
-    ) -> StepResult:
-        """As `UnrolledDopri8.step`."""
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+    def advance(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args) -> _Step:
+        """See `AbstractDopri8.advance`."""
         advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.tangents else _advanced
-        end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
-        end = end if self.wrap is None else self.wrap(end)
-        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
+        return advance((t0, terms.contr(t0, t1), y0, first, args, terms))
 
 
 def _linear_combination(inputs: tuple[Array, Array]) -> Array:

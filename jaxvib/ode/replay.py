@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TypeAlias
 
 import diffrax
@@ -13,7 +12,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.ode.control import Decision, WrappedController
-from jaxvib.ode.types import VF, Args, IntScalarLike, RealScalarLike, Terms, Y
+from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Y
 from jaxvib.runtime.compat import no_host_checks
 
 __all__ = ["solve"]
@@ -160,17 +159,7 @@ class RecordedSteps(WrappedController):
     def wrap(self, direction: IntScalarLike) -> RecordedSteps:
         return self
 
-    def init(
-        self,
-        terms: Terms,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        dt0: RealScalarLike | None,
-        args: Args,
-        func: Callable[[Terms, RealScalarLike, Y, Args], VF],
-        error_order: RealScalarLike | None,
-    ) -> tuple[RealScalarLike, Array]:
+    def init(self, *_: object, **__: object) -> tuple[RealScalarLike, Array]:
         return self.times[0], jnp.asarray(0)
 
     def adapt_step_size(
