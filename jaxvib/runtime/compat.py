@@ -144,7 +144,7 @@ def no_host_checks() -> Iterator[None]:
         yield
         return
 
-    def to_nan(*args: Any, on_error: str) -> Any:
+    def to_nan(*args: object, on_error: str) -> object:
         # Not the compiled one: what it is traced to would be found again outside.
         return plain(*args, on_error="nan" if on_error == "default" else on_error)
 
