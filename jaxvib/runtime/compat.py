@@ -43,7 +43,10 @@ __all__ = [
 ]
 
 _TESTED = ((0, 10), (0, 12))
-"""The first and the last version of jaxlib (major, minor) that knows all flags of `prepare_cpu`."""
+"""The first and the last version of jaxlib (major, minor) of which it is known which flags of `prepare_cpu` it has."""
+
+_GONE = {"--xla_cpu_use_fusion_emitters": (0, 11)}
+"""The flags of `prepare_cpu` that jaxlib has no more, each with the first version without it."""
 
 try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
@@ -108,7 +111,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
     version = importlib.metadata.version("jaxlib")
     number = tuple(int(part) for part in version.split(".")[:2])
     if _TESTED[0] <= number <= _TESTED[1]:
-        return flags
+        return [flag for flag in flags if number < _GONE.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
     answers: dict[str, bool] = {}
     with contextlib.suppress(OSError, ValueError):

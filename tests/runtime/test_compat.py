@@ -93,6 +93,13 @@ def test_this_jaxlib_starts_with_the_flags_of_prepare_cpu():
     assert len(flags) >= 2 and compat.starts_with(flags)
 
 
+@pytest.mark.parametrize(("version", "known"), [("0.10.2", 2), ("0.11.2", 1), ("0.12.0", 1)])
+def test_a_flag_that_jaxlib_has_no_more_is_left_out(monkeypatch, version, known):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
+    flags = ["--xla_cpu_prefer_vector_width=512", "--xla_cpu_use_fusion_emitters=false"]
+    assert compat.accepted_flags(flags) == flags[:known]
+
+
 def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     """The answer is remembered by version; a file of answers that is damaged is written anew."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
