@@ -27,7 +27,8 @@ test-slow: $(VENV)/installed
 # The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
 LOWEST_PYTHON ?= python3.11
 HIGHEST_PYTHON ?= python3.13
-VERSION_TESTS = tests/runtime tests/equations tests/ode/test_scalarize.py tests/ode/test_dopri8.py tests/steady/jams/test_jam.py tests/motion/test_endings.py
+VERSION_TESTS = tests/runtime tests/numerics tests/machine tests/equations tests/ode tests/test_results.py \
+	tests/steady/jams tests/motion/test_endings.py
 
 test-versions:
 	$(MAKE) .venv-lowest/installed VENV=.venv-lowest PYTHON=$(LOWEST_PYTHON) PIP_CONSTRAINT=.ci/lowest.txt
@@ -49,6 +50,9 @@ $(VENV)/installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
 	@touch $@
+
+# Another lowest version is installed too.
+.venv-lowest/installed: .ci/lowest.txt
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[test,dev]'

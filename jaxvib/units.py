@@ -5,20 +5,34 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxvib.errors import InputError
-from jaxvib.runtime.compat import is_tracer
+from jaxvib.runtime.compat import traced
 
-__all__ = ["FIELD_UNITS", "Number", "count", "number", "numbers", "to_float", "traced"]
+__all__ = ["FIELD_UNITS", "Number", "Numbers", "count", "number", "numbers", "to_float", "traced"]
 
-Number = Any
+
+@runtime_checkable
+class Quantity(Protocol):
+    """A number with a unit, such as pint's."""
+
+    def m_as(self, units: str, /) -> Any:
+        """Its magnitude in a unit."""
+        ...
+
+
+Number: TypeAlias = float | Array | np.ndarray | np.number | str | Quantity
 """A number as public functions accept it: a float, an array, a traced value, a string with a unit, a pint quantity."""
+
+Numbers: TypeAlias = Number | Sequence[Number]
+"""Several of them, or one that stands for all."""
 
 
 _TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_](?:(?!\s\d)[^,;()])*)")
@@ -49,15 +63,6 @@ FIELD_UNITS = {
 """The unit of each number of a scene that a design may free or hold."""
 
 
-def traced(value: Any) -> bool:
-    """Whether JAX is transforming the computation this value is part of, so that it has no number to look at.
-
-    >>> traced(1.0)
-    False
-    """
-    return is_tracer(value)
-
-
 def _unit_name(unit: str) -> str:
     return unit or "no unit"
 
@@ -66,7 +71,7 @@ def _example(unit: str) -> str:
     return "'1500 rpm', '157.1 rad/s' or '25 Hz'" if unit == "rad/s" else f"'1.5 {unit}'" if unit else "1.5"
 
 
-def to_float(value: Number, unit: str, field: str) -> Any:
+def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
     """The SI magnitude of `value` in `unit`; numbers without a unit are taken to be in `unit` already.
 
     Strings and pint quantities are converted. A frequency in hertz given where rad/s is wanted counts as
@@ -90,7 +95,7 @@ def to_float(value: Number, unit: str, field: str) -> Any:
             return float(value)
         except ValueError:
             pass
-    if isinstance(value, str) or hasattr(value, "m_as"):
+    if isinstance(value, (str, Quantity)):
         wrong = InputError(
             field,
             f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}",
@@ -114,7 +119,7 @@ def to_float(value: Number, unit: str, field: str) -> Any:
     return value
 
 
-def _checked(value: Any, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
+def _checked(value: Array, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
     """Value checks, for concrete numbers only: a traced value has none to look at."""
     if traced(value):
         return
@@ -142,7 +147,7 @@ def number(value: Number, unit: str, field: str, *, low: float = -math.inf, open
 
 
 def numbers(
-    value: Number | Sequence[Number],
+    value: Numbers,
     unit: str,
     field: str,
     length: int | None,
@@ -160,7 +165,7 @@ def numbers(
     >>> numbers(["44 N/mm", 5e4], "N/m", "machine.stiffness", 2).tolist()
     [44000.0, 50000.0]
     """
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, Sequence) and not isinstance(value, str):
         parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         for i, part in enumerate(parts):
             if np.ndim(part) != 0:
@@ -187,7 +192,7 @@ def numbers(
     return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)
 
 
-def _array(value: Any, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
+def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
     try:
         # What JAX does not hold yet NumPy converts: no program need be compiled for it.
         array = jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype=float), dtype=float)
@@ -199,7 +204,7 @@ def _array(value: Any, unit: str, field: str, shape: tuple[int, ...], low: float
     return array
 
 
-def count(value: Any, field: str, *, low: int = 1) -> int:
+def count(value: object, field: str, *, low: int = 1) -> int:
     """A whole number of things, at least `low`.
 
     **Raises** `InputError` for anything else.

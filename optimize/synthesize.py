@@ -28,6 +28,7 @@ from optimize.search import Search, descend, draw_starts, polish
 from optimize.space import DesignSpace
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
@@ -118,18 +119,28 @@ class Synthesis(Result):
             lines.append(f"  not verified: {self.unverified}")
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Every quantity after the search against before. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Every quantity after the search against before.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
 
         names = amplitude_names(self.scene)
-        return before_after(_flat(self.before, names), _flat(self.after, names), title=f"search for {wanted(self.objective)}")
+        return before_after(
+            _flat(self.before, names), _flat(self.after, names), title=f"search for {wanted(self.objective)}", ax=ax
+        )
 
-    def plot_convergence(self) -> Figure:
-        """The objective of every start over the iterations. **Returns** a matplotlib figure."""
+    def plot_convergence(self, *, ax: Axes | None = None) -> Figure:
+        """The objective of every start over the iterations.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.charts import convergence
 
-        return convergence(self.history, best=int(np.argmin(self.values)), label=f"{self.objective}, {self.unit}".rstrip(", "))
+        return convergence(
+            self.history, best=int(np.argmin(self.values)), label=f"{self.objective}, {self.unit}".rstrip(", "), ax=ax
+        )
 
 
 def wanted(objective: str) -> str:

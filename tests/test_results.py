@@ -1,5 +1,6 @@
 """Every result: status, sentence, text, figure, plain and labelled data, files and back."""
 
+import inspect
 import json
 import pathlib
 import subprocess
@@ -139,6 +140,26 @@ def test_speaks(result):
     assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
     assert result.summary().strip() and "Array(" not in result.summary()
     assert isinstance(result.plot(), Figure)
+
+
+def test_a_figure_of_one_panel_goes_onto_given_axes(result):
+    if "ax" not in inspect.signature(result.plot).parameters:
+        pytest.skip("its figure has several panels")
+    axes = Figure().subplots(1, 2)
+    assert result.plot(ax=axes[1]) is axes[1].figure
+    assert axes[1].has_data() and not axes[0].has_data() and len(axes[0].figure.axes) == 2
+
+
+def test_the_figure_of_jam_modes_names_the_coordinates():
+    scene = jv.Scene(
+        jv.two_mass(mass=[50.0, 80.0], stiffness=[4e4, 6e4], damping=[100.0, 100.0], link_stiffness=2e4, link_damping=20.0),
+        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
+        jv.ConstantSpeed("60 rad/s"),
+    )
+    modes = jv.jam_modes(scene)
+    for found in (modes, modes.select(modes.mode_numbers()[0])):
+        legend = found.plot().axes[1].get_legend()
+        assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
 
 
 def test_plain_data_is_json(result):

@@ -16,6 +16,8 @@ from jaxvib.ode.progress import ProgressBar
 from jaxvib.units import number
 
 if TYPE_CHECKING:
+    from jaxvib.motion.start import Start
+    from jaxvib.results.fields import Plain
     from optimize import Outcome, Synthesis
 
 
@@ -55,7 +57,7 @@ def new(kind: str, output: Output) -> None:
 def simulate(
     scene: Path,
     until: str,
-    start: Any,
+    start: Start,
     mode: int | None,
     spin_up: str | None,
     tolerance: float | None,
@@ -119,7 +121,7 @@ def _long(scene: jv.Scene, until: str) -> bool:
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
 
 
-def _regime(found: jv.Regime) -> dict[str, Any]:
+def _regime(found: jv.Regime) -> dict[str, Plain]:
     """The regime and its evidence; names as in `RegimeName` and `PhasePattern`."""
     return {
         "name": found.label,

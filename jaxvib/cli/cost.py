@@ -10,7 +10,7 @@ import click
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.study.accuracy.cost import WANTED, Cost, CostRow
-from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
+from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS, Quantity
 
 
 @app.command("cost")
@@ -27,7 +27,7 @@ from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 @shared
 def cost(
     scene: Path,
-    quantity: Any,
+    quantity: Quantity,
     mode: int | None,
     until: str | None,
     solvers: tuple[str, ...],

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import click
 import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.machine.files import read_toml
+from jaxvib.machine.files import Tables, read_toml
 from jaxvib.study.bearing.decrement import Estimate
 from jaxvib.study.bearing.measurement import measurement_from_tables
+
+Command = TypeVar("Command", bound=Callable)
 
 _NAMED = (
     ("mass", "pendulum", "Mass of the pendulum, such as '300 g'."),
@@ -27,7 +30,7 @@ _NAMED = (
 )
 
 
-def _named(command: Any) -> Any:
+def _named(command: Command) -> Command:
     for name, section, text in reversed(_NAMED):
         command = click.option(f"--{name}", f"{section}__{name.replace('-', '_')}", help=text)(command)
     return command
@@ -39,15 +42,15 @@ def _named(command: Any) -> Any:
 @click.option("--columns", "record__columns", help="Names of the columns of time and angle, such as 't,phi'.")
 @click.option("--dry/--no-dry", "identify__dry", default=None, help="Find mu2 of dry friction as well as mu1, or not.")
 @shared
-def identify(record: Path, output: Output, **given: Any) -> None:
+def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a measurement
     file (TOML) that names one; options replace what the file says. --out adds the picture and the fit (fit.csv)."""
     is_file = record.suffix.lower() == ".toml"
-    tables: dict[str, Any] = read_toml(record) if is_file else {"record": {"file": record.name}}
+    tables: Tables = read_toml(record) if is_file else {"record": {"file": record.name}}
     for name, value in given.items():
         section, _, field = name.partition("__")
         if value is not None:
-            value = value.split(",") if field == "columns" else value
+            value = value.split(",") if field == "columns" and isinstance(value, str) else value
             old = tables.get(section, {})
             tables[section] = {**old, field: value} if isinstance(old, dict) else old
     pendulum, swing, dry, instrument = measurement_from_tables(tables, record.parent)

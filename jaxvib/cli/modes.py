@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypeAlias
 
 import click
 import jax
@@ -15,6 +15,8 @@ from jaxvib.errors import InputError
 
 _RPM = 30.0 / np.pi
 
+SpeedUnit: TypeAlias = Literal["rad/s", "rpm"]
+
 
 @app.command("modes")
 @click.argument("scene", type=click.Path(path_type=Path))
@@ -23,7 +25,7 @@ _RPM = 30.0 / np.pi
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
 @shared
-def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, output: Output) -> None:
+def modes(scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: bool, output: Output) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
     Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
@@ -95,7 +97,7 @@ def _left_out(scene: jv.Scene) -> list[str]:
     return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 
 
-def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
+def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     """The jams of light loads at any phases."""
     found = jv.phase_jams(scene)
     picture = output.file("phases.png")
@@ -142,7 +144,7 @@ def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
     output.done(document, text, "modes")
 
 
-def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
+def _exact(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
     from jaxvib.steady.orbits.jam_orbit import exact_mode_speeds  # needs the time integrator: only who asks pays
 

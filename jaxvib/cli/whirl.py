@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import click
 import numpy as np
@@ -22,7 +22,7 @@ _RPM = 30.0 / np.pi
     "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Whether the loads' masses count."
 )
 @shared
-def whirl(scene: Path, speed: str | None, loads: Any, output: Output) -> None:
+def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], output: Output) -> None:
     """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
     loaded = jv.load_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))

@@ -133,10 +133,10 @@ def solid_and_dashed(
         axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name)
 
 
-def before_after(before: Mapping[str, float], after: Mapping[str, float], *, title: str = "") -> Figure:
+def before_after(before: Mapping[str, float], after: Mapping[str, float], *, title: str = "", ax: Axes | None = None) -> Figure:
     """Bars of every quantity after the search, as a multiple of what it was before; the values stand beside them."""
     shared = [name for name in after if name in before and np.isfinite(before[name]) and before[name] != 0.0]
-    figure, (axis,) = panels(1, size=(8.0, 0.55 * len(shared) + 1.4))
+    figure, (axis,) = panels(1, size=(8.0, 0.55 * len(shared) + 1.4), ax=ax)
     ratios = [after[name] / before[name] for name in shared]
     places = np.arange(len(shared))[::-1]
     axis.barh(places, ratios, color=COLORS[0], height=0.6)
@@ -151,9 +151,9 @@ def before_after(before: Mapping[str, float], after: Mapping[str, float], *, tit
     return figure
 
 
-def convergence(history: np.ndarray, *, best: int, label: str) -> Figure:
+def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Figure:
     """The objective of every start (iterations, starts) over the iterations, the one numbered `best` bold."""
-    figure, (axis,) = panels(1, size=(7.0, 3.6))
+    figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.plot(history, color=COLORS[0], lw=0.5, alpha=0.25)
     axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
     axis.set_yscale("log" if np.nanmin(history) > 0.0 else "linear")

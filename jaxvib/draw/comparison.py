@@ -18,9 +18,11 @@ from jaxvib.draw.style import COLORS, panels
 __all__ = ["CostPanel", "convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
 
 
-def tiers_chart(mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray) -> Figure:
+def tiers_chart(
+    mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray, *, ax: Axes | None = None
+) -> Figure:
     """Relative differences (n,) by name over the mass of a load (n,) kg; marks are hollow where `stable` (n,) is False."""
-    figure, (axes,) = panels(1, size=(7.0, 4.0))
+    figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     for color, (name, values) in zip(COLORS, differences.items(), strict=False):
         axes.loglog(mass, values, color=color, label=name)
         axes.loglog(mass[stable], values[stable], "o", color=color, ms=5)
@@ -91,9 +93,11 @@ def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Ma
     axes.set_ylabel(f"relative error of {panel.quantity}")
 
 
-def convergence_chart(harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str]) -> Figure:
+def convergence_chart(
+    harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
+) -> Figure:
     """Errors (n, w) over the highest harmonic (n,), log scale; their estimates `known` (n, w) dashed."""
-    figure, (axes,) = panels(1, size=(7.0, 4.0))
+    figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
     for k, (color, name) in enumerate(zip(itertools.cycle(COLORS), names, strict=False)):
         axes.semilogy(harmonics, np.maximum(error[:, k], floor), "o-", color=color, ms=4.5, label=name)
@@ -106,10 +110,16 @@ def convergence_chart(harmonics: np.ndarray, error: np.ndarray, known: np.ndarra
 
 
 def stability_chart(
-    value: np.ndarray, omega: np.ndarray, stable: np.ndarray, marks: Mapping[str, np.ndarray], *, label: str
+    value: np.ndarray,
+    omega: np.ndarray,
+    stable: np.ndarray,
+    marks: Mapping[str, np.ndarray],
+    *,
+    label: str,
+    ax: Axes | None = None,
 ) -> Figure:
     """Where `stable` (n, P) over load speed `omega` (n, P) rad/s and another number (n,), with marks (k, 2) by kind."""
-    figure, (axes,) = panels(1, size=(7.5, 4.5))
+    figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     height = np.broadcast_to(value[:, None], omega.shape)
     if value.size > 1:
         axes.contourf(omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import solid_and_dashed
@@ -26,6 +27,7 @@ def drag_diagram(
     jams: tuple[np.ndarray, np.ndarray] | None = None,
     within: float | None = None,
     unit: str = "rad/s",
+    ax: Axes | None = None,
 ) -> Figure:
     """Load speeds over the drag, log scale, of patterns (name, drag, speed, stable), (n,) each; the rotor's a level line.
 
@@ -40,7 +42,7 @@ def drag_diagram(
     'speed of loads, rad/s'
     """
     scale = speed_scale(unit)
-    figure, (axis,) = panels(1, size=(7.5, 4.6))
+    figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
     colors = dict(zip(dict.fromkeys(name for name, *_ in branches), itertools.cycle(COLORS), strict=False))
     for name, drag, speed, stable in branches:
         solid_and_dashed(axis, drag, scale * speed, stable, colors[name], widths=_WIDTHS)

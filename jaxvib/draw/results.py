@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
@@ -13,12 +14,19 @@ __all__ = ["modes_chart", "multiplier_chart", "phase_circles", "points_chart", "
 
 
 def modes_chart(
-    mode: np.ndarray, omega: np.ndarray, stable: np.ndarray, amplitude: np.ndarray, resonances: np.ndarray | None = None
+    mode: np.ndarray,
+    omega: np.ndarray,
+    stable: np.ndarray,
+    amplitude: np.ndarray,
+    resonances: np.ndarray | None = None,
+    *,
+    names: Sequence[str],
 ) -> Figure:
-    """Load speeds (k,) rad/s and amplitudes (k, nd) m over the numbers of modes (k,); filled where stable, resonances level.
+    """Load speeds (k,) rad/s and amplitudes (k, nd) m over the numbers of modes (k,); filled where stable, resonances level;
+    `names` (nd,) of the coordinates, a colour each.
 
     >>> import numpy as np
-    >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)))
+    >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)), names=["y"])
     >>> figure.axes[1].get_ylabel()
     'amplitude, m'
     """
@@ -27,6 +35,9 @@ def modes_chart(
         for k in range(values.shape[1]):
             for kind, face in ((stable, COLORS[k % len(COLORS)]), (~stable, "white")):
                 axis.plot(mode[kind], values[kind, k], "o", mfc=face, mec=COLORS[k % len(COLORS)])
+    for k, name in enumerate(names):
+        bottom.plot([], [], "o", color=COLORS[k % len(COLORS)], label=name)
+    bottom.legend(loc="best")
     for k, w in enumerate(() if resonances is None else resonances):
         top.axhline(w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
     if resonances is not None:
@@ -40,14 +51,14 @@ def modes_chart(
     return figure
 
 
-def phase_circles(sets: Sequence[tuple[str, np.ndarray]]) -> Figure:
-    """Angles of loads (count,) rad as points on a circle, one circle for each (title, angles).
+def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Axes | None = None) -> Figure:
+    """Angles of loads (count,) rad as points on a circle, one circle for each (title, angles); `ax` only for a single one.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
     2
     """
-    figure, axes = panels(1, max(len(sets), 1), size=(3.0, 3.2))
+    figure, axes = panels(1, max(len(sets), 1), size=(3.0, 3.2), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     for axis in axes:
         axis.plot(np.cos(turn), np.sin(turn), color="#999999", lw=0.8)
@@ -62,7 +73,9 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]]) -> Figure:
     return figure
 
 
-def speeds_chart(rows: Sequence[tuple[str, np.ndarray]], spans: Sequence[tuple[str, np.ndarray]] = ()) -> Figure:
+def speeds_chart(
+    rows: Sequence[tuple[str, np.ndarray]], spans: Sequence[tuple[str, np.ndarray]] = (), *, ax: Axes | None = None
+) -> Figure:
     """Speeds (n,) rad/s as points on a level line for each (label, speeds), then intervals (n, 2) as bars; what is no finite
     number is left out, an interval without an end goes to the edge.
 
@@ -71,7 +84,7 @@ def speeds_chart(rows: Sequence[tuple[str, np.ndarray]], spans: Sequence[tuple[s
     >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
     ['balancing', 'resonances']
     """
-    figure, (axis,) = panels(1, size=(7.0, 0.5 * (len(rows) + len(spans)) + 1.0))
+    figure, (axis,) = panels(1, size=(7.0, 0.5 * (len(rows) + len(spans)) + 1.0), ax=ax)
     values = np.concatenate([np.ravel(x) for _, x in (*rows, *spans)])
     top = 1.15 * np.max(values[np.isfinite(values)], initial=1e-300)
     heights = np.arange(len(rows) + len(spans))[::-1]
@@ -105,14 +118,14 @@ def signals_chart(x: np.ndarray, signals: Sequence[tuple[str, np.ndarray]], *, a
     return figure
 
 
-def points_chart(values: np.ndarray, *, across: str, up: str) -> Figure:
+def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Figure:
     """Values (n, k) as points over 1 .. n.
 
     >>> import numpy as np
     >>> points_chart(np.ones((3, 2)), across="run", up="speed, rad/s").axes[0].get_xlabel()
     'run'
     """
-    figure, (axis,) = panels(1, size=(7.0, 3.2))
+    figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     for k in range(values.shape[1]):
         axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], ".", color=COLORS[k % len(COLORS)])
     axis.set_xlabel(across)
@@ -120,14 +133,14 @@ def points_chart(values: np.ndarray, *, across: str, up: str) -> Figure:
     return figure
 
 
-def multiplier_chart(multipliers: np.ndarray) -> Figure:
+def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Figure:
     """Floquet multipliers (n,) in the complex plane, and the unit circle.
 
     >>> import numpy as np
     >>> multiplier_chart(np.array([0.5 + 0.1j])).axes[0].get_xlabel()
     'real part'
     """
-    figure, (axis,) = panels(1, size=(4.0, 4.0))
+    figure, (axis,) = panels(1, size=(4.0, 4.0), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     axis.plot(np.cos(turn), np.sin(turn), color="#999999", lw=0.8)
     axis.plot(np.real(multipliers), np.imag(multipliers), "o", color=COLORS[0], ms=4.0)

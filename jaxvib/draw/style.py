@@ -48,14 +48,18 @@ def speed_scale(unit: str) -> float:
 
 
 def panels(
-    rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False
+    rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False, ax: Axes | None = None
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `rows` x `columns` axes in the house's style, `size` inches each. **Returns** the figure and its axes.
+    """A figure with `rows` x `columns` axes in the house's style, `size` inches each; with `ax` those axes and their figure.
+
+    **Returns** the figure and its axes.
 
     >>> figure, axes = panels(2)
     >>> len(axes)
     2
     """
+    if ax is not None:
+        return ax.figure.figure, [ax]
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(size[0] * columns, size[1] * rows))
         FigureCanvasAgg(figure)

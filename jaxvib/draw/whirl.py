@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
@@ -10,7 +11,7 @@ from jaxvib.draw.style import COLORS, panels
 __all__ = ["campbell_diagram"]
 
 
-def campbell_diagram(rotor_speed: np.ndarray, speed: np.ndarray, forward: np.ndarray) -> Figure:
+def campbell_diagram(rotor_speed: np.ndarray, speed: np.ndarray, forward: np.ndarray, *, ax: Axes | None = None) -> Figure:
     """Whirl speeds (ns, nd) rad/s over rotor speed (ns,) rad/s: forward ones solid, backward ones dashed; the line w = n.
 
     >>> import numpy as np
@@ -18,7 +19,7 @@ def campbell_diagram(rotor_speed: np.ndarray, speed: np.ndarray, forward: np.nda
     >>> len(campbell_diagram(n, np.ones((5, 1)), np.ones((5, 1), dtype=bool)).axes)
     1
     """
-    figure, (axis,) = panels(1, size=(7.0, 4.6))
+    figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for with_rotor, line, color, label in ((True, "-", COLORS[0], "forward"), (False, "--", COLORS[1], "backward")):
         # The k-th motion of one sense keeps its place among its kind while speeds of different sense cross.
         count = int(np.max(np.sum(forward == with_rotor, axis=1), initial=0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -13,13 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.machine.drive import Drive, IdealDrive, Motor
+from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, Friction, total_gravity
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, times
 
 __all__ = ["Dynamics", "State", "vector_field"]
+
+_Kinematics: TypeAlias = tuple[list[tuple[Array, Array]], tuple[Array, Array]]
+"""Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x and a y."""
 
 
 class State(eqx.Module):
@@ -108,7 +111,7 @@ class Dynamics(eqx.Module):
         throw = self._throw(t, state)
         loads = _kinematics(self.loads, state.angle, state.rate)
 
-        def accelerations(friction: Sequence[Friction]) -> tuple[list[Any], Array, _Eliminated, Array | None]:
+        def accelerations(friction: Sequence[Friction]) -> tuple[list[Array], Array, _Eliminated, Array | None]:
             part = self._eliminate(loads, state, speed, friction)
             weight, reaction, spin = self._with_rotor(part, throw, speed)
             a, carrier = self._close(weight, reaction, unforced)
@@ -139,7 +142,7 @@ class Dynamics(eqx.Module):
         found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
         return [_signed(each, {}) if each.normal is None else each for each in found if each is not None]
 
-    def _eliminate(self, kinematics: Any, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
+    def _eliminate(self, kinematics: _Kinematics, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
         loads, axes = self.loads, self.axes
         columns, curvature = kinematics
         torque = loads.resistance(state.angle, state.rate, speed)
@@ -177,19 +180,21 @@ class Dynamics(eqx.Module):
         self, part: _Eliminated, throw: tuple[list[Array], list[Array]] | None, speed: Array
     ) -> tuple[list[list[Array]], list[Array], tuple[Array, list[Array]] | None]:
         """Weight and reaction with the rotor's imbalance, and its own acceleration as (free, row): theta'' = free - row . a."""
-        if not isinstance(self.drive, Motor):
+        motor = self.drive.torque_and_inertia(speed)
+        if motor is None:
             if throw is None:
                 return part.weight, part.reaction, None
             return part.weight, [g + b for g, b in zip(part.reaction, throw[1], strict=True)], None
-        free = (self.drive.torque(speed) - self._total(part.drag)) / self.drive.inertia
+        torque, inertia = motor
+        free = (torque - self._total(part.drag)) / inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
             arms = self._arms()
-            row = [self._total(part.pull[i], *arms[1:2] * n) / self.drive.inertia for n in range(len(arms)) for i in self.axes]
+            row = [self._total(part.pull[i], *arms[1:2] * n) / inertia for n in range(len(arms)) for i in self.axes]
         if throw is None:
             return part.weight, part.reaction, (free, row)
         along, bend = throw
-        row = [r + d / self.drive.inertia for r, d in zip(row, along, strict=True)]
+        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
         weight = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(part.weight, along, strict=True)]
         reaction = [g + b + d * free for g, b, d in zip(part.reaction, bend, along, strict=True)]
         return weight, reaction, (free, row)
@@ -215,12 +220,12 @@ class Dynamics(eqx.Module):
 
         along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
         push = [b * rate**2 for b in bend]
-        if isinstance(self.drive, IdealDrive):
-            change = self.drive.acceleration_at(t)
+        change = self.drive.rotor_acceleration(t)
+        if change is not None:
             push = [p + d * change for p, d in zip(push, along, strict=True)]
         return list(along), push
 
-    def _close(self, weight: list[list[Array]], reaction: list[Array], unforced: Array) -> tuple[list[Any], Array]:
+    def _close(self, weight: list[list[Array]], reaction: list[Array], unforced: Array) -> tuple[list[Array], Array]:
         """Accelerations of P's rows and of the carrier."""
         n = len(reaction)
         free = times(self.port, unforced)
@@ -233,18 +238,18 @@ class Dynamics(eqx.Module):
         push = [-sum(weight[i][k] * a[k] for k in range(n)) - reaction[i] for i in range(n)]
         return list(a), unforced + sum(self.push[:, i] * push[i] for i in range(n))
 
-    def _at_loads(self, a: list[Any]) -> dict[int, Any]:
+    def _at_loads(self, a: list[Array]) -> dict[int, Array]:
         """Accelerations of the points that carry the loads, by axis."""
         n = len(self.axes)
         if self.stations is None:
             return dict(zip(self.axes, a[:n], strict=True))
         return {axis: a[k] + self.stations * a[n + k] for k, axis in enumerate(self.axes)}
 
-    def _arms(self) -> list[Any]:
+    def _arms(self) -> list[Array | float]:
         """The levers of the port's rows: 1, and where loads have stations those, for the tilts."""
         return [1.0] if self.stations is None else [1.0, self.stations]
 
-    def _total(self, values: Array, *arms: Array) -> Array:
+    def _total(self, values: Array, *arms: Array | float) -> Array:
         for arm in arms:
             values = values * arm
         return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
@@ -300,7 +305,7 @@ def vector_field(scene: Scene) -> Dynamics:
     )
 
 
-def _signed(friction: Friction, a: dict[int, Any]) -> Friction:
+def _signed(friction: Friction, a: dict[int, Array]) -> Friction:
     """A friction whose reaction is known to be positive or negative, so that it is linear in the accelerations."""
     reaction = friction.reaction
     if friction.normal is not None:
@@ -309,9 +314,7 @@ def _signed(friction: Friction, a: dict[int, Any]) -> Friction:
     return Friction(friction.lever * sign, friction.reaction, friction.normal)
 
 
-def _kinematics(
-    loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]
-) -> tuple[list[tuple[Array, Array]], tuple[Array, Array]]:
+def _kinematics(loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> _Kinematics:
     """Columns of J and c = (dJ/dt) u', of all loads at once (the position acts elementwise)."""
 
     def along(direction: tuple[Array, ...]) -> Callable[..., tuple[Array, Array]]:
@@ -328,5 +331,5 @@ def _sum(values: Iterable[Array]) -> Array:
     return functools.reduce(operator.add, values)
 
 
-def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
-    return sum(a * b for a, b in zip(x, y, strict=True))
+def _dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    return _sum(a * b for a, b in zip(x, y, strict=True))

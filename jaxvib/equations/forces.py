@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.machine.drive import Motor
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 
@@ -64,8 +63,9 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     t = jnp.asarray(t, q.dtype)
     turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     parts.append(rate * _throw_rate(scene, turn) @ v)
-    if isinstance(scene.drive, Motor):
-        parts.append(0.5 * scene.drive.inertia * rate**2)
+    motor = scene.drive.torque_and_inertia(rate)
+    if motor is not None:
+        parts.append(0.5 * motor[1] * rate**2)
     return sum(parts[1:], parts[0])
 
 
@@ -80,13 +80,13 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     acceleration = vector_field(scene)(t, state).velocity
     at_load = carrier.point_rates(acceleration)
-    torque = loads.resistance(state.angle, state.rate, speed)
+    taken = loads.resistance(state.angle, state.rate, speed)
     g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
     for effect in scene.effects:
         friction = effect.friction(loads, state.angle, state.rate, speed, g)
         if friction is not None:
-            torque = (torque[0] + friction.torque(at_load), *torque[1:])
+            taken = (taken[0] + friction.torque(at_load), *taken[1:])
         resistance = effect.load_resistance(loads, state.angle, state.rate)
         if resistance is not None:
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
@@ -96,13 +96,11 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
             resisting = effect.support_resistance(x, v)
             if resisting is not None:
                 lost.append(resisting @ v)
-    braking = jnp.sum(torque[0])
-    lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(torque, state.rate, strict=True))]
-    if isinstance(scene.drive, Motor):
-        supplied = speed * scene.drive.torque(speed)
-    else:
-        supplied = speed * (braking + _throw_rate(scene, turn) @ acceleration)
-    return supplied, sum(lost[1:], lost[0])
+    braking = jnp.sum(taken[0])
+    lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
+    motor = scene.drive.torque_and_inertia(speed)
+    torque = braking + _throw_rate(scene, turn) @ acceleration if motor is None else motor[0]
+    return speed * torque, sum(lost[1:], lost[0])
 
 
 def _throw_rate(scene: Scene, turn: Array) -> Array:

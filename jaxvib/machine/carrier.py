@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import abc
 import functools
-from typing import Any
+from collections.abc import Hashable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 __all__ = ["Carrier", "Machine"]
@@ -95,7 +96,7 @@ class Machine(eqx.Module):
 
 
 @functools.lru_cache(maxsize=128)
-def _structure(rest: Any, kinds: tuple[Any, ...], precision: Any) -> Carrier:
+def _structure(rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype) -> Carrier:
     """Traced once for all machines of a form, in the `precision` in force: a trace takes longer than many a run."""
     machine = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return eqx.filter_eval_shape(lambda machine: machine.carrier(), machine)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
@@ -14,7 +13,7 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.units import Number, number, numbers
+from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units import count as whole
 
 __all__ = ["Dimensionless"]
@@ -71,11 +70,11 @@ class Dimensionless(eqx.Module):
         self,
         form: Literal["antiphase", "criterion"],
         *,
-        natural: Number | Sequence[Number],
-        damping: Number | Sequence[Number],
-        link_natural: Number | Sequence[Number] = (),
-        link_damping: Number | Sequence[Number] = (),
-        rho: Number | Sequence[Number] = (),
+        natural: Numbers,
+        damping: Numbers,
+        link_natural: Numbers = (),
+        link_damping: Numbers = (),
+        rho: Numbers = (),
         eps: Number,
         beta: Number,
         speed: Number,

@@ -42,6 +42,14 @@ class Drive(eqx.Module):
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
         """The rotor's angle at time `t` (s), rad, in the state `rotor`."""
 
+    @abc.abstractmethod
+    def rotor_acceleration(self, t: Array) -> Array | None:
+        """The rotor's angular acceleration at time `t` (s), rad/s^2; None where it follows from the torques on the rotor."""
+
+    @abc.abstractmethod
+    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
+        """T at the rotor's `speed` (rad/s), N m, and its inertia J, kg m^2; None where no torque changes its speed."""
+
     def jump_ts(self) -> tuple[Array, ...]:
         """Times at which the acceleration jumps, on which an integrator has to put a step."""
         return ()
@@ -72,6 +80,13 @@ class IdealDrive(Drive):
         """`angle_at`."""
         return self.angle_at(t)
 
+    def rotor_acceleration(self, t: Array) -> Array:
+        """`acceleration_at`."""
+        return self.acceleration_at(t)
+
+    def torque_and_inertia(self, speed: Array) -> None:
+        """None."""
+
 
 class Motor(Drive):
     """A drive of limited power: the rotor turns as its torque and the loads let it.
@@ -94,6 +109,13 @@ class Motor(Drive):
         """That of the state."""
         assert rotor is not None
         return rotor[0]
+
+    def rotor_acceleration(self, t: Array) -> None:
+        """None."""
+
+    def torque_and_inertia(self, speed: Array) -> tuple[Array, Array]:
+        """`torque` and `inertia`."""
+        return self.torque(speed), self.inertia
 
     @abc.abstractmethod
     def torque(self, speed: Array) -> Array:

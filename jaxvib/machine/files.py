@@ -7,7 +7,7 @@ import inspect
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from jaxvib.machine.scene import Scene
 
 __all__ = [
     "TEMPLATES",
+    "Tables",
     "called",
     "closest",
     "load_scene",
@@ -62,6 +63,12 @@ _EFFECTS = {
 _SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": _DRIVES}
 
 
+T = TypeVar("T")
+
+Tables: TypeAlias = dict[str, Any]
+"""What a file holds, read and not yet looked at: tables, arrays, texts, numbers, by name."""
+
+
 def closest(name: str, allowed: list[str]) -> str:
     """The end of an error message about a name: what was probably meant, and what is allowed."""
     near = difflib.get_close_matches(name, allowed, n=1)
@@ -69,7 +76,7 @@ def closest(name: str, allowed: list[str]) -> str:
     return f"{meant}allowed: {', '.join(allowed)}"
 
 
-def read_toml(path: str | Path) -> dict[str, Any]:
+def read_toml(path: str | Path) -> Tables:
     """The tables of a TOML file. **Raises** `InputError` for a file that is missing or no TOML."""
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -155,7 +162,7 @@ def scene_from_toml(text: str) -> Scene:
         raise InputError("scene", f"is no TOML: {error}") from error
 
 
-def scene_from_tables(tables: Mapping[str, Any]) -> Scene:
+def scene_from_tables(tables: Tables) -> Scene:
     """A scene from the tables of a scene file, see `scene_from_toml`."""
     for name in tables:
         if name not in (*_SECTIONS, "effects"):
@@ -183,7 +190,7 @@ def scene_from_tables(tables: Mapping[str, Any]) -> Scene:
     return Scene(**parts, effects=tuple(effects))
 
 
-def _built(table: Any, section: str, kinds: Mapping[str, Callable[..., Any]]) -> Any:
+def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {table!r}; it must be a table, write [{section}]")
     if "kind" not in table:
@@ -194,7 +201,7 @@ def _built(table: Any, section: str, kinds: Mapping[str, Callable[..., Any]]) ->
     return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
-def called(build: Callable[..., Any], values: Mapping[str, Any], section: str) -> Any:
+def called(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
     """`build(**values)`, with every unknown or missing name said as a field of `section`. **Raises** `InputError`."""
     parameters = inspect.signature(build).parameters
     for name in values:
@@ -223,7 +230,7 @@ def scene_to_toml(scene: Scene) -> str:
     """
     import tomli_w  # only where a file is written
 
-    tables: dict[str, Any] = {}
+    tables: dict[str, Tables] = {}
     for name, kinds in _SECTIONS.items():
         part = getattr(scene, name)
         tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
@@ -237,8 +244,8 @@ def scene_to_toml(scene: Scene) -> str:
     return tomli_w.dumps(tables)
 
 
-def _fields(part: Any, build: Callable[..., Any]) -> dict[str, Any]:
-    fields = {}
+def _fields(part: object, build: Callable[..., object]) -> Tables:
+    fields: Tables = {}
     for name in inspect.signature(build).parameters:
         value = getattr(part, name)
         if value is None:  # an option that was not taken

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.units import Number, count, number, numbers, traced
+from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
 __all__ = ["CircularLoads", "Loads", "balls", "pendulums", "rollers"]
 
@@ -120,15 +119,15 @@ class CircularLoads(Loads):
 def _circular(
     kind: str,
     count_: int,
-    mass: Number | Sequence[Number],
+    mass: Numbers,
     radius: Number,
-    drag: Number | Sequence[Number],
-    inertia: Number | Sequence[Number] | None,
+    drag: Numbers,
+    inertia: Numbers | None,
     own_radius: Number | None = None,
 ) -> CircularLoads:
     n = count(count_, "loads.count")
 
-    def each(value: Number, unit: str, name: str, open_low: bool) -> Array:
+    def each(value: Numbers, unit: str, name: str, open_low: bool) -> Array:
         return numbers(value, unit, f"loads.{name}", n, low=0.0, open_low=open_low, shared=True)
 
     loads = CircularLoads(
@@ -162,9 +161,9 @@ def _fit(loads: CircularLoads, r: Array) -> None:
 def balls(
     *,
     count: int,
-    mass: Number | Sequence[Number],
+    mass: Numbers,
     radius: Number,
-    drag: Number | Sequence[Number],
+    drag: Numbers,
     own_radius: Number | None = None,
 ) -> CircularLoads:
     """Balls that roll in an annular track, kappa = 7/5.
@@ -191,9 +190,9 @@ def balls(
 def rollers(
     *,
     count: int,
-    mass: Number | Sequence[Number],
+    mass: Numbers,
     radius: Number,
-    drag: Number | Sequence[Number],
+    drag: Numbers,
     own_radius: Number | None = None,
 ) -> CircularLoads:
     """Cylindrical rollers that roll in an annular track, kappa = 3/2.
@@ -214,10 +213,10 @@ def rollers(
 def pendulums(
     *,
     count: int,
-    mass: Number | Sequence[Number],
+    mass: Numbers,
     radius: Number,
-    drag: Number | Sequence[Number],
-    inertia: Number | Sequence[Number] = 0.0,
+    drag: Numbers,
+    inertia: Numbers = 0.0,
 ) -> CircularLoads:
     """Pendulums hung on the shaft, kappa = 1 + J_C/(m R^2).
 

@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.units import Number, count, numbers
+from jaxvib.units import Number, Numbers, count, numbers
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 
@@ -71,12 +71,12 @@ class Platforms(Machine):
 def _platforms(
     kind: str,
     n: int,
-    mass: Number,
-    stiffness: Number,
-    damping: Number,
+    mass: Numbers,
+    stiffness: Numbers,
+    damping: Numbers,
     links: Sequence[Sequence[int]],
-    link_stiffness: Number,
-    link_damping: Number,
+    link_stiffness: Numbers,
+    link_damping: Numbers,
     exciter: int,
 ) -> Platforms:
     joined = _links(links, n)
@@ -84,9 +84,10 @@ def _platforms(
     if which > n:
         raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
 
-    def links_of(value: Number, unit: str, field: str) -> Array:
-        if not joined and np.size(value) > 0:
-            raise InputError(field, f"has {np.size(value)} values; the machine has no links, leave it out or give links")
+    def links_of(value: Numbers, unit: str, field: str) -> Array:
+        given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
+        if not joined and given > 0:
+            raise InputError(field, f"has {given} values; the machine has no links, leave it out or give links")
         return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.zeros((0,), dtype=float)
 
     return Platforms(

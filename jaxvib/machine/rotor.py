@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.units import Number, number, numbers, traced
+from jaxvib.units import Number, Numbers, number, numbers, traced
 
 __all__ = ["PlanarRotor", "Rotor", "planar_rotor", "rotor"]
 
@@ -92,10 +92,10 @@ def rotor(
     mass: Number,
     transverse_inertia: Number,
     polar_inertia: Number,
-    stiffness: Number | Sequence[Number],
-    damping: Number | Sequence[Number],
+    stiffness: Numbers,
+    damping: Numbers,
     position: Sequence[Number],
-    stations: Number | Sequence[Number] = 0.0,
+    stations: Numbers = 0.0,
     stiffness_terms: Sequence[Number] | None = None,
     damping_terms: Sequence[Number] | None = None,
 ) -> Rotor:
@@ -121,7 +121,7 @@ def rotor(
     def terms(values: Sequence[Number] | None, units: tuple[str, str, str], field: str) -> Array | None:
         if values is None:
             return None
-        if not isinstance(values, (list, tuple)) and np.ndim(values) != 1:
+        if not isinstance(values, (list, tuple)) and getattr(values, "ndim", 0) != 1:
             problem = f"is {values!r}; it must be a list of three numbers, in {', '.join(units)}"
             raise InputError(f"machine.{field}", problem)
         if len(values) != 3:

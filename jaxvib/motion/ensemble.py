@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Hashable
+from typing import TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
@@ -25,15 +26,20 @@ from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_unit
 from jaxvib.motion.start import initial_state
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
+
+_Ends: TypeAlias = tuple[State, Array, Array, Array, Array]
+"""What `_run` returns, of one run or of many."""
 
 _PARTS = 4
 """Into so many parts a run is cut; over the last one mean speeds are taken."""
@@ -82,17 +88,20 @@ class Ensemble(Result):
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
 
-    def plot(self) -> Figure:
-        """The mean speed of each load, over the runs. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The mean speed of each load, over the runs.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
 
-        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s")
+        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s", ax=ax)
 
 
 @refuse_former(steps=FORMER["steps"])
 def ensemble(
     make: Callable[..., Scene | tuple[Scene, State]],
-    values: Any,
+    values: PyTree[Array],
     until: Number,
     *,
     stepsize_controller: EqualSteps | None = None,
@@ -169,10 +178,10 @@ def ensemble(
 
 
 @eqx.filter_jit
-def _made(make: Callable[..., Any], values: Any) -> tuple[Scene, State]:
+def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State]:
     """The scenes and the states they start from, all with a leading axis over the runs."""
 
-    def one(value: Any) -> tuple[Scene, State]:
+    def one(value: PyTree[Array]) -> tuple[Scene, State]:
         given = make(value)
         if isinstance(given, Scene):
             return given, initial_state(given)
@@ -191,8 +200,8 @@ def _fastest(scenes: Scene) -> Array:
 
 @cached
 def _all(
-    parts: list[Array], end: Array, counts: Any, shared: tuple[bool, ...], rest: Any, lanes: int, runs: int
-) -> tuple[State, Array, Array, Array, Array]:
+    parts: list[Array], end: Array, counts: np.ndarray, shared: tuple[bool, ...], rest: Hashable, lanes: int, runs: int
+) -> _Ends:
     """All runs in chunks over all devices, (runs, ...); see `_run`."""
     devices = jax.devices()
     chunks = -(-runs // (lanes * len(devices)))
@@ -206,12 +215,12 @@ def _all(
     own = [chunked(leaf) for leaf, same in zip(parts, shared, strict=True) if not same]
     common = [leaf for leaf, same in zip(parts, shared, strict=True) if same]
 
-    def one(own: list[Array], common: list[Array], end: Array, counts: Array) -> Any:
+    def one(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         mine, ours = iter(own), iter(common)
         scene, state = jax.tree.unflatten(rest, [next(ours) if same else next(mine) for same in shared])
         return _run(scene, state, end, counts)
 
-    def on_device(own: list[Array], common: list[Array], end: Array, counts: Array) -> Any:
+    def on_device(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         chunk = jax.vmap(one, in_axes=(0, None, None, None))
         return jax.lax.map(lambda mine: chunk(mine, common, end, counts), own)
 
@@ -224,7 +233,7 @@ def _all(
     return jax.tree.map(lambda leaf: leaf.reshape(padded, *leaf.shape[2:])[:runs], found)
 
 
-def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, Array, Array, Array, Array]:
+def _run(scene: Scene, state: State, end: Array, counts: Array) -> _Ends:
     """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
 
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
@@ -234,7 +243,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, 
     motion = PackedSystem(vector_field(scene), state, wrapped=single, together=together)
     length = end / _PARTS
 
-    def part(held: Any, begin: Array, step: Array) -> tuple[Any, Any]:
+    def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:
         solution = diffrax.diffeqsolve(
             motion.term,
             motion.method(lanes=True),
@@ -252,7 +261,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array) -> tuple[State, 
         held = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
         return held, (held, solution.stats["num_steps"])
 
-    def whole(steps: Array) -> tuple[Any, Array]:
+    def whole(steps: Array) -> tuple[Y, Array]:
         times = length * jnp.arange(_PARTS)
         _, (helds, taken) = jax.lax.scan(lambda held, begin: part(held, begin, length / steps), motion.pack(state), times)
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)

@@ -257,9 +257,9 @@ def _in_stretches(
     end: Array,
     number: int,
     state: State,
-    solver: Any,
-    controller: Any,
-    adjoint: Any,
+    solver: diffrax.AbstractSolver | None,
+    controller: diffrax.AbstractStepSizeController | StepControl,
+    adjoint: diffrax.AbstractAdjoint | None,
     turns: Array,
     max_steps: int,
 ) -> Run:

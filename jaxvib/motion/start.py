@@ -16,7 +16,7 @@ from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import Number, numbers, traced
+from jaxvib.units import Number, Numbers, numbers, traced
 
 __all__ = ["Start", "brought_up", "initial_state", "require_numbers", "whole_state"]
 
@@ -25,7 +25,7 @@ Start = Literal["rest", "jam", "spin_up"]
 
 
 def initial_state(
-    scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Number | None = None, throw: bool = True
+    scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Numbers | None = None, throw: bool = True
 ) -> State:
     """A state to start from.
 

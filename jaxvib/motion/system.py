@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -11,14 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import Dynamics, State
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
-from jaxvib.runtime.compat import jaxpr_as_fun
+from jaxvib.ode.types import Args, RealScalarLike
+from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 
 __all__ = ["PackedSystem"]
+
+Held: TypeAlias = PyTree[Array]
+"""What the integrator holds: a state or a tuple of its numbers; where angles are wrapped a pair, that and the turns done."""
 
 _TURN = 2.0 * math.pi
 
@@ -39,11 +44,11 @@ class PackedSystem(eqx.Module):
     `args` the arguments of `term`.
     """
 
-    args: Any
-    program: Any = eqx.field(static=True)
+    args: Args
+    program: ClosedJaxpr | None = eqx.field(static=True)
     size: int = eqx.field(static=True)
     like: Any = eqx.field(static=True)
-    shapes: Any = eqx.field(static=True)
+    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
     together: bool = eqx.field(static=True)
 
@@ -74,19 +79,19 @@ class PackedSystem(eqx.Module):
         wrap = self._wrap if self.wrapped else None
         return UnrolledDopri8(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else LoopDopri8(wrap=wrap)
 
-    def pack(self, state: State) -> Any:
+    def pack(self, state: State) -> Held:
         """A state (or a tree like it) as the integrator holds it."""
         y = tuple(scalars_of(state)) if self.is_scalarized else state
         return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
 
-    def unpack(self, held: Any) -> State:
+    def unpack(self, held: Held) -> State:
         """States along a leading axis, from what the integrator held then; wrapped angles count from the first one's turn."""
         if not self.wrapped:
             return self._state(held)
         y, turns = held
         return self._state(self._turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
-    def _wrap(self, held: Any) -> Any:
+    def _wrap(self, held: Held) -> Held:
         """Takes whole turns out of the angles and counts them."""
         y, turns = held
         angles = self._angles(y)
@@ -112,11 +117,11 @@ class PackedSystem(eqx.Module):
         rotor = [] if chosen.rotor is None else [chosen.rotor[0]]
         return [place for places in (*chosen.angle, *rotor) for place in places]
 
-    def _angles(self, y: Any) -> list[Array]:
+    def _angles(self, y: Held) -> list[Array]:
         leaves = jax.tree.leaves(y)
         return [leaves[place] for place in self._places()]
 
-    def _turned(self, y: Any, turns: list[Array], sign: float) -> Any:
+    def _turned(self, y: Held, turns: list[Array], sign: float) -> Held:
         """Angles changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
         leaves, rest = jax.tree.flatten(y)
         for place, n in zip(self._places(), turns, strict=True):
@@ -125,7 +130,7 @@ class PackedSystem(eqx.Module):
             leaves[place] = (leaves[place] + sign * n * high) + sign * n * low
         return jax.tree.unflatten(rest, leaves)
 
-    def _state(self, y: Any) -> State:
+    def _state(self, y: Held) -> State:
         if not self.is_scalarized:
             return y
         rows = iter(y)
@@ -135,13 +140,13 @@ class PackedSystem(eqx.Module):
             parts.append(jnp.stack(entries, axis=-1).reshape(*entries[0].shape, *shape))
         return jax.tree.unflatten(self.like, parts)
 
-    def _rates(self, t: Any, y: Any, args: Any) -> Any:
+    def _rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
         if self.wrapped:
             y, turns = y
             return self._plain_rates(t, y, args), jax.tree.map(jnp.zeros_like, turns)
         return self._plain_rates(t, y, args)
 
-    def _plain_rates(self, t: Any, y: Any, args: Any) -> Any:
+    def _plain_rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
         if self.program is None:
             return args(t, y)
         return tuple(jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,16 @@ __all__ = [
 ]
 
 
+_Entry: TypeAlias = Array | float
+"""Of a matrix: a number, or an array of those of many matrices."""
+
+
 def times(matrix: Array, vector: Array) -> Array:
     """Matrix times vector as a sum: a library call in a time loop would keep the compiler from fusing it."""
     return jnp.sum(matrix * vector[None, :], axis=-1)
 
 
-def small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
+def small_inverse(a: Sequence[Sequence[_Entry]]) -> Callable[[tuple[Array, ...]], tuple[Array, ...]]:
     """x of a x = b for a few equations, written out; the entries may be arrays of many such systems."""
     n = len(a)
     if n == 1:
@@ -40,7 +44,7 @@ def small_inverse(a: Sequence[Sequence[Any]]) -> Callable[[tuple[Array, ...]], t
     return lambda b: _eliminate(a, b)
 
 
-def _eliminate(a: Sequence[Sequence[Any]], b: tuple[Array, ...]) -> tuple[Array, ...]:
+def _eliminate(a: Sequence[Sequence[_Entry]], b: tuple[Array, ...]) -> tuple[Array, ...]:
     """Gauss' elimination, in each column the row with the largest entry first."""
     rows = [[*line, right] for line, right in zip(a, b, strict=True)]
     n = len(rows)
@@ -54,9 +58,9 @@ def _eliminate(a: Sequence[Sequence[Any]], b: tuple[Array, ...]) -> tuple[Array,
         for i in range(k + 1, n):
             factor = rows[i][k] / rows[k][k]
             rows[i] = [y - factor * x if j > k else y for j, (x, y) in enumerate(zip(rows[k], rows[i], strict=True))]
-    x: list[Any] = [None] * n
+    x: list[Array] = []
     for i in reversed(range(n)):
-        x[i] = (rows[i][n] - sum(rows[i][j] * x[j] for j in range(i + 1, n))) / rows[i][i]
+        x.insert(0, (rows[i][n] - sum(rows[i][j] * known for j, known in enumerate(x, i + 1))) / rows[i][i])
     return tuple(x)
 
 

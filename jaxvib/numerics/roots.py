@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from types import ModuleType
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 __all__ = ["bracketed_root", "next_share"]
 
-Point = tuple[Any, Any]
+Numbers = TypeVar("Numbers", np.ndarray, Array)
 
 
 def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: tuple[Array, Array] | None = None) -> Array:
@@ -59,7 +61,13 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
     return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
 
 
-def next_share(xp: Any, newest: Point, other: Point, before: Point, tolerance: float) -> Any:
+def next_share(
+    xp: ModuleType,
+    newest: tuple[Numbers, Numbers],
+    other: tuple[Numbers, Numbers],
+    before: tuple[Numbers, Numbers],
+    tolerance: float | np.floating,
+) -> Numbers:
     """Where to look next for a root between `newest` and `other`, as a share of the way; `before` is the point before these.
 
     Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` relative.

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
+from jaxvib.ode.types import Mapped, Tangents
 from jaxvib.runtime.compat import custom_vmap
 
 __all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
@@ -17,11 +19,12 @@ __all__ = ["VECTOR", "batch_last", "flat_tangents", "multi_tangent_jvp"]
 VECTOR = 8
 """The number of tangents is padded to a multiple of this: how many numbers a processor works on at a time."""
 
-Tangents = Any
-"""A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
+X = TypeVar("X")
+Out = TypeVar("Out")
+_WithTangents: TypeAlias = Callable[[PyTree, Tangents], tuple[PyTree[Array], Tangents]]
 
 
-def multi_tangent_jvp(function: Callable[[Any], Any], jvp: Callable[[Any, Tangents], Any]) -> Callable[[Any], Any]:
+def multi_tangent_jvp(function: Callable[[X], Out], jvp: Callable[[X, Tangents], tuple[Out, Tangents]]) -> Callable[[X], Out]:
     """`function` with forward derivatives by `jvp`, and no reverse ones.
 
     Under `jacfwd` JAX maps the derivative along one tangent over all of them, and puts the axis of the tangents before all
@@ -37,17 +40,17 @@ def multi_tangent_jvp(function: Callable[[Any], Any], jvp: Callable[[Any, Tangen
     """
 
     @eqx.filter_custom_jvp
-    def call(x: Any) -> Any:
+    def call(x: X) -> Out:
         return function(x)
 
     @call.def_jvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[X], tangents: tuple[Tangents]) -> tuple[Out, Tangents]:
         leaves, rest = jax.tree.flatten(primals[0])
         moves = flat_tangents(tangents[0], primals[0])
         arrays = [leaf if eqx.is_array(leaf) else None for leaf in leaves]
         places = [k for k, move in enumerate(moves) if move is not None]
 
-        def on_arrays(arrays: Any, moves: Any) -> Any:
+        def on_arrays(arrays: list[Array | None], moves: list[Array]) -> tuple[Out, Tangents]:
             inputs = [leaf if array is None else array for array, leaf in zip(arrays, leaves, strict=True)]
             given = dict(zip(places, moves, strict=True))
             return jvp(jax.tree.unflatten(rest, inputs), jax.tree.unflatten(rest, [given.get(k) for k in range(len(leaves))]))
@@ -57,7 +60,7 @@ def multi_tangent_jvp(function: Callable[[Any], Any], jvp: Callable[[Any, Tangen
     return call
 
 
-def batch_last(function: Callable[[Any], Any], batched: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+def batch_last(function: Callable[[X], Out], batched: Callable[[X, Mapped], Out]) -> Callable[[X], Out]:
     """`function`, under `vmap` computed by `batched`; with derivatives of every kind, which are mapped as JAX does it.
 
     JAX puts the batch before all other axes of what a loop carries. `batched` may keep it as the last one, where every number
@@ -73,18 +76,18 @@ def batch_last(function: Callable[[Any], Any], batched: Callable[[Any, Any], Any
     """
 
     @eqx.filter_custom_jvp
-    def call(x: Any) -> Any:
+    def call(x: X) -> Out:
         leaves, rest = jax.tree.flatten(x)
         places = [k for k, leaf in enumerate(leaves) if eqx.is_array(leaf)]
 
-        def unflatten(arrays: Any) -> Any:
+        def unflatten(arrays: Sequence[Array]) -> X:
             given = dict(zip(places, arrays, strict=True))
             return jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
 
         mapped = custom_vmap(lambda *arrays: function(unflatten(arrays)))
 
         @mapped.def_vmap
-        def _(size: int, is_mapped: Any, *arrays: Array) -> Any:
+        def _(size: int, is_mapped: Sequence[bool], *arrays: Array) -> tuple[Out, Mapped]:
             last = [jnp.moveaxis(a, 0, -1) if along else a for a, along in zip(arrays, is_mapped, strict=True)]
             known = dict(zip(places, is_mapped, strict=True))
             out = batched(unflatten(last), jax.tree.unflatten(rest, [known.get(k, False) for k in range(len(leaves))]))
@@ -93,28 +96,28 @@ def batch_last(function: Callable[[Any], Any], batched: Callable[[Any, Any], Any
         return mapped(*(leaves[k] for k in places))
 
     @call.def_jvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[X], tangents: tuple[Tangents]) -> tuple[Out, Tangents]:
         return eqx.filter_jvp(function, primals, tangents)
 
     return call
 
 
-def flat_tangents(tangents: Tangents, like: Any) -> list[Array | None]:
+def flat_tangents(tangents: Tangents, like: PyTree) -> list[Array | None]:
     """Tangents of the leaves of `like`, in order."""
     return jax.tree.structure(like).flatten_up_to(tangents)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _tangents_last(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def _tangents_last(function: _WithTangents) -> _WithTangents:
     """f(x, tangents) for one direction, of a function for directions along a last axis: called once where f is mapped."""
 
-    def single(x: Any, tangents: Any) -> Any:
+    def single(x: PyTree, tangents: Tangents) -> tuple[PyTree[Array], Tangents]:
         y, out = function(x, jax.tree.map(lambda dx: dx[..., None], tangents))
         return y, jax.tree.map(lambda dy: dy[..., 0], out)
 
     mapped = custom_vmap(single)
 
     @mapped.def_vmap
-    def _(size: int, is_mapped: Any, x: Any, tangents: Any) -> Any:
+    def _(size: int, is_mapped: Mapped, x: PyTree, tangents: Tangents) -> tuple[tuple[PyTree[Array], Tangents], Mapped]:
         if any(jax.tree.leaves(is_mapped[0])):
             axes = jax.tree.map(lambda which: 0 if which else None, is_mapped)
             out = jax.vmap(single, in_axes=tuple(axes))(x, tangents)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -12,7 +13,16 @@ import optimistix
 from jax import Array
 from jaxtyping import PyTree
 
-__all__ = ["PIController", "WrappedController"]
+from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, RealScalarLike, Terms, Y
+
+__all__ = ["Decision", "PIController", "WrappedController"]
+
+Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
+"""Whether a step is accepted, where the next one begins and ends, whether the field jumps there, the controller's new state,
+whether the run can go on."""
+
+_State: TypeAlias = tuple[Array, Array | None]
+"""Of `PIController`: the 32nd root of the last accepted step's error, the steps that are left where they are limited."""
 
 
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
@@ -55,23 +65,40 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return self.tolerance
 
     @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
+    def norm(self) -> Norm:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
         """As `rtol`."""
         return optimistix.rms_norm
 
-    def wrap(self, direction: Any) -> PIController:
+    def wrap(self, direction: IntScalarLike) -> PIController:
         """Time runs forward only."""
         return self
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+    def init(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        dt0: RealScalarLike,
+        args: Args,
+        func: Callable[[Terms, RealScalarLike, Y, Args], VF],
+        error_order: RealScalarLike | None,
+    ) -> tuple[RealScalarLike, _State]:
         """The first step ends at t0 + dt0."""
         return t0 + dt0, (jnp.ones_like(self.tolerance), self.max_steps)
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
-    ) -> Any:
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        y1_candidate: Y,
+        args: Args,
+        y_error: Y,
+        error_order: RealScalarLike,
+        controller_state: _State,
+    ) -> Decision:
         """Whether the step is accepted, where the next one begins and ends, and the controller's new state."""
-
         root_before, left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
@@ -98,7 +125,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         return accept, start, end, False, (root, left), result
 
 
-def moved_on(accept: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
+def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
     """Whether the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
@@ -107,19 +134,19 @@ def moved_on(accept: Any, start: Any, before: Any, end: Any) -> diffrax.RESULTS:
 class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
     """A controller that acts through another one, its `controller`, and hands on that one's tolerances to implicit methods."""
 
-    controller: eqx.AbstractVar[Any]
+    controller: eqx.AbstractVar[diffrax.AbstractStepSizeController]
 
     @property
-    def rtol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def rtol(self) -> RealScalarLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         """The tolerance of an implicit method; 0 where the inner controller, such as one of constant steps, has none."""
         return getattr(self.controller, "rtol", 0.0)
 
     @property
-    def atol(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def atol(self) -> RealScalarLike:  # pyright: ignore[reportIncompatibleVariableOverride]
         """As `rtol`."""
         return getattr(self.controller, "atol", 0.0)
 
     @property
-    def norm(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
+    def norm(self) -> Norm:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
         """As `rtol`."""
         return getattr(self.controller, "norm", optimistix.rms_norm)

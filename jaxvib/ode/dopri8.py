@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar
+import abc
+import functools
+import operator
+from collections.abc import Callable, Sequence
+from typing import ClassVar, TypeAlias, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -11,6 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
+
+from jaxvib.ode.interpolation import StepInterpolation
+from jaxvib.ode.types import VF, Args, BoolScalarLike, RealScalarLike, StepResult, Terms, Y
 
 __all__ = [
     "ERROR",
@@ -24,6 +31,9 @@ __all__ = [
     "ravel",
     "unravel",
 ]
+
+Tree = TypeVar("Tree")
+_Fence: TypeAlias = Callable[[Y], Y]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _LATE = 5
@@ -58,12 +68,12 @@ ERROR = np.asarray(_TABLEAU.b_error)
 """With what weights stages make the error of the step."""
 
 
-def ravel(tree: Any, directions: int = 0) -> Array:
+def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
     """The numbers of a tree as a vector (n,), or (n, directions) where there is that last axis."""
     return jnp.concatenate([leaf.reshape(-1, *leaf.shape[leaf.ndim - directions :]) for leaf in jax.tree.leaves(tree)])
 
 
-def unravel(flat: Array, like: Any) -> Any:
+def unravel(flat: Array, like: Tree) -> Tree:
     """The inverse of `ravel`; `like` tells structure and shapes."""
     leaves, rest = jax.tree.flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
@@ -88,51 +98,67 @@ def linear_combination(weights: Array, stages: Array) -> Array:
     return jnp.tensordot(weights.astype(stages.dtype), stages, 1, precision="highest")
 
 
-class Dopri8Interpolation(diffrax.AbstractLocalInterpolation):
+class Dopri8Interpolation(StepInterpolation):
     """The motion within a step: y0 + (t - t0) sum_j w_j(s) k_j, s the share of the step that is done, k_j the stages' rates.
 
     The polynomials w_j are diffrax's; `stages` is (10, n), see `dense_stages` and `ravel`.
     """
 
-    t0: Any
-    t1: Any
-    y0: Any
+    y0: Y
     stages: Array
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
-        """The state at `t0`, or by how much it changes from there to `t1`."""
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
-        span = self.t1 - self.t0
-        share = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
+    def at(self, share: Array, span: Array) -> Y:
         weights = jnp.zeros(len(_POLYNOMIALS), share.dtype)
         for column in _POLYNOMIALS.T:
             weights = weights * share + jnp.asarray(column, share.dtype)
         return self.from_weights(share * span * weights)
 
-    def from_weights(self, weights: Array) -> Any:
+    def from_weights(self, weights: Array) -> Y:
         """y0 + sum_j weights_j k_j."""
         return jax.tree.map(lambda y, change: y + change, self.y0, unravel(linear_combination(weights, self.stages), self.y0))
 
 
 class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
-    """What the forms of Dormand and Prince's pair share: all but the step, and what finds states within one."""
+    """What the forms of Dormand and Prince's pair share: all but how stages are computed, and what finds states within."""
 
-    wrap: Callable[[Any], Any] | None = None
+    wrap: Callable[[Y], Y] | None = None
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU
     term_structure: ClassVar = diffrax.AbstractTerm
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: Terms) -> int:
         """8."""
         return 8
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
         """The rates at the start: the last stage of a step is the first of the next one."""
         return terms.vf(t0, y0, args)
 
-    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+    def func(self, terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         """The vector field, for the choice of the first step."""
         return terms.vf(t0, y0, args)
+
+    @abc.abstractmethod
+    def advance(
+        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
+    ) -> tuple[Y, Array, VF, Y]:
+        """From the rates `first` at t0: the state at t1, the rates of all stages (stages, n), those at t1, the error."""
+
+    def step(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: VF,
+        made_jump: BoolScalarLike,
+    ) -> StepResult:
+        """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
+        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
+        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+        end, stages, last, error = self.advance(terms, t0, t1, y0, first, args)
+        end = end if self.wrap is None else self.wrap(end)
+        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
 
 
 class UnrolledDopri8(AbstractDopri8):
@@ -159,14 +185,12 @@ class UnrolledDopri8(AbstractDopri8):
     """
 
     lanes: bool = eqx.field(static=True, default=False)
-    interpolation_cls: ClassVar[Callable[..., Any]] = Dopri8Interpolation
+    interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
-        """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
-        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+    def advance(
+        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
+    ) -> tuple[Y, Array, VF, Y]:
+        """See `AbstractDopri8.advance`."""
         fence = _fence_of(self.lanes, jnp.where(t1 >= t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
         stages = [first]
@@ -175,25 +199,19 @@ class UnrolledDopri8(AbstractDopri8):
             y = fence(_stage_state(y0, dt, row[: len(stages)], stages))
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
-        end = y if self.wrap is None else self.wrap(y)
-        inside = dict(y0=y0, stages=dense_stages(jnp.stack([ravel(k) for k in stages])))
-        return end, error, inside, stages[-1], diffrax.RESULTS.successful
+        return y, jnp.stack([ravel(k) for k in stages]), stages[-1], error
 
 
-def _weighted(weights: Any, values: Any) -> Array:
-    total: Any = None
-    for weight, value in zip(weights, values, strict=True):
-        if weight != 0.0:
-            term = float(weight) * value
-            total = term if total is None else total + term
-    return total
+def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:
+    terms = [float(weight) * value for weight, value in zip(weights, values, strict=True) if weight != 0.0]
+    return functools.reduce(operator.add, terms)
 
 
-def _stage_state(y0: Any, dt: Array, weights: Any, stages: list[Any]) -> Any:
+def _stage_state(y0: Y, dt: Array, weights: np.ndarray, stages: Sequence[VF]) -> Y:
     return jax.tree.map(lambda y, *k: y + dt * _weighted(weights, k), y0, *stages)
 
 
-def _fenced(fence: Callable[[Any], Any], rates: Any, y: Any) -> Any:
+def _fenced(fence: _Fence, rates: VF, y: Y) -> VF:
     """Rates behind a fence, but those that are part of `y`, as velocities are, and have been behind one."""
     leaves, rest = jax.tree.flatten(rates)
     new = [k for k, leaf in enumerate(leaves) if not any(leaf is known for known in jax.tree.leaves(y))]
@@ -202,17 +220,17 @@ def _fenced(fence: Callable[[Any], Any], rates: Any, y: Any) -> Any:
     return jax.tree.unflatten(rest, leaves)
 
 
-def _fence_of(lanes: bool, one: Array) -> Callable[[Any], Any]:
+def _fence_of(lanes: bool, one: Array) -> _Fence:
     one = jax.lax.stop_gradient(one)
 
-    def through_memory(y: Any) -> Any:
+    def through_memory(y: Y) -> Y:
         leaves, rest = jax.tree.flatten(y)
         if any(jnp.ndim(leaf) for leaf in leaves):
             return jax.tree.map(lambda leaf: leaf / one.astype(leaf.dtype), y)
         kept = jnp.stack(leaves) * one.astype(leaves[0].dtype)
         return jax.tree.unflatten(rest, [kept[i] for i in range(len(leaves))])
 
-    def divided(y: Any) -> Any:
+    def divided(y: Y) -> Y:
         return jax.tree.map(lambda leaf: leaf / one.astype(leaf.dtype), y)
 
     return divided if lanes else through_memory

@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias, TypeVar
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from jaxvib.ode.batching import batch_last, flat_tangents, multi_tangent_jvp
 from jaxvib.ode.dopri8 import (
@@ -21,13 +21,22 @@ from jaxvib.ode.dopri8 import (
     ROWS,
     AbstractDopri8,
     Dopri8Interpolation,
-    dense_stages,
     linear_combination,
     ravel,
     unravel,
 )
+from jaxvib.ode.types import VF, Args, Mapped, RealScalarLike, Tangents, Terms, Y
 
 __all__ = ["LoopDopri8"]
+
+_Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, VF, Args, Terms]
+"""Of a step: the time at its start, its length, the state, its rates, the arguments of the equations, the equations."""
+
+_Step: TypeAlias = tuple[Y, Array, VF, Y]
+"""The state at the end of a step, the rates of its stages (stages, n), the last of them, the error of the state."""
+
+Numbers = TypeVar("Numbers", Array, tuple[Array, Array])
+"""A vector (n,), a batch of them (n, batch), or a vector and its tangents (n, directions)."""
 
 
 class LoopDopri8(AbstractDopri8):
@@ -51,26 +60,21 @@ class LoopDopri8(AbstractDopri8):
     tangents: bool = eqx.field(static=True, default=False)
 
     @property
-    def interpolation_cls(self) -> Callable[..., Any]:  # pyright: ignore
+    def interpolation_cls(self) -> Callable[..., Dopri8Interpolation]:  # pyright: ignore
         """The interpolation that finds states within a step."""
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
-    def step(
-        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
-    ) -> tuple[Any, Any, dict[str, Any], Any, Any]:
-        """As `UnrolledDopri8.step`."""
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
+    def advance(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args) -> _Step:
+        """See `AbstractDopri8.advance`."""
         advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.tangents else _advanced
-        end, stages, last, error = advance((t0, terms.contr(t0, t1), y0, first, args, terms))
-        end = end if self.wrap is None else self.wrap(end)
-        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
+        return advance((t0, terms.contr(t0, t1), y0, first, args, terms))
 
 
 def _linear_combination(inputs: tuple[Array, Array]) -> Array:
     return linear_combination(*inputs)
 
 
-def _linear_combination_jvp(inputs: tuple[Array, Array], tangents: Any) -> tuple[Array, Array]:
+def _linear_combination_jvp(inputs: tuple[Array, Array], tangents: tuple[Array | None, Array | None]) -> tuple[Array, Array]:
     (weights, stages), (dweights, dstages) = inputs, tangents
     parts = [] if dweights is None else [linear_combination(dweights.T, stages).T]
     parts += [] if dstages is None else [linear_combination(weights, dstages)]
@@ -85,9 +89,9 @@ def _linear_combination_batched(inputs: tuple[Array, Array], mapped: tuple[bool,
 class _BatchedInterpolation(Dopri8Interpolation):
     """As `Dopri8Interpolation`, with derivatives and batches of its own kind."""
 
-    combine: Callable[[tuple[Array, Any]], Array] = eqx.field(static=True)
+    combine: Callable[[tuple[Array, Array]], Array] = eqx.field(static=True)
 
-    def from_weights(self, weights: Array) -> Any:
+    def from_weights(self, weights: Array) -> Y:
         """As `Dopri8Interpolation.from_weights`."""
         return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.combine((weights, self.stages)), self.y0))
 
@@ -97,18 +101,18 @@ _WITHOUT_TANGENTS = functools.partial(_BatchedInterpolation, combine=_combinatio
 _WITH_TANGENTS = functools.partial(_BatchedInterpolation, combine=multi_tangent_jvp(_combination, _linear_combination_jvp))
 
 
-def _advance(inputs: Any) -> tuple[Any, Array, Any, Any]:
-    """The state at the end of a step, the rates of its stages (stages, n), the last of them, the error of the state."""
+def _advance(inputs: _Inputs) -> _Step:
+    """One step."""
     t0, dt, y0, first, args, terms = inputs
 
-    def rates(share: Array, y: Array) -> Array:
+    def rates(share: RealScalarLike, y: Array) -> Array:
         return ravel(terms.vf(t0 + share * dt, unravel(y, y0), args))
 
     end, stages, error = _stages(ravel(y0), ravel(first), rates, lambda total: dt * total, dt)
     return _unpack_result(end, stages, error, y0)
 
 
-def _advance_batched(inputs: Any, mapped: Any) -> Any:
+def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
     """`_advance` for a batch along a last axis."""
     t0, dt, y0, first, args, terms = inputs
     t0_too, dt_too, y0_too, first_too, *others_too = mapped
@@ -118,12 +122,12 @@ def _advance_batched(inputs: Any, mapped: Any) -> Any:
     like = jax.tree.map(lambda leaf, along: leaf[..., 0] if along else leaf, y0, y0_too)
     size = next(leaf.shape[-1] for leaf, along in zip(*map(jax.tree.leaves, (inputs, mapped)), strict=True) if along)
 
-    def whole(tree: Any, along: Any) -> Array:
+    def whole(tree: PyTree[Array], along: Mapped) -> Array:
         spread = lambda leaf, here: leaf if here else jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))  # noqa: E731
         return ravel(jax.tree.map(spread, tree, along), 1)
 
-    def rates(share: Array, y: Array) -> Array:
-        def rate(y: Any, moving: list[Array]) -> Any:
+    def rates(share: RealScalarLike, y: Array) -> Array:
+        def rate(y: Y, moving: list[Array]) -> VF:
             given = dict(zip(places, moving, strict=True))
             t0, dt, args, terms = jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
             return terms.vf(t0 + share * dt, y, args)
@@ -139,7 +143,7 @@ def _advance_batched(inputs: Any, mapped: Any) -> Any:
 _advanced = batch_last(_advance, _advance_batched)
 
 
-def _advance_jvp(inputs: Any, tangents: Any) -> tuple[Any, Any]:
+def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
     """`_advance` and the tangents of all that."""
     t0, dt, y0, first, args, terms = inputs
     dt0, ddt, dy0, dfirst, *others = tangents
@@ -147,16 +151,16 @@ def _advance_jvp(inputs: Any, tangents: Any) -> tuple[Any, Any]:
     moves = flat_tangents((dt0, ddt, *others), (t0, dt, args, terms))
     places = [k for k, move in enumerate(moves) if move is not None]
 
-    def field(share: Array, y: Any, moving: list[Array]) -> Any:
+    def field(share: RealScalarLike, y: Y, moving: list[Array]) -> VF:
         given = dict(zip(places, moving, strict=True))
         t0, dt, args, terms = jax.tree.unflatten(rest, [given.get(k, leaf) for k, leaf in enumerate(leaves)])
         return terms.vf(t0 + share * dt, y, args)
 
-    def rates(share: Array, pair: tuple[Array, Array]) -> tuple[Array, Array]:
+    def rates(share: RealScalarLike, pair: tuple[Array, Array]) -> tuple[Array, Array]:
         here = unravel(pair[0], y0), [leaves[k] for k in places]
-        along = unravel(pair[1], y0), [moves[k] for k in places]
+        along = unravel(pair[1], y0), [move for move in moves if move is not None]
 
-        def tangent(direction: Any) -> Any:
+        def tangent(direction: tuple[Y, list[Array]]) -> VF:
             return jax.jvp(lambda y, moving: field(share, y, moving), here, direction)[1]
 
         tangents = jax.vmap(tangent, in_axes=-1, out_axes=-1)(along)
@@ -166,7 +170,7 @@ def _advance_jvp(inputs: Any, tangents: Any) -> tuple[Any, Any]:
         total, change = pair
         return dt * total, dt * change if ddt is None else dt * change + total[:, None] * ddt[None, :]
 
-    def whole(tangents: Any) -> Array:
+    def whole(tangents: Tangents) -> Array:
         size = jax.tree.leaves((dt0, ddt, dy0, dfirst, others))[0].shape[-1]
         pairs = zip(flat_tangents(tangents, y0), jax.tree.leaves(y0), strict=True)
         return ravel([jnp.zeros((*leaf.shape, size), leaf.dtype) if dx is None else dx for dx, leaf in pairs], 1)
@@ -176,25 +180,31 @@ def _advance_jvp(inputs: Any, tangents: Any) -> tuple[Any, Any]:
     return _unpack_result(end, stages, error, y0), _unpack_result(dend, dstages, derror, y0)
 
 
-def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[[Any], Any], dt: Array) -> tuple[Any, Any, Any]:
+def _stages(
+    y0: Numbers,
+    first: Numbers,
+    rates: Callable[[RealScalarLike, Numbers], Numbers],
+    over_step: Callable[[Numbers], Numbers],
+    dt: Array,
+) -> tuple[Numbers, Numbers, Numbers]:
     """A step's end, stages and error; y0, first and the rates are trees of arrays (n, ...) alike."""
     count = len(ROWS)
     known = jax.tree.map(lambda k: jnp.zeros((count + 1, *k.shape), k.dtype).at[0].set(k), first)
     # A division by a 1 that the compiler cannot know keeps it from computing the state anew for each use of it.
     one = lax.stop_gradient(jnp.where(dt >= 0.0, 1.0, dt))
 
-    def weighted(known: Any, weights: Any) -> Any:
+    def weighted(known: Numbers, weights: Array | np.ndarray) -> Numbers:
         dense_stages = np.flatnonzero(weights) if isinstance(weights, np.ndarray) else range(len(weights))
         return over_step(jax.tree.map(lambda k: sum(weights[i].astype(k.dtype) * k[i] for i in dense_stages), known))
 
-    def moved(known: Any, weights: Any) -> Any:
+    def moved(known: Numbers, weights: Array | np.ndarray) -> Numbers:
         return jax.tree.map(lambda start, change: (start + change) / one, y0, weighted(known, weights))
 
-    def with_stage(j: Any, known: Any, share: Any, y: Any) -> Any:
+    def with_stage(j: Array | int, known: Numbers, share: RealScalarLike, y: Numbers) -> Numbers:
         new = rates(share, y)
         return jax.tree.map(lambda k, value: lax.dynamic_update_index_in_dim(k, value, j, 0), known, new)
 
-    def stage(j: Array, known: Any) -> Any:
+    def stage(j: Array, known: Numbers) -> Numbers:
         row, share = (jnp.asarray(table, one.dtype)[j] for table in (ROWS[:, : count - 1], NODES))
         return with_stage(j + 1, known, share, moved(known, row))
 
@@ -205,5 +215,5 @@ def _stages(y0: Any, first: Any, rates: Callable[..., Any], over_step: Callable[
     return end, known, weighted(known, ERROR)
 
 
-def _unpack_result(end: Array, stages: Array, error: Array, like: Any) -> tuple[Any, Array, Any, Any]:
+def _unpack_result(end: Array, stages: Array, error: Array, like: Y) -> _Step:
     return unravel(end, like), stages, unravel(stages[-1], like), unravel(error, like)

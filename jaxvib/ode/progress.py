@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import diffrax
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+from jaxvib.ode.types import RealScalarLike
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -43,7 +45,7 @@ class ProgressBar(diffrax.AbstractProgressMeter):
         """The progress shown last."""
         return jnp.array(0.0)
 
-    def step(self, state: Array, progress: Any) -> Array:
+    def step(self, state: Array, progress: RealScalarLike) -> Array:
         """Shows `progress` where it is a per cent further."""
         progress = jnp.asarray(progress, dtype=state.dtype)
         further = (progress - state > 0.01) | (progress >= 1.0)

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jaxtyping import PyTree
 
-from jaxvib.ode.control import WrappedController
+from jaxvib.ode.control import Decision, WrappedController
+from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Y
 from jaxvib.runtime.compat import no_host_checks
 
 __all__ = ["solve"]
+
+_Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm]
+"""What is differentiated: the end, the first step, the state at the start, the arguments, what is saved, the equations."""
+
+_Rest: TypeAlias = tuple[diffrax.AbstractSolver, int, diffrax.AbstractProgressMeter]
+"""What is not: the method, the largest number of steps, the progress meter."""
 
 
 def solve(
@@ -22,8 +30,8 @@ def solve(
     *,
     end: Array,
     first_step: Array | None,
-    y0: Any,
-    args: Any,
+    y0: Y,
+    args: Args,
     saveat: diffrax.SaveAt,
     controller: diffrax.AbstractStepSizeController,
     adjoint: diffrax.AbstractAdjoint | None,
@@ -52,7 +60,14 @@ def solve(
 
 
 @no_host_checks()
-def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: int, progress: Any) -> diffrax.Solution:
+def _solve(
+    inputs: _Inputs,
+    controller: diffrax.AbstractStepSizeController,
+    adjoint: diffrax.AbstractAdjoint,
+    solver: diffrax.AbstractSolver,
+    max_steps: int,
+    progress: diffrax.AbstractProgressMeter,
+) -> diffrax.Solution:
     end, first_step, y0, args, saveat, term = inputs
     return diffrax.diffeqsolve(
         term,
@@ -72,18 +87,20 @@ def _solve(inputs: Any, controller: Any, adjoint: Any, solver: Any, max_steps: i
 
 
 @eqx.filter_custom_vjp
-def _with_replay(inputs: Any, controller: Any, *rest: Any) -> diffrax.Solution:
+def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest) -> diffrax.Solution:
     return _solve(inputs, controller, diffrax.ForwardMode(), *rest)
 
 
 @_with_replay.def_fwd
-def _forward(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[diffrax.Solution, Array | None]:
+def _forward(
+    perturbed: PyTree[bool], inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest
+) -> tuple[diffrax.Solution, Array | None]:
     """The run, and the times at which its steps end."""
     if isinstance(controller, (diffrax.ConstantStepSize, diffrax.StepTo)):
         return _solve(inputs, controller, diffrax.ForwardMode(), *rest), None
-    *others, saveat, term = inputs
+    end, first_step, y0, args, saveat, term = inputs
     steps = diffrax.SubSaveAt(steps=True, fn=_nothing)
-    recording = (*others, diffrax.SaveAt(subs=[saveat.subs, steps]), term)
+    recording = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, steps]), term)
     solution = _solve(recording, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
     times = solution.ts[1]
@@ -91,10 +108,17 @@ def _forward(perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> tuple[
 
 
 @_with_replay.def_bwd
-def _backward(times: Array | None, cotangents: Any, perturbed: Any, inputs: Any, controller: Any, *rest: Any) -> Any:
+def _backward(
+    times: Array | None,
+    cotangents: PyTree[Array | None],
+    perturbed: PyTree[bool],
+    inputs: _Inputs,
+    controller: diffrax.AbstractStepSizeController,
+    *rest: *_Rest,
+) -> PyTree[Array | None]:
     differentiable, fixed = eqx.partition(inputs, perturbed)
 
-    def replayed(differentiable: Any) -> Any:
+    def replayed(differentiable: PyTree[Array | None]) -> PyTree[Array | None]:
         steps = controller if times is None else _recorded_steps(controller, times)
         adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(inputs[2], rest[1]))
         solution = _solve(eqx.combine(differentiable, fixed), steps, adjoint, *rest)
@@ -108,18 +132,18 @@ def _backward(times: Array | None, cotangents: Any, perturbed: Any, inputs: Any,
     return transposed(jax.tree.unflatten(rest, whole))[0]
 
 
-def _checkpoints(y0: Any, max_steps: int) -> int | None:
+def _checkpoints(y0: Y, max_steps: int) -> int | None:
     """As many as take 1 MiB, for steps between checkpoints are computed once more; not fewer than diffrax's own, None."""
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
     room = min(2**20 // (3 * size), max_steps)  # the state, its rates, and about as much of the loop's own
     return room if room > (2.0 * max_steps) ** 0.5 else None
 
 
-def _nothing(t: Any, y: Any, args: Any) -> None:
+def _nothing(t: RealScalarLike, y: Y, args: Args) -> None:
     return None
 
 
-def _recorded_steps(controller: Any, times: Array) -> Any:
+def _recorded_steps(controller: diffrax.AbstractStepSizeController, times: Array) -> diffrax.AbstractStepSizeController:
     """The controller that takes the recorded steps; one that steps onto `jump_ts` of the field still does."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, _recorded_steps(controller.controller, times))
@@ -129,17 +153,25 @@ def _recorded_steps(controller: Any, times: Array) -> Any:
 class RecordedSteps(WrappedController):
     """Takes the steps that end at `times` (max_steps,), in order."""
 
-    controller: Any
+    controller: diffrax.AbstractStepSizeController
     times: Array
 
-    def wrap(self, direction: Any) -> RecordedSteps:
+    def wrap(self, direction: IntScalarLike) -> RecordedSteps:
         return self
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+    def init(self, *_: object, **__: object) -> tuple[RealScalarLike, Array]:
         return self.times[0], jnp.asarray(0)
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
-    ) -> Any:
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        y1_candidate: Y,
+        args: Args,
+        y_error: Y,
+        error_order: RealScalarLike,
+        controller_state: Array,
+    ) -> Decision:
         done = controller_state + 1
         return jnp.asarray(True), t1, self.times[done], False, done, diffrax.RESULTS.successful

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import diffrax
 import jax
@@ -15,6 +15,8 @@ from jax import Array, lax
 
 from jaxvib.numerics.linalg import written_inverse
 from jaxvib.ode.batching import VECTOR
+from jaxvib.ode.interpolation import StepInterpolation
+from jaxvib.ode.types import Args, BoolScalarLike, RealScalarLike, StepResult, Terms
 
 __all__ = ["Rodas4"]
 
@@ -47,7 +49,7 @@ _DENSE = (
 )
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class _Interpolation(StepInterpolation):
     """The method's own continuous extension of order 3, a cubic in the share s of the step, `coefficients` c (2, n):
 
         y = (1 - s) y0 + s (y1 + (1 - s) (c_0 + s c_1))
@@ -55,19 +57,13 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     It uses no rates at the ends of a step, which stiffness makes useless.
     """
 
-    t0: Any
-    t1: Any
     y0: Array
     y1: Array
     coefficients: Array
 
-    def evaluate(self, t0: Any, t1: Any | None = None, left: bool = True) -> Array:
-        if t1 is not None:
-            return self.evaluate(t1) - self.evaluate(t0)
-        span = self.t1 - self.t0
-        s = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
-        inner = self.coefficients[0] + s * self.coefficients[1]
-        return (1.0 - s) * self.y0 + s * (self.y1 + (1.0 - s) * inner)
+    def at(self, share: Array, span: Array) -> Array:
+        inner = self.coefficients[0] + share * self.coefficients[1]
+        return (1.0 - share) * self.y0 + share * (self.y1 + (1.0 - share) * inner)
 
 
 class Rodas4(diffrax.AbstractAdaptiveSolver):
@@ -85,22 +81,31 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
 
-    def order(self, terms: Any) -> int:
+    def order(self, terms: Terms) -> int:
         """4."""
         return 4
 
-    def error_order(self, terms: Any) -> int:
+    def error_order(self, terms: Terms) -> int:
         """4: the error estimate falls with the fourth power of the step."""
         return 4
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Array, args: Any) -> None:
+    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Array, args: Args) -> None:
         """Nothing is carried from step to step."""
 
-    def func(self, terms: Any, t0: Any, y0: Array, args: Any) -> Array:
+    def func(self, terms: Terms, t0: RealScalarLike, y0: Array, args: Args) -> Array:
         """The vector field."""
         return terms.vf(t0, y0, args)
 
-    def step(self, terms: Any, t0: Any, t1: Any, y0: Array, args: Any, solver_state: None, made_jump: Any) -> Any:
+    def step(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Array,
+        args: Args,
+        solver_state: None,
+        made_jump: BoolScalarLike,
+    ) -> StepResult:
         """One step from t0 to t1."""
         h = t1 - t0
         # A padded step has no length; its inverse must not be a division by 0.
@@ -108,7 +113,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         jacobian, time_derivative = _jacobian(terms, t0, y0, args)
         inverse = written_inverse(per_step / _GAMMA * jnp.eye(y0.shape[0], dtype=y0.dtype) - jacobian)
 
-        def combine(weights: Any, stages: Array) -> Array:
+        def combine(weights: Array | Sequence[float], stages: Array) -> Array:
             return functools.reduce(operator.add, (weights[i] * stages[i] for i in range(len(_A) - 1)))
 
         def stage(i: Array, stages: Array) -> Array:
@@ -126,7 +131,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         return y1, stages[-1], dense, None, diffrax.RESULTS.successful
 
 
-def _jacobian(terms: Any, t: Array, y: Array, args: Any) -> tuple[Array, Array]:
+def _jacobian(terms: Terms, t: RealScalarLike, y: Array, args: Args) -> tuple[Array, Array]:
     """df/dy (n, n) and df/dt (n,), by forward mode with the tangents along a last axis, padded to whole vectors."""
     n = y.shape[0]
     directions = jnp.eye(n + 1, -(-(n + 1) // VECTOR) * VECTOR, dtype=y.dtype)

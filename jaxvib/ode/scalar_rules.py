@@ -5,32 +5,48 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import Primitive
 
-__all__ = ["NotScalarizable", "Scalars", "elementwise", "inlined", "is_known", "joined", "primitive_of", "rules", "to_scalars"]
+__all__ = [
+    "NotScalarizable",
+    "Scalar",
+    "Scalars",
+    "elementwise",
+    "inlined",
+    "is_known",
+    "joined",
+    "primitive_of",
+    "rules",
+    "to_scalars",
+]
 
-Scalars = np.ndarray
+Scalars: TypeAlias = np.ndarray
 """An array of dtype object: every entry is a traced scalar, or a NumPy scalar that the program itself holds as a constant."""
 
-Scalar = Any
+Scalar: TypeAlias = Any
 """A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`, as far as a type can say."""
 
-Rule = Callable[..., Scalars | list[Scalars]]
+Rule: TypeAlias = Callable[..., Scalars | list[Scalars]]
 """From the `Scalars` of an operation's arguments, and its parameters as keywords, to those of its results."""
+
+_Axes: TypeAlias = tuple[Sequence[int], Sequence[int]]
+_Function: TypeAlias = Callable[..., PyTree[Array]]
 
 
 class NotScalarizable(Exception):
     """The program has an operation that has no rule on scalars, or one that its rule does not fit."""
 
 
-def to_scalars(value: Any) -> Scalars:
+def to_scalars(value: ArrayLike) -> Scalars:
     """An array as an object array of its entries."""
     if isinstance(value, np.ndarray) and value.dtype == object:
         return value
@@ -82,7 +98,7 @@ def joined(x: Scalar) -> Scalar:
 def _by_parts(rule: Callable[..., Scalar]) -> Callable[..., Scalar]:
     """A rule for real numbers, applied to the real and to the imaginary parts."""
 
-    def apply(*x: Scalar, **params: Any) -> Scalar:
+    def apply(*x: Scalar, **params: object) -> Scalar:
         if not any(_is_complex(v) for v in x):
             return rule(*x, **params)
         real, imag = zip(*(_parts(v) for v in x), strict=True)
@@ -92,25 +108,25 @@ def _by_parts(rule: Callable[..., Scalar]) -> Callable[..., Scalar]:
 
 
 @_by_parts
-def _add(x: Scalar, y: Scalar, **_: Any) -> Scalar:
+def _add(x: Scalar, y: Scalar, **_: object) -> Scalar:
     if is_known(x) and is_known(y):
         return x + y
     return y if _is_zero(x) else x if _is_zero(y) else x + y
 
 
 @_by_parts
-def _sub(x: Scalar, y: Scalar, **_: Any) -> Scalar:
+def _sub(x: Scalar, y: Scalar, **_: object) -> Scalar:
     if is_known(x) and is_known(y):
         return x - y
     return _neg(y) if _is_zero(x) else x if _is_zero(y) else x - y
 
 
 @_by_parts
-def _neg(x: Scalar, **_: Any) -> Scalar:
+def _neg(x: Scalar, **_: object) -> Scalar:
     return -x
 
 
-def _mul(x: Scalar, y: Scalar, **_: Any) -> Scalar:
+def _mul(x: Scalar, y: Scalar, **_: object) -> Scalar:
     if _is_complex(x) or _is_complex(y):
         (a, b), (c, d) = _parts(x), _parts(y)
         return ComplexParts(_sub(_mul(a, c), _mul(b, d)), _add(_mul(a, d), _mul(b, c)))
@@ -121,7 +137,7 @@ def _mul(x: Scalar, y: Scalar, **_: Any) -> Scalar:
     return y if is_known(x) and x == 1 else x if is_known(y) and y == 1 else x * y
 
 
-def _div(x: Scalar, y: Scalar, **_: Any) -> Scalar:
+def _div(x: Scalar, y: Scalar, **_: object) -> Scalar:
     if _is_complex(x) or _is_complex(y):
         (a, b), (c, d) = _parts(x), _parts(y)
         if not _is_zero(d):
@@ -140,11 +156,11 @@ def _power(x: Scalar, *, y: int) -> Scalar:
     return lax.integer_pow(jnp.asarray(joined(x)), y)
 
 
-def _convert(x: Scalar, *, new_dtype: Any, **_: Any) -> Scalar:
+def _convert(x: Scalar, *, new_dtype: DTypeLike, **_: object) -> Scalar:
     if is_known(x):
         return np.asarray(x, new_dtype)[()]
     if jnp.issubdtype(new_dtype, jnp.complexfloating):
-        part = np.empty((), new_dtype).real.dtype
+        part = jnp.finfo(new_dtype).dtype
         return ComplexParts(*(_convert(v, new_dtype=part) for v in _parts(x)))
     return lax.convert_element_type(joined(x), new_dtype)
 
@@ -168,7 +184,7 @@ def _bound(primitive: Primitive) -> Callable[..., Scalar]:
 def elementwise(rule: Callable[..., Scalar]) -> Rule:
     """A rule for scalars as one for arrays of them; an array of one entry stands for one of any shape, as `clamp` has it."""
 
-    def apply(*given: Scalars, **params: Any) -> Scalars:
+    def apply(*given: Scalars, **params: object) -> Scalars:
         whole = np.broadcast_arrays(*given) if len(given) > 1 else list(given)
         out = np.empty(whole[0].shape, dtype=object)
         for index in np.ndindex(*out.shape):
@@ -178,7 +194,7 @@ def elementwise(rule: Callable[..., Scalar]) -> Rule:
     return apply
 
 
-def _broadcast_in_dim(x: Scalars, *, shape: Sequence[int], broadcast_dimensions: Sequence[int], **_: Any) -> Scalars:
+def _broadcast_in_dim(x: Scalars, *, shape: Sequence[int], broadcast_dimensions: Sequence[int], **_: object) -> Scalars:
     whole = [1] * len(shape)
     for axis, place in enumerate(broadcast_dimensions):
         whole[place] = x.shape[axis]
@@ -186,7 +202,7 @@ def _broadcast_in_dim(x: Scalars, *, shape: Sequence[int], broadcast_dimensions:
 
 
 def _reduce(combine: Callable[[Scalar, Scalar], Scalar]) -> Rule:
-    def reduce(x: Scalars, *, axes: Sequence[int], **_: Any) -> Scalars:
+    def reduce(x: Scalars, *, axes: Sequence[int], **_: object) -> Scalars:
         moved = np.moveaxis(x, axes, range(len(axes))).reshape(-1, *np.delete(x.shape, axes).astype(int))
         out = np.empty(moved.shape[1:], dtype=object)
         for index in np.ndindex(*out.shape):
@@ -199,7 +215,7 @@ def _reduce(combine: Callable[[Scalar, Scalar], Scalar]) -> Rule:
     return reduce
 
 
-def _dot_general(x: Scalars, y: Scalars, *, dimension_numbers: Any, **_: Any) -> Scalars:
+def _dot_general(x: Scalars, y: Scalars, *, dimension_numbers: tuple[_Axes, _Axes], **_: object) -> Scalars:
     (over_x, over_y), batch = dimension_numbers
     if any(batch):
         raise NotScalarizable("dot_general with batch dimensions")
@@ -223,12 +239,12 @@ def _dynamic_slice(x: Scalars, *starts: Scalars, slice_sizes: Sequence[int]) -> 
     return x[tuple(slice(place, place + size) for place, size in zip(places, slice_sizes, strict=True))]
 
 
-def _slice(x: Scalars, *, start_indices: Any, limit_indices: Any, strides: Any) -> Scalars:
+def _slice(x: Scalars, *, start_indices: Sequence[int], limit_indices: Sequence[int], strides: Sequence[int] | None) -> Scalars:
     strides = strides or [1] * x.ndim
     return x[tuple(slice(*cut) for cut in zip(start_indices, limit_indices, strides, strict=True))]
 
 
-def _iota(*, dtype: Any, shape: Sequence[int], dimension: int, **_: Any) -> Scalars:
+def _iota(*, dtype: DTypeLike, shape: Sequence[int], dimension: int, **_: object) -> Scalars:
     return to_scalars(np.indices(shape)[dimension].astype(dtype))
 
 
@@ -237,7 +253,7 @@ def _unstack(x: Scalars, *, axis: int) -> list[Scalars]:
     return [moved[k, ...] for k in range(moved.shape[0])]
 
 
-def _pad(x: Scalars, value: Scalars, *, padding_config: Any) -> Scalars:
+def _pad(x: Scalars, value: Scalars, *, padding_config: Sequence[tuple[int, int, int]]) -> Scalars:
     low, high, inner = zip(*padding_config, strict=True)
     if min(low) < 0 or min(high) < 0 or any(inner):
         raise NotScalarizable("a pad that cuts off, or fills between entries")
@@ -247,7 +263,7 @@ def _pad(x: Scalars, value: Scalars, *, padding_config: Any) -> Scalars:
     return out
 
 
-def primitive_of(function: Callable[..., Any], *arguments: Any) -> Primitive:
+def primitive_of(function: _Function, *arguments: ArrayLike) -> Primitive:
     """The one primitive that a public function of JAX is made of.
 
     **Raises** `NotScalarizable` where it is made of several, or of none.
@@ -272,7 +288,7 @@ def rules() -> dict[Primitive, Rule]:
     """
     x, v, yes = np.float32(1.0), np.ones((2, 2), np.float32), np.True_
     z = np.complex64(1.0)
-    maps: list[tuple[Callable[..., Any], tuple[Any, ...], Callable[..., Scalar]]] = [
+    maps: list[tuple[_Function, tuple[ArrayLike, ...], Callable[..., Scalar]]] = [
         (lax.add, (x, x), _add),
         # JAX's sum of cotangents.
         (lambda y: jax.linear_transpose(lambda x: (x, x), x)((y, y))[0], (x,), _add),
@@ -297,7 +313,7 @@ def rules() -> dict[Primitive, Rule]:
     bound = [(f, (x,)) for f in (*one, lax.is_finite)] + [(f, (x, x)) for f in two]
     bound += [(f, (yes, yes)) for f in (lax.bitwise_and, lax.bitwise_or)]
     bound += [(lax.bitwise_not, (yes,)), (lax.clamp, (x, x, x))]
-    whole: list[tuple[Callable[..., Any], tuple[Any, ...], Rule]] = [
+    whole: list[tuple[_Function, tuple[ArrayLike, ...], Rule]] = [
         (lambda v: lax.broadcast_in_dim(v, (2, 2, 2), (0, 1)), (v,), _broadcast_in_dim),
         (lambda v: lax.reshape(v, (4,)), (v,), lambda x, *, new_sizes, **_: x.reshape(new_sizes)),
         (lambda v: lax.squeeze(v, (0,)), (v[:1],), lambda x, *, dimensions: np.squeeze(x, axis=tuple(dimensions))),

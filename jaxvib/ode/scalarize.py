@@ -9,19 +9,38 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
-from jaxvib.ode.scalar_rules import NotScalarizable, Scalars, elementwise, inlined, is_known, joined, primitive_of, rules
+from jaxvib.ode.scalar_rules import (
+    NotScalarizable,
+    Scalar,
+    Scalars,
+    elementwise,
+    inlined,
+    is_known,
+    joined,
+    primitive_of,
+    rules,
+)
 from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
 from jaxvib.ode.sincos import sine_and_cosine
 from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
 
 __all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", "scalarized_vmap", "scalars_of"]
+
+X = TypeVar("X")
+Shared = TypeVar("Shared")
+Out = TypeVar("Out")
+
+_Sines: TypeAlias = dict[int, tuple[Scalar, tuple[Array, Array]]]
+"""By the `id` of an angle: the angle, which keeps the id its own, its sine and cosine."""
 
 MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
 """With more numbers in a state, or operations on them, equations on scalars take too long to compile for what they save."""
@@ -33,7 +52,7 @@ _MAX_RECOMPUTED = 8
 """A value used more than once that takes more operations than these is fenced: see `_fenced`."""
 
 
-def scalarize(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
+def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
     """`function`, traced for arguments of these shapes, on single numbers.
 
     **Returns** a function of the same arguments in which every array is an object array of scalars; so is what it returns.
@@ -52,7 +71,7 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Callable[..., An
     structure = jax.tree.structure(out)
     _require_rules(closed.jaxpr)
 
-    def run(*given: Any) -> Any:
+    def run(*given: PyTree[Scalars]) -> PyTree[Scalars]:
         leaves = jax.tree.leaves(given, is_leaf=lambda x: isinstance(x, np.ndarray))
         try:
             found = _run(closed.jaxpr, closed.consts, [_to_scalars(leaf) for leaf in leaves], {})
@@ -65,7 +84,7 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Callable[..., An
     return run
 
 
-def scalarized_program(function: Callable[..., Any], *arguments: Any) -> ClosedJaxpr | None:
+def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
     """`scalarize`, traced: a program that takes the numbers of all arguments and gives those of the result, in order.
 
     **Returns** None where an operation has no rule on scalars, where there are too many of them, or where this version of JAX
@@ -97,12 +116,12 @@ def scalarized_program(function: Callable[..., Any], *arguments: Any) -> ClosedJ
     return program if len(program.jaxpr.eqns) <= _MAX_OPERATIONS else None
 
 
-def scalars_of(tree: Any) -> list[Array]:
+def scalars_of(tree: PyTree[Array]) -> list[Array]:
     """All numbers of a tree of arrays, in order."""
     return [leaf[index] for leaf in jax.tree.leaves(tree) for index in np.ndindex(*leaf.shape)]
 
 
-def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared], Out]:
     """`jax.vmap(function, in_axes=(0, None))`, on single numbers where `function` is small enough; for values only.
 
     The program on scalars is fenced, so that its time grows with the number of its operations whatever they are, and it goes
@@ -116,7 +135,7 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
     [3.0, 6.0]
     """
 
-    def run(batch: Any, shared: Any) -> Any:
+    def run(batch: X, shared: Shared) -> Out:
         one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), batch)
         size = sum(leaf.size for leaf in jax.tree.leaves(one))
         shared = jax.tree.map(jnp.asarray, shared)
@@ -129,7 +148,7 @@ def scalarized_vmap(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
         shapes, structure = jax.tree.flatten(jax.eval_shape(function, one, shared))
         constants = scalars_of(shared)
 
-        def single(x: Any) -> Array:
+        def single(x: X) -> Array:
             return jnp.stack(_fenced(program, [*scalars_of(x), *constants]))
 
         count = jax.tree.leaves(batch)[0].shape[0]
@@ -156,7 +175,7 @@ def _fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
     one = lax.stop_gradient(jnp.where(jnp.abs(first) < jnp.inf, jnp.ones_like(first), first))
     cost: dict[int, int] = {}
 
-    def run(jaxpr: Jaxpr, consts: Sequence[Any], given: Sequence[Any]) -> list[Any]:
+    def run(jaxpr: Jaxpr, consts: Sequence[Array], given: Sequence[Array]) -> list[Array]:
         uses: dict[Var, int] = {}
         for atom in (*(a for equation in jaxpr.eqns for a in equation.invars), *jaxpr.outvars):
             if isinstance(atom, Var):
@@ -181,7 +200,7 @@ def _fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
             known.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    kept: list[Any] = []
+    kept: list[Array] = []
     return run(program.jaxpr, program.consts, arguments)
 
 
@@ -199,12 +218,12 @@ def _require_rules(jaxpr: Jaxpr) -> None:
             raise NotScalarizable(equation.primitive.name)
 
 
-def _inner(equation: JaxprEqn) -> tuple[Jaxpr, Sequence[Any]]:
+def _inner(equation: JaxprEqn) -> tuple[Jaxpr, Sequence[ArrayLike]]:
     inner = equation.params["jaxpr"]
     return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
 
-def _run(jaxpr: Jaxpr, consts: Sequence[Any], arguments: list[Scalars], sines: dict[int, Any]) -> list[Scalars]:
+def _run(jaxpr: Jaxpr, consts: Sequence[ArrayLike], arguments: list[Scalars], sines: _Sines) -> list[Scalars]:
     known: dict[Var, Scalars] = {}
 
     def read(atom: Var | Literal) -> Scalars:
@@ -237,7 +256,7 @@ def _checked(result: Scalars, aval: Any, name: str) -> Scalars:
     return result
 
 
-def _of_angle(x: Any, place: int, sines: dict[int, Any]) -> Any:
+def _of_angle(x: Scalar, place: int, sines: _Sines) -> Scalar:
     """The sine or cosine of an angle, both computed once however often a program asks."""
     if is_known(x):
         return np.cos(x) if place else np.sin(x)

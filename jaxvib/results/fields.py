@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypedDict, TypeGuard, TypeVar
 
 import equinox as eqx
 import jax
@@ -16,16 +16,50 @@ from jaxvib.results.status import is_status, sentence, status_names
 
 if TYPE_CHECKING:
     import xarray
+    from _typeshed import DataclassInstance
 
 __all__ = ["as_dict", "as_text", "in_unit", "is_named_tuple", "part", "to_xarray"]
 
 EACH = "*"
 """Stands for the `outer_axes` of the class that a field is in."""
 
-Metadata = Mapping[str, Any]
+T = TypeVar("T")
+
+Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
+"""What JSON can hold."""
+
+Labels: TypeAlias = Mapping[str, Sequence[str]]
+"""Labels along axes, by the axis's name; of "unit" those of the coordinates."""
+
+Column: TypeAlias = tuple[str, tuple[str, ...], np.ndarray, str]
+"""The name of an array, of its axes, its values, its unit."""
 
 
-def in_unit(unit: str, *axes: str, name: str = "") -> dict[str, Any]:
+class InUnit(TypedDict):
+    """See `in_unit`."""
+
+    unit: str
+    axes: tuple[str, ...]
+    name: str
+
+
+class Part(TypedDict):
+    """See `part`."""
+
+    part: tuple[str, ...]
+    prefix: str
+    fields: Mapping[str, InUnit] | None
+
+
+class AsText(TypedDict):
+    """See `as_text`."""
+
+    write: Callable[[Any], str]
+    read: Callable[[str], object]
+    labels: Callable[[Any], Labels]
+
+
+def in_unit(unit: str, *axes: str, name: str = "") -> InUnit:
     """Metadata of a field that holds numbers: their unit ("" for none) and the names of their axes in order.
 
     **Arguments**: `unit`, of numbers that are a length for one coordinate and an angle for another "m or rad" and so on;
@@ -37,7 +71,7 @@ def in_unit(unit: str, *axes: str, name: str = "") -> dict[str, Any]:
     return {"unit": unit, "axes": axes, "name": name}
 
 
-def part(*axes: str, prefix: str = "", fields: Mapping[str, Metadata] | None = None) -> dict[str, Any]:
+def part(*axes: str, prefix: str = "", fields: Mapping[str, InUnit] | None = None) -> Part:
     """Metadata of a field that holds another tree of numbers, each of them with these axes before its own.
 
     **Arguments**: `prefix` of its names in labelled data; `fields` the metadata of its fields where its class has none.
@@ -45,33 +79,31 @@ def part(*axes: str, prefix: str = "", fields: Mapping[str, Metadata] | None = N
     return {"part": axes, "prefix": prefix, "fields": fields}
 
 
-def as_text(
-    write: Callable[[Any], str], read: Callable[[str], Any], labels: Callable[[Any], Mapping[str, Sequence[Any]]]
-) -> dict[str, Any]:
+def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callable[[T], Labels]) -> AsText:
     """Metadata of a field that files and plain data hold as text; `labels` of axes that it knows, by the axis's name."""
     return {"write": write, "read": read, "labels": labels}
 
 
-def is_named_tuple(value: Any) -> bool:
+def is_named_tuple(value: object) -> TypeGuard[NamedTuple]:
     """Whether a value is a tuple whose entries have names."""
     return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
-def as_dict(result: eqx.Module) -> dict[str, Any]:
+def as_dict(result: eqx.Module) -> dict[str, Plain]:
     """A result as plain Python values, ready for JSON: SI units, statuses by name, None for what is no finite number.
 
     Complex numbers are pairs [real, imaginary]. Beside the fields stand the `status` and the `message`.
     """
     status = getattr(result, "status", None)
     head = {} if status is None else {"status": _plain(status), "message": sentence(status)}
-    return {**head, **_plain(result)}
+    return {**head, **_plain_fields(result)}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Plain:
     if is_status(value):
         return status_names(value).tolist()
-    if dataclasses.is_dataclass(value):
-        return {field.name: _plain_field(field, getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain_fields(value)
     if is_named_tuple(value):
         return {name: _plain(getattr(value, name)) for name in value._fields}
     if isinstance(value, Mapping):
@@ -82,11 +114,16 @@ def _plain(value: Any) -> Any:
         return [_plain(entry) for entry in value]
     if isinstance(value, complex):
         return [_plain(value.real), _plain(value.imag)]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    raise TypeError(f"{value!r} is no plain value, and no array")
 
 
-def _plain_field(field: dataclasses.Field[Any], value: Any) -> Any:
-    return field.metadata["write"](value) if "write" in field.metadata else _plain(value)
+def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
+    found = {field.name: (field.metadata, getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return {name: known["write"](part) if "write" in known else _plain(part) for name, (known, part) in found.items()}
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:
@@ -116,9 +153,9 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
     return data if status is None else data.assign_attrs(result=type(result).__name__, message=sentence(status))
 
 
-def _labels(result: Any) -> dict[str, Sequence[Any]]:
+def _labels(result: eqx.Module) -> Labels:
     """Labels of axes by the axis's name, of "unit" those of the coordinates."""
-    labels: dict[str, Sequence[Any]] = {}
+    labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):
         if "labels" in field.metadata and getattr(result, field.name) is not None:
             labels |= field.metadata["labels"](getattr(result, field.name))
@@ -132,11 +169,8 @@ def _one_unit(unit: str, units: Sequence[str]) -> str:
     return choices[("m", "rad").index(units[0])] if alike else unit
 
 
-Column = tuple[str, tuple[str, ...], np.ndarray, str]
-
-
 def _columns(
-    tree: Any, fields: Mapping[str, Metadata] | None, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]
+    tree: eqx.Module, fields: Mapping[str, InUnit] | None, prefix: str, outer: tuple[str, ...], renamed: Mapping[str, str]
 ) -> Iterator[Column]:
     """Every array of a tree: its name, its axes, its values, its unit."""
     outer_axes = getattr(tree, "outer_axes", ())
@@ -163,7 +197,7 @@ def _columns(
             yield from _column(prefix + field.name, axes((EACH,)), value, "")
 
 
-def _column(name: str, axes: tuple[str, ...], value: Any, unit: str) -> Iterator[Column]:
+def _column(name: str, axes: tuple[str, ...], value: object, unit: str) -> Iterator[Column]:
     if is_status(value):
         yield name, axes, status_names(value), ""
     elif is_named_tuple(value):

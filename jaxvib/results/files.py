@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
-from jaxvib.results.fields import is_named_tuple
+from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
 
@@ -75,7 +75,7 @@ def load(path: str | Path) -> Any:
         raise InputError("path", f"is {str(path)!r}; it is no result written by save") from error
 
 
-def _encoded(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
     """A value as JSON can hold it, its arrays put among `arrays` and named."""
     if value is None or (isinstance(value, (bool, int, float, str)) and not isinstance(value, np.generic)):
         return value
@@ -98,7 +98,7 @@ def _encoded(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     raise InputError("result", f"holds {value!r}, which no file can hold; save what it was made from")
 
 
-def _encoded_field(field: dataclasses.Field[Any], owner: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np.ndarray]) -> Plain:
     value = getattr(owner, field.name)
     return {"text": field.metadata["write"](value)} if "write" in field.metadata else _encoded(value, arrays)
 
@@ -113,7 +113,7 @@ def _class(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
-def _decoded(value: Any, archive: Any, metadata: Mapping[str, Any] | None = None) -> Any:
+def _decoded(value: Any, archive: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> Any:
     """The value that `_encoded` made this of."""
     if not isinstance(value, dict):
         return value
@@ -137,7 +137,7 @@ def _decoded(value: Any, archive: Any, metadata: Mapping[str, Any] | None = None
     return {"tuple": tuple, "list": list}[name](_decoded(entry, archive) for entry in entries)
 
 
-def _rebuilt(kind: type, fields: Mapping[str, Any], archive: Any) -> Any:
+def _rebuilt(kind: type, fields: Mapping[str, Plain], archive: Mapping[str, np.ndarray]) -> object:
     """An object with these fields as they were: a constructor would read units and check values once more."""
     whole = object.__new__(kind)
     for field in dataclasses.fields(kind):
@@ -148,7 +148,7 @@ def _rebuilt(kind: type, fields: Mapping[str, Any], archive: Any) -> Any:
     return whole
 
 
-def _found(name: str) -> Any:
+def _found(name: str) -> type:
     """The class of that name, where it was when the file was written, or else among the public names."""
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():

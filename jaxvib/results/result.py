@@ -34,7 +34,7 @@ class Result(eqx.Module):
     if TYPE_CHECKING:  # to a type checker an abstract field is one that no constructor takes
         status: Any = eqx.field(init=False)
     else:
-        status: eqx.AbstractVar[Any]
+        status: eqx.AbstractVar[eqx.Enumeration]
 
     @property
     @final
@@ -54,10 +54,10 @@ class Result(eqx.Module):
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """What came out, as a matplotlib figure."""
+        """What came out, as a matplotlib figure. Where it has one panel, `plot(ax=axes)` draws onto axes that are there."""
 
     @final
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> "dict[str, fields.Plain]":
         """The result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`."""
         return fields.as_dict(self)
 

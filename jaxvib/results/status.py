@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeGuard, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError
-from jaxvib.runtime.compat import enumeration_names, enumeration_of, is_tracer
+from jaxvib.runtime.compat import enumeration_names, enumeration_of, traced
 
 __all__ = [
     "Computed",
@@ -23,18 +23,21 @@ __all__ = [
 ]
 
 
+Status = TypeVar("Status", bound=eqx.Enumeration)
+
+
 class Computed(eqx.Enumeration):
     """The status of a result that cannot fail once its input is accepted."""
 
     done = "the answer was computed"
 
 
-def is_status(value: Any) -> bool:
+def is_status(value: object) -> TypeGuard[eqx.Enumeration]:
     """Whether a value is a member of an enumeration, or an array of them."""
     return isinstance(value, type(Computed.done))
 
 
-def member(enumeration: Any, names: Any) -> Any:
+def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
     """The member of that name; of an array of names (any shape) as many, on JAX's device.
 
     >>> bool(member(Computed, "done") == Computed.done)
@@ -45,18 +48,18 @@ def member(enumeration: Any, names: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(getattr(enumeration, next(iter(of_name)))), [numbers])
 
 
-def status_names(status: Any) -> np.ndarray:
+def status_names(status: eqx.Enumeration) -> np.ndarray:
     """The name of each member in a status of any shape, an array of text of that shape.
 
     **Raises** `TypeError` for a status that is not known yet, under a JAX transformation.
     """
     (numbers,) = jax.tree.leaves(status)
-    if is_tracer(numbers):
+    if traced(numbers):
         raise TypeError("a status under a JAX transformation has no name yet; look at it outside")
     return np.asarray(enumeration_names(enumeration_of(status)))[np.asarray(numbers)]
 
 
-def status_name(status: Any) -> str:
+def status_name(status: eqx.Enumeration) -> str:
     """The name of a single status.
 
     >>> status_name(Computed.done)
@@ -65,7 +68,7 @@ def status_name(status: Any) -> str:
     return str(status_names(status))
 
 
-def sentence(status: Any) -> str:
+def sentence(status: eqx.Enumeration) -> str:
     """What a status says, a sentence; of several, each sentence once with how many say it.
 
     >>> sentence(Computed.done)
@@ -80,6 +83,6 @@ def sentence(status: Any) -> str:
     return "; ".join(parts) or "there is none"
 
 
-def failure(status: Any, hint: str = "") -> ComputationError:
+def failure(status: eqx.Enumeration, hint: str = "") -> ComputationError:
     """The error to raise for a single status: its name, its sentence, and a `hint` that follows the sentence."""
     return ComputationError(status_name(status), sentence(status) + hint)

@@ -16,9 +16,12 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import jax
+
+if TYPE_CHECKING:
+    import equinox as eqx
 
 __all__ = [
     "HAS_JAXPRS",
@@ -33,14 +36,17 @@ __all__ = [
     "custom_vmap",
     "enumeration_names",
     "enumeration_of",
-    "is_tracer",
     "jaxpr_as_fun",
     "no_host_checks",
+    "traced",
     "user_folder",
 ]
 
 _TESTED = ((0, 10), (0, 12))
-"""The first and the last version of jaxlib (major, minor) that knows all flags of `prepare_cpu`."""
+"""The first and the last version of jaxlib (major, minor) of which it is known which flags of `prepare_cpu` it has."""
+
+_GONE = {"--xla_cpu_use_fusion_emitters": (0, 11)}
+"""The flags of `prepare_cpu` that jaxlib has no more, each with the first version without it."""
 
 try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
@@ -53,27 +59,31 @@ except ImportError:
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
 
 
-class _PlainVmap:
+Out = TypeVar("Out")
+Rule = TypeVar("Rule", bound=Callable)
+
+
+class _PlainVmap(Generic[Out]):
     """In place of `jax.custom_batching.custom_vmap`: JAX's own rule, by which the function is mapped operation by operation."""
 
-    def __init__(self, function: Callable[..., Any]):
+    def __init__(self, function: Callable[..., Out]):
         self.function = function
 
-    def def_vmap(self, rule: Callable[..., Any]) -> Callable[..., Any]:
+    def def_vmap(self, rule: Rule) -> Rule:
         return rule
 
-    def __call__(self, *args: Any) -> Any:
+    def __call__(self, *args: object) -> Out:
         return self.function(*args)
 
 
-custom_vmap: Any = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
+custom_vmap: type[_PlainVmap] = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
 """A function with a rule of its own for `vmap`. Without it the results are the same, and slower."""
 
 
-def is_tracer(value: object) -> bool:
+def traced(value: object) -> bool:
     """Whether JAX is transforming the computation that `value` is part of, so that it has no number yet.
 
-    >>> is_tracer(1.0)
+    >>> traced(1.0)
     False
     """
     tracer = getattr(getattr(jax, "core", None), "Tracer", None)
@@ -101,7 +111,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
     version = importlib.metadata.version("jaxlib")
     number = tuple(int(part) for part in version.split(".")[:2])
     if _TESTED[0] <= number <= _TESTED[1]:
-        return flags
+        return [flag for flag in flags if number < _GONE.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
     answers: dict[str, bool] = {}
     with contextlib.suppress(OSError, ValueError):
@@ -137,7 +147,7 @@ def no_host_checks() -> Iterator[None]:
         yield
         return
 
-    def to_nan(*args: Any, on_error: str) -> Any:
+    def to_nan(*args: object, on_error: str) -> object:
         # Not the compiled one: what it is traced to would be found again outside.
         return plain(*args, on_error="nan" if on_error == "default" else on_error)
 
@@ -148,7 +158,7 @@ def no_host_checks() -> Iterator[None]:
         setattr(errors, "branched_error_if_impl_jit", compiled)  # noqa: B010
 
 
-def enumeration_of(item: object) -> Any:
+def enumeration_of(item: object) -> type[eqx.Enumeration]:
     """The `equinox.Enumeration` that a member, or an array of members, is of. Without its attribute, what its text names."""
     found = getattr(item, "_enumeration", None)
     if found is None:
@@ -157,7 +167,7 @@ def enumeration_of(item: object) -> Any:
     return found
 
 
-def enumeration_names(enumeration: Any) -> tuple[str, ...]:
+def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
     """The names of the members in the order of their numbers. Without Equinox's table of them, those in its source."""
     known = getattr(enumeration, "_name_to_item", None)
     if known is not None:

@@ -15,7 +15,7 @@ import itertools
 import json
 import os
 import tempfile
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -26,7 +26,7 @@ import numpy as np
 from jax import Array, export
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import is_tracer, no_host_checks
+from jaxvib.runtime.compat import no_host_checks, traced
 from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Undescribable, describe, rebuild
@@ -66,7 +66,7 @@ class _CachedFunction(Generic[P, T]):
         leaves, treedef = jax.tree.flatten((args, kwargs))
         leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         folder = program_folder()
-        if folder is None or any(is_tracer(leaf) for leaf in leaves) or _is_debugging():
+        if folder is None or any(traced(leaf) for leaf in leaves) or _is_debugging():
             return self.jitted(*args, **kwargs)
         asked = (folder, treedef, tuple(map(_leaf_key, leaves)), _options())
         try:
@@ -80,7 +80,7 @@ class _CachedFunction(Generic[P, T]):
             return self.jitted(*args, **kwargs)
         return program(leaf for leaf in leaves if eqx.is_array(leaf))
 
-    def _program(self, folder: Path, leaves: list[Any], treedef: Any) -> _Program | None:
+    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable) -> _Program | None:
         """From the disk, or traced and written there; None where this call has no program that could be stored."""
         try:
             path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
@@ -88,7 +88,7 @@ class _CachedFunction(Generic[P, T]):
         except Undescribable:
             return None
 
-    def _key(self, leaves: list[Any], treedef: Any) -> str:
+    def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
             if leaf.sharding.device_set != {jax.devices()[0]}:
                 raise Undescribable("an array is not on the first device")
@@ -98,7 +98,7 @@ class _CachedFunction(Generic[P, T]):
         name = f"{self.function.__module__}:{self.function.__qualname__}"
         return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
 
-    def _write(self, path: Path, leaves: list[Any], treedef: Any) -> _Program:
+    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable) -> _Program:
         structure: list[Description] = []
         # Not the arrays of this call, which would live as long as the program.
         static = [_Slot(k) if eqx.is_array(leaf) else leaf for k, leaf in enumerate(leaves)]
@@ -137,8 +137,8 @@ class _Program:
     """A function of all arrays of the arguments, and what its arrays are put into."""
 
     run: Callable[..., list[Array]]
-    leaves: list[Any]
-    treedef: Any
+    leaves: Sequence[object]
+    treedef: Hashable
 
     @classmethod
     def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
@@ -189,8 +189,8 @@ def _compiled(path: Path, exported: export.Exported) -> Callable[..., list[Array
     return jax.jit(run)
 
 
-def _leaf_key(leaf: Any) -> Hashable:
-    if eqx.is_array(leaf):
+def _leaf_key(leaf: Array | Hashable) -> Hashable:
+    if isinstance(leaf, jax.Array):
         return jax.typeof(leaf), leaf.sharding
     return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
 

@@ -28,7 +28,7 @@ class Undescribable(Exception):
     """A value that has no description: a function without a name, or of a class that is not of a known package."""
 
 
-def describe(value: Any, array: Callable[[Any], Description]) -> Description:
+def describe(value: object, array: Callable[[Any], Description]) -> Description:
     """The description of a tree; `array` gives that of an array in it.
 
     **Raises** `Undescribable`.
@@ -56,7 +56,7 @@ def describe(value: Any, array: Callable[[Any], Description]) -> Description:
         raise Undescribable(str(error)) from error
 
 
-def rebuild(description: Description, arrays: Iterator[Any]) -> Any:
+def rebuild(description: Description, arrays: Iterator[object]) -> Any:
     """The tree of a description; its arrays are taken from `arrays` in the order in which `describe` met them.
 
     **Raises** `Undescribable` for a description that `describe` cannot have given.
@@ -90,7 +90,7 @@ def _fields(kind: type) -> list[str]:
     raise Undescribable(f"{kind} is no dataclass")
 
 
-def _instance(kind: Any, values: list[Any]) -> Any:
+def _instance(kind: object, values: list[object]) -> object:
     """An object with these values in its fields; its constructor, which may convert and check them, is not called."""
     if not isinstance(kind, type):
         raise Undescribable(f"{kind} is no class")
@@ -103,7 +103,7 @@ def _instance(kind: Any, values: list[Any]) -> Any:
     return made
 
 
-def _name(value: Any) -> str:
+def _name(value: object) -> str:
     """`module:name` of a class or function that can be found by it."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
     if _named(name) is not value:
@@ -111,7 +111,7 @@ def _name(value: Any) -> str:
     return name
 
 
-def _named(name: str) -> Any:
+def _named(name: str) -> object:
     module, _, path = name.partition(":")
     if module.partition(".")[0] not in KNOWN_PACKAGES:
         raise Undescribable(f"{name} is not of a known package")

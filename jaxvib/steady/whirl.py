@@ -18,9 +18,10 @@ from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.units import Number, numbers, traced
+from jaxvib.units import Numbers, numbers, traced
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["CriticalSpeeds", "Whirl", "critical_speeds", "whirl"]
@@ -49,12 +50,15 @@ class CriticalSpeeds(Result):
         lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
         return "\n".join(lines) or "no critical speed"
 
-    def plot(self) -> Figure:
-        """Forward and backward critical speeds, on a line each. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Forward and backward critical speeds, on a line each.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         speed, forward = np.asarray(self.speed), np.asarray(self.forward)
-        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])])
+        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])], ax=ax)
 
 
 class Whirl(Result):
@@ -81,14 +85,17 @@ class Whirl(Result):
             lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
         return "\n".join([*lines, self.critical.summary()])
 
-    def plot(self) -> Figure:
-        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
 
-        return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)))
+        return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), ax=ax)
 
 
-def whirl(scene: Scene, rotor_speed: Number | None = None, *, loads: Weights = "fixed") -> Whirl:
+def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
     """Whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex

@@ -34,8 +34,8 @@ def test_tracers_are_recognized(monkeypatch):
     def answers():
         found = []
         for transform in (jax.jit, jax.grad, jax.jacfwd):
-            transform(lambda x: found.append(compat.is_tracer(x)) or x)(1.0)
-        return [*found, *map(compat.is_tracer, (1.0, None, np.ones(2), jnp.ones(2)))]
+            transform(lambda x: found.append(compat.traced(x)) or x)(1.0)
+        return [*found, *map(compat.traced, (1.0, None, np.ones(2), jnp.ones(2)))]
 
     expected = [True] * 3 + [False] * 4
     assert answers() == expected
@@ -91,6 +91,13 @@ def test_this_jaxlib_starts_with_the_flags_of_prepare_cpu():
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     flags = done.stdout.split()
     assert len(flags) >= 2 and compat.starts_with(flags)
+
+
+@pytest.mark.parametrize(("version", "known"), [("0.10.2", 2), ("0.11.2", 1), ("0.12.0", 1)])
+def test_a_flag_that_jaxlib_has_no_more_is_left_out(monkeypatch, version, known):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
+    flags = ["--xla_cpu_prefer_vector_width=512", "--xla_cpu_use_fusion_emitters=false"]
+    assert compat.accepted_flags(flags) == flags[:known]
 
 
 def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):

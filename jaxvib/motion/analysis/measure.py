@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -126,7 +125,7 @@ def _spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
 
 
 @_spans.def_jvp
-def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     _, samples, shares = jax.lax.stop_gradient(_extrema(*primals))
     outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
 

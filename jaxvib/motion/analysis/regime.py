@@ -21,6 +21,7 @@ from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
@@ -113,11 +114,14 @@ class Regime(Result):
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 
-    def plot(self) -> Figure:
-        """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 
-        return phase_circles([(self.label, np.asarray(self.phase))])
+        return phase_circles([(self.label, np.asarray(self.phase))], ax=ax)
 
 
 def regime(scene: Scene, stretch: Trajectory) -> Regime:

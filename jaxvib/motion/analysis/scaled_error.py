@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State
 from jaxvib.units import traced
@@ -26,7 +28,7 @@ def error_scale(state: State, unit: State) -> State:
     """
     xp = _library((state, unit))
 
-    def largest(x: Any, least: Any) -> Any:
+    def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
 
     return State(
@@ -38,7 +40,7 @@ def error_scale(state: State, unit: State) -> State:
     )
 
 
-def scaled_error(a: State, b: State, scale: State) -> Any:
+def scaled_error(a: State, b: State, scale: State) -> Array:
     """The largest difference of two states in all their numbers, each relative to its part's `scale`.
 
     **Arguments**: `a`, `b` states, or stretches of them whose arrays have a leading axis; `scale` a `State` of numbers, see
@@ -54,7 +56,7 @@ def scaled_error(a: State, b: State, scale: State) -> Any:
     """
     xp = _library((a, b, scale))
 
-    def apart(x: Any, y: Any, unit: Any) -> Any:
+    def apart(x: Array, y: Array, unit: Array) -> Array:
         with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
             return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
 
@@ -73,7 +75,7 @@ def turned(state: State, to: State) -> State:
     """
     xp = _library((state, to))
 
-    def near(x: Any, y: Any) -> Any:
+    def near(x: Array, y: Array) -> Array:
         return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))
 
     rotor = None
@@ -82,6 +84,6 @@ def turned(state: State, to: State) -> State:
     return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor)
 
 
-def _library(tree: Any) -> Any:
+def _library(tree: PyTree[Array]) -> ModuleType:
     """NumPy, or JAX's where JAX is transforming the computation that a tree is part of."""
     return jnp if any(traced(leaf) for leaf in jax.tree.leaves(tree)) else np

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 import diffrax
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.equations.dynamics import State
@@ -22,10 +24,11 @@ from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
 from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require, small_number
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.ode.control import WrappedController, moved_on
+from jaxvib.ode.control import Decision, WrappedController, moved_on
 from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
+from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
@@ -43,18 +46,36 @@ _LONGEST = 256
 class _Tolerance(WrappedController):
     """Measures errors against the length of a complex vector: one of its parts is often 0 when the others are not."""
 
-    controller: Any
+    controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
 
-    def wrap(self, direction: Any) -> _Tolerance:
+    def wrap(self, direction: IntScalarLike) -> _Tolerance:
         return _Tolerance(controller=self.controller.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
 
-    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, dt0: Any, args: Any, func: Any, error_order: Any) -> Any:
+    def init(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Array,
+        dt0: RealScalarLike | None,
+        args: Args,
+        func: Callable[[Terms, RealScalarLike, Array, Args], Array],
+        error_order: RealScalarLike | None,
+    ) -> tuple[RealScalarLike, PyTree[Array]]:
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(
-        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any, error_order: Any, controller_state: Any
-    ) -> Any:
+        self,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Array,
+        y1_candidate: Array,
+        args: Args,
+        y_error: Array | None,
+        error_order: RealScalarLike,
+        controller_state: PyTree[Array],
+    ) -> Decision:
         def sizes(y: Array) -> Array:
             parts = jnp.split(jnp.abs(y), np.cumsum(self.blocks)[:-1])
             # An angle grows without end; its error is never relative.
@@ -250,10 +271,10 @@ def _at_rest(scene: Scene) -> Amplitudes:
     return Amplitudes(rest.displacement + 0.0j, rest.velocity + 0.0j, rate, angle - jnp.mean(angle))
 
 
-def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
+def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[..., Array], Args]:
     """The averaged equations on the integrator's vector, and their arguments: on single numbers, where there are few."""
 
-    def on_arrays(t: Any, y: Array, args: tuple[Averaged, _Units]) -> Array:
+    def on_arrays(t: Array, y: Array, args: tuple[Averaged, _Units]) -> Array:
         field, units = args
         return units.pack(field(t, units.unpack(y, nd)))
 
@@ -261,7 +282,7 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Any, Any]:
     if program is None:
         return on_arrays, args
 
-    def on_numbers(t: Any, y: Array, args: list[Array]) -> Array:
+    def on_numbers(t: Array, y: Array, args: list[Array]) -> Array:
         return jnp.stack(jaxpr_as_fun(program)(jnp.asarray(t, y.dtype), *(y[i] for i in range(y.shape[0])), *args))
 
     return on_numbers, scalars_of(args)

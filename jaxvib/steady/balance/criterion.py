@@ -16,6 +16,7 @@ from jaxvib.results.result import Result
 from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, characteristic_speeds, port_receptance
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
@@ -63,13 +64,16 @@ class Criterion(Result):
         lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Characteristic speeds with damping, and the intervals between them. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Characteristic speeds with damping, and the intervals between them.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         rows = [("resonances", self.speeds.damped_resonances), ("additional", self.speeds.damped_additional)]
         spans = [("balancing", self.balancing), ("gathering", self.gathering)]
-        return speeds_chart(*([(label, np.asarray(values)) for label, values in group] for group in (rows, spans)))
+        return speeds_chart(*([(label, np.asarray(values)) for label, values in group] for group in (rows, spans)), ax=ax)
 
 
 def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:

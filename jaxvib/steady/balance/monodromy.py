@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.typing import ArrayLike
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.equations.linear import circular_loads
@@ -56,12 +55,13 @@ def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
 
     def step(flow: Array, k: Array) -> tuple[Array, None]:
         points = (k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h
-        return magnus(*jax.vmap(generator)(points), h) @ flow, None
+        a, b, c = jax.vmap(generator)(points)
+        return magnus(a, b, c, h) @ flow, None
 
     return jax.lax.scan(step, jnp.eye(sizes.shape[0], dtype=sizes.dtype), jnp.arange(steps) * 1.0)[0]
 
 
-def magnus(a: Array, b: Array, c: Array, h: ArrayLike) -> Array:
+def magnus(a: Array, b: Array, c: Array, h: float | Array) -> Array:
     """The flow of x' = A x over a step `h`, from A at its three Gauss points, by a Magnus method of order 6."""
     a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
     c1 = _commutator(a1, a2)

@@ -21,6 +21,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
@@ -85,13 +86,16 @@ class CharacteristicSpeeds(Result):
             lines.append(line)
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Resonances and additional speeds, without and with damping, on a line each. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Resonances and additional speeds, without and with damping, on a line each.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         rows = [("resonances", self.resonances), ("additional", self.additional)]
         rows += [("damped resonances", self.damped_resonances), ("damped additional", self.damped_additional)]
-        return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows])
+        return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows], ax=ax)
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:

@@ -11,6 +11,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["BalancedStability", "StabilityStatus"]
@@ -51,8 +52,11 @@ class BalancedStability(Result):
             f"known to {self.error:.1e}"
         )
 
-    def plot(self) -> Figure:
-        """The multipliers in the complex plane, and the unit circle. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The multipliers in the complex plane, and the unit circle.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
 
-        return multiplier_chart(np.asarray(self.multipliers))
+        return multiplier_chart(np.asarray(self.multipliers), ax=ax)

@@ -42,7 +42,7 @@ class AbstractJam(Result):
     **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
     the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude`
     (nd,) m, of tilts rad, and `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed
-    squares of their peaks (sqrt 2 times the force of a circular whirl).
+    squares of their peaks (sqrt 2 times the force of a circular whirl); `coordinates` the names of the nd coordinates.
     """
 
     mode: Array = eqx.field(metadata=in_unit("", "*"))
@@ -54,6 +54,7 @@ class AbstractJam(Result):
     displacement: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     amplitude: Array = eqx.field(metadata=in_unit("m or rad", "*", "coordinate"))
     foundation_force: Array = eqx.field(metadata=in_unit("N", "*"))
+    coordinates: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
 
 
 class Jam(AbstractJam):
@@ -106,7 +107,7 @@ class JamModes(AbstractJam):
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
-        jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1], fields))
+        jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1] if eqx.is_array_like(leaf) else leaf, fields))
         if throw and not traced(self.omega) and not np.asarray(self.exists)[mode - 1]:
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
@@ -130,7 +131,8 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None) -> Figure:
     from jaxvib.draw.results import modes_chart  # slow to import: only who draws pays
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
-    return modes_chart(mode, omega, stable, amplitude, None if resonances is None else np.asarray(resonances))
+    among = None if resonances is None else np.asarray(resonances)
+    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates)
 
 
 def jam_modes(scene: Scene) -> JamModes:
@@ -219,6 +221,7 @@ def _jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array,
         displacement=displacement,
         amplitude=magnitude(displacement),
         foundation_force=peak_force(model.carrier.bed_force(displacement, 1j * omega * displacement)),
+        coordinates=model.carrier.coordinates,
     )
 
 

@@ -15,6 +15,7 @@ from jaxvib.results.result import Result
 from jaxvib.steady.jams.phases import PhaseStatus
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["PhaseBranch", "drag_curve"]
@@ -58,16 +59,19 @@ class PhaseBranch(Result):
             f"{np.max(factor[there]):.4g} times the scene's drag"
         )
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", ax: Axes | None = None) -> Figure:
         """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
-        solid, unstable dashed. **Returns** a matplotlib figure. **Raises** `InputError` for another unit."""
+        solid, unstable dashed.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        """
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 
         alike = bool(np.all(np.asarray(self.drag == self.drag[0])))
         times, label = (float(self.drag[0]), "drag, N s/m") if alike else (1.0, "drag, times the scene's")
         factor, omega, stable = drag_curve(self)
         curve = ("loads", times * factor, omega, stable)
-        return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit)
+        return drag_diagram([curve], float(self.rotor_speed), label=label, at=times, unit=unit, ax=ax)
 
 
 def drag_curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

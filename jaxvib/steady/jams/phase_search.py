@@ -34,6 +34,7 @@ from jaxvib.steady.jams.phases import (
 from jaxvib.units import count
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
@@ -76,11 +77,11 @@ class PhaseJams(AbstractPhaseJam):
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s") -> Figure:
+    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", ax: Axes | None = None) -> Figure:
         """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
         scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
 
-        **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 
@@ -99,7 +100,7 @@ class PhaseJams(AbstractPhaseJam):
                 curves.append((jam.pattern_label, factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
         label = "drag, times the scene's"
-        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit)
+        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit, ax=ax)
 
 
 @overload

@@ -25,6 +25,7 @@ from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "phase_jam", "phase_torques"]
@@ -80,11 +81,14 @@ class PhaseJam(AbstractPhaseJam):
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
         return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
 
-    def plot(self) -> Figure:
-        """Where the loads stand, on a circle. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Where the loads stand, on a circle.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 
-        return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))])
+        return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))], ax=ax)
 
 
 class Parts(eqx.Module):

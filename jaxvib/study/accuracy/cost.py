@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "timed"]
+
+T = TypeVar("T")
 
 WANTED = (1e-2, 1e-4, 1e-6)
 """Errors for which tables and figures name the cheapest way."""
@@ -103,7 +106,7 @@ def cost_figure(costs: Mapping[str, Cost]) -> Figure:
     return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED)
 
 
-def timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
+def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
     """A result, the seconds of its fastest computation, and what the first one took besides."""
     begun = time.perf_counter()
     value = jax.block_until_ready(call())
@@ -118,7 +121,7 @@ def timed(call: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
     return value, best, max(first - best, 0.0)
 
 
-def relative(value: Any, reference: np.ndarray) -> float:
+def relative(value: ArrayLike, reference: np.ndarray) -> float:
     """The largest difference, relative to the largest entry; infinite for what is not finite."""
     difference = float(np.max(np.abs(np.ravel(np.asarray(value, float)) - reference)) / np.max(np.abs(reference)))
     return difference if np.isfinite(difference) else np.inf
@@ -128,8 +131,8 @@ def row_of(
     tier: str,
     method: str,
     setting: str,
-    call: Callable[[], Any],
-    error: Callable[[Any], float],
+    call: Callable[[], T],
+    error: Callable[[T], float],
     repeats: int,
     dtype: str = "float64",
 ) -> CostRow:

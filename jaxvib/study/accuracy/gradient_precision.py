@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.simulate import enough_steps, simulate
@@ -27,7 +28,7 @@ _GRADIENT_TOLERANCE = 1e-8
 _MOST_NOTED = 2**17
 """Steps that a run may take whose derivatives are asked for: the end of each is noted."""
 
-_Way = tuple[str, str, str, Callable[..., Any]]
+_Way: TypeAlias = tuple[str, str, str, Callable[[Array], Array | np.ndarray]]
 """Tier, method and setting in words, and the gradient at stiffnesses."""
 
 
@@ -37,13 +38,13 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
     few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
 
-    def at(k: Any) -> Scene:
+    def at(k: Array) -> Scene:
         return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
 
-    def exact(k: Any, points: int = few) -> Any:
+    def exact(k: Array, points: int = few) -> Array:
         return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
 
-    def leading(k: Any) -> Any:
+    def leading(k: Array) -> Array:
         return jnp.max(jam_modes(at(k)).select(mode).amplitude)
 
     fine, coarse = (np.asarray(jax.jacfwd(lambda k, p=p: exact(k, p))(stiffness)) for p in (most, more))
@@ -68,18 +69,18 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
     return Cost("gradient", fine.tolist(), relative(coarse, fine), rows, tuple(left_out))
 
 
-def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
+def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
     """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
     max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
 
-    def full(k: Any, adjoint: Any = None) -> Any:
+    def full(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
         asked = dict(save="window", stepsize_controller=Tolerance(_GRADIENT_TOLERANCE), max_steps=max_steps, throw=False)
         run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
         return jnp.max(run.amplitude)
 
     value = eqx.filter_jit(full)
-    ways: list[tuple[str, Callable[..., Any]]] = [
+    ways: list[tuple[str, Callable[[Array], Array | np.ndarray]]] = [
         ("forward", jax.jit(jax.jacfwd(lambda k: full(k, diffrax.ForwardMode())))),
         ("reverse", jax.jit(jax.grad(full))),
         ("finite differences", lambda k: _differences(value, k)),
@@ -87,7 +88,7 @@ def _by_runs(scene: Scene, at: Callable[[Any], Scene], jam: ExactJam, end: float
     return [("full", name, f"{_GRADIENT_TOLERANCE:.0e}", way) for name, way in ways]
 
 
-def _differences(value: Callable[[Any], Any], at: Any) -> np.ndarray:
+def _differences(value: Callable[[Array], Array], at: Array) -> np.ndarray:
     """Central differences, each number moved by 1e-5 of itself; 0 for those that are 0."""
     steps = 1e-5 * np.asarray(at)
     whole = np.zeros(len(steps))

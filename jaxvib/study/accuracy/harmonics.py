@@ -26,6 +26,7 @@ from jaxvib.steady.orbits.orbit import light_rotor_speed
 from jaxvib.units import Number, number
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["HarmonicConvergence", "harmonic_convergence"]
@@ -48,12 +49,15 @@ class HarmonicConvergence(Result):
         rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.known, axis=1), strict=True)
         return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {known:.1e}" for n, error, known in rows)
 
-    def plot(self) -> Figure:
-        """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         names = [f"{w:.4g} rad/s" for w in self.omega]
         from jaxvib.draw.comparison import convergence_chart  # slow to import: only who draws pays
 
-        return convergence_chart(self.harmonics, self.error, self.known, names=names)
+        return convergence_chart(self.harmonics, self.error, self.known, names=names, ax=ax)
 
 
 def harmonic_convergence(

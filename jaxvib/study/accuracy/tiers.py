@@ -19,6 +19,7 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["TierValues", "Tiers", "compare_tiers"]
@@ -55,8 +56,11 @@ class Tiers(Result):
             lines.append(f"load of {mass:.4g} kg: leading order {light}, exact {exact}")
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         differences = {
             "load speed": np.abs(self.leading.omega / self.exact.omega - 1.0),
             "amplitude": np.max(np.abs(self.leading.amplitude / self.exact.amplitude - 1.0), axis=1),
@@ -64,7 +68,7 @@ class Tiers(Result):
         }
         from jaxvib.draw.comparison import tiers_chart  # slow to import: only who draws pays
 
-        return tiers_chart(self.mass, differences, self.exact.stable)
+        return tiers_chart(self.mass, differences, self.exact.stable, ax=ax)
 
 
 def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
@@ -22,6 +23,7 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
 from jaxvib.motion.steps import Tolerance
+from jaxvib.results.result import Result
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.accuracy.cost import Cost, CostRow, relative, row_of
@@ -31,10 +33,15 @@ from jaxvib.units import Number, count, number
 
 __all__ = ["QUANTITIES", "SOLVERS", "work_precision"]
 
+Tree = TypeVar("Tree")
 Quantity = Literal["amplitude", "foundation_force", "final_state", "gradient"]
 QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
 
-SOLVERS: dict[str, Any] = {"default": None, "Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8}
+SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver | None]] = {
+    "default": lambda: None,
+    "Tsit5": diffrax.Tsit5,
+    "Dopri8": diffrax.Dopri8,
+}
 """Methods of time integration by name; the default is what `simulate` takes unless told otherwise."""
 
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
@@ -128,7 +135,7 @@ class _Ask(NamedTuple):
     repeats: int
 
 
-def _single(tree: Any) -> Any:
+def _single(tree: Tree) -> Tree:
     """A scene, or more, in single precision; goes with `jax.enable_x64(False)`."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float32), tree)
 
@@ -136,12 +143,12 @@ def _single(tree: Any) -> Any:
 def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     scene, mode = ask.scene, jam.mode
 
-    def read(found: Any) -> Any:
+    def read(found: Result) -> Array:
         return getattr(found, quantity)
 
     reference = np.ravel(np.asarray(read(jam.fine), float))
 
-    def error(value: Any) -> float:
+    def error(value: Array) -> float:
         return relative(value, reference)
 
     def leading(scene: Scene, dtype: str) -> CostRow:
@@ -178,7 +185,7 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
     """Of a motion that is no jam: as measured at the end of a run from rest."""
     end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
 
-    def read(found: Any) -> Any:
+    def read(found: Result) -> Array:
         return getattr(found, quantity)
 
     start = initial_state(ask.scene)
@@ -195,8 +202,8 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
 
 def _integrated(
     ask: _Ask,
-    read: Callable[[Any], Any],
-    error: Callable[[Any], float],
+    read: Callable[[Result], Array],
+    error: Callable[[Array], float],
     start: State,
     length: Callable[[float], float],
 ) -> tuple[list[CostRow], list[str]]:
@@ -205,7 +212,7 @@ def _integrated(
     for tolerance in _AVERAGED:
         end = length(tolerance)
 
-        def averaged(end: float = end, tolerance: float = tolerance) -> Any:
+        def averaged(end: float = end, tolerance: float = tolerance) -> Array:
             chosen = Tolerance(tolerance)
             return read(envelope(ask.scene, end, start=start, save="window", stepsize_controller=chosen, throw=False))
 
@@ -223,7 +230,7 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
     steps = enough_steps(ask.scene, jnp.asarray(max(ends.values())))  # one for all: it is a part of the program
 
     def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:
-        solver = None if SOLVERS[name] is None else SOLVERS[name]()
+        solver = SOLVERS[name]()
 
         def run(tolerance: float) -> Run:
             asked = dict(solver=solver, stepsize_controller=Tolerance(tolerance), max_steps=steps, estimate=False, throw=False)
@@ -242,7 +249,7 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
     return found
 
 
-def _compiled(function: Callable[[Scene], Any], scene: Scene) -> Callable[[], Any]:
+def _compiled(function: Callable[[Scene], Array], scene: Scene) -> Callable[[], Array]:
     jitted = eqx.filter_jit(function)
     return lambda: jitted(scene)
 

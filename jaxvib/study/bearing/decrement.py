@@ -16,6 +16,7 @@ from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import count
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_points"]
@@ -70,11 +71,14 @@ class Decrement(Result):
             f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
         )
 
-    def plot(self) -> Figure:
-        """mu1 of each pair of swings, first to last. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """mu1 of each pair of swings, first to last.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
 
-        return points_chart(self.estimates[:, None], across="pair of swings", up="mu1, N m s")
+        return points_chart(self.estimates[:, None], across="pair of swings", up="mu1, N m s", ax=ax)
 
 
 def turning_points(record: Record) -> TurningPoints:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -212,7 +212,7 @@ def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints,
     return guess, jnp.asarray(0.005 * w * float(np.min(a)))
 
 
-def steps_for(start: Unknowns, time: Any) -> int:
+def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
     """More steps than the integration takes; a power of 2, so that few lengths of a record need few compilations."""
     return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import called, closest
+from jaxvib.machine.files import Tables, called, closest
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
-from jaxvib.units import number
+from jaxvib.units import Number, number
 
 __all__ = ["TEMPLATE", "Measurement", "measurement_from_tables"]
 
@@ -29,7 +29,7 @@ class Measurement(NamedTuple):
     instrument: float
 
 
-def measurement_from_tables(tables: Mapping[str, Any], folder: Path) -> Measurement:
+def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     """A measurement from the tables [record], [pendulum], [identify] of a file in `folder`, see `TEMPLATE`.
 
     **Arguments**: `tables` as TOML reads them; `folder` in which the record's file is looked for.
@@ -60,7 +60,9 @@ def measurement_from_tables(tables: Mapping[str, Any], folder: Path) -> Measurem
     return Measurement(pendulum, record, *asked)
 
 
-def _record(file: Any, columns: Any = None, angle_unit: Any = None, from_: Any = None, until: Any = None) -> Any:
+def _record(
+    file: object, columns: object = None, angle_unit: object = None, from_: Number | None = None, until: Number | None = None
+) -> Callable[[Path], Record]:
     if not isinstance(file, str):
         raise InputError("record.file", f"is {file!r}; write the path of a CSV file")
     if angle_unit is not None and not isinstance(angle_unit, str):
@@ -80,7 +82,7 @@ def _record(file: Any, columns: Any = None, angle_unit: Any = None, from_: Any =
     return read
 
 
-def _asked(dry: Any = False, instrument: Any = 0.0) -> tuple[bool, float]:
+def _asked(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float]:
     if not isinstance(dry, bool):
         raise InputError("identify.dry", f"is {dry!r}; write true or false")
     return dry, float(number(instrument, "", "identify.instrument", low=0.0))

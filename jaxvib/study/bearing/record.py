@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxvib.errors import InputError
 from jaxvib.results.fields import in_unit
@@ -41,7 +41,7 @@ class Record(eqx.Module):
     angle: np.ndarray = eqx.field(metadata=in_unit("rad", "time", name="recorded"))
     name: str = eqx.field(static=True)
 
-    def __init__(self, time: Any, angle: Any, name: str = "record"):
+    def __init__(self, time: ArrayLike, angle: ArrayLike, name: str = "record"):
         try:
             self.time, self.angle = (np.asarray(x, dtype=float) for x in (time, angle))
         except (TypeError, ValueError) as error:

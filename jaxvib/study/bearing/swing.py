@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
@@ -16,10 +15,11 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.friction import dry_lever
 from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require
+from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
-from jaxvib.units import Number, count, number, numbers, traced
+from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,7 +123,7 @@ class Swing(Result):
 @refuse_former(tolerance=FORMER["tolerance"])
 def swing(
     pendulum: BearingPendulum,
-    time: Number | Sequence[Number],
+    time: Numbers,
     *,
     angle: Number,
     rate: Number = 0.0,
@@ -230,7 +230,7 @@ def swing_states(
         zone = jax.lax.stop_gradient(pendulum.dead_zone(jnp.abs(dry)) * frequency)
         width = 0.05 * jnp.where(zone > 0.0, zone, frequency)
 
-    def moving(t: Any, y: tuple[Array, Array], args: None, **_: Any) -> Array:
+    def moving(t: RealScalarLike, y: tuple[Array, Array], args: None, **_: object) -> Array:
         """Changes its sign to minus where the pendulum is slow within the dead zone: there the smooth sign lets it creep."""
         assert dry is not None and width is not None
         f, slip = y
@@ -240,7 +240,7 @@ def swing_states(
     # A start that is held already changes no sign.
     free = None if dry is None else moving(times[0], (angle, rate), None) > 0.0
 
-    def term(t: Any, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
+    def term(t: RealScalarLike, y: tuple[Array, Array], args: None) -> tuple[Array, Array]:
         f, slip = y
         torque = -pendulum.mass * pendulum.g * pendulum.length * jnp.sin(f) - viscous * slip
         if free is None:

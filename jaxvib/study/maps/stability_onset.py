@@ -16,6 +16,7 @@ from jaxvib.results.status import Computed
 from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["StabilityMap", "stability_map", "stability_onset"]
@@ -40,15 +41,20 @@ class StabilityMap(Result):
             lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
-    def plot(self, *, label: str = "x") -> Figure:
-        """Stable jams shaded over the load speed and x, special points as marks by kind; `label` names x on its axis."""
+    def plot(self, *, label: str = "x", ax: Axes | None = None) -> Figure:
+        """Stable jams shaded over the load speed and x, special points as marks by kind; `label` names x on its axis.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):
             for point in points:
                 marks.setdefault(point.kind.replace("_", " "), []).append((point.omega, float(x)))
         from jaxvib.draw.comparison import stability_chart  # slow to import: only who draws pays
 
-        return stability_chart(self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label)
+        return stability_chart(
+            self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label, ax=ax
+        )
 
 
 def stability_map(

@@ -1,0 +1,34 @@
+"""States within a step."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.ode.types import RealScalarLike, Y
+
+__all__ = ["StepInterpolation"]
+
+
+class StepInterpolation(diffrax.AbstractLocalInterpolation):
+    """States within a step from `t0` to `t1`, by the share of it that is done; a step without a length has done none of it."""
+
+    t0: Any
+    t1: Any
+
+    @abc.abstractmethod
+    def at(self, share: Array, span: Array) -> Y:
+        """The state where `share` of the step is done, which is `span` long."""
+
+    def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
+        """The state at `t0`, or by how much it changes from there to `t1`."""
+        if t1 is not None:
+            return jax.tree.map(lambda a, b: b - a, self.evaluate(t0), self.evaluate(t1))
+        span = self.t1 - self.t0
+        share = jnp.where(span == 0.0, 0.0, (t0 - self.t0) / jnp.where(span == 0.0, 1.0, span))
+        return self.at(share, span)

@@ -1,0 +1,62 @@
+"""What diffrax hands its methods and controllers, and what it takes from them, by the names that it has for them itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import diffrax
+import numpy as np
+from jax import Array
+from jaxtyping import PyTree
+
+__all__ = [
+    "VF",
+    "Args",
+    "BoolScalarLike",
+    "DenseInfo",
+    "IntScalarLike",
+    "Mapped",
+    "Norm",
+    "RealScalarLike",
+    "StepResult",
+    "Tangents",
+    "Terms",
+    "Y",
+]
+
+RealScalarLike: TypeAlias = int | float | Array | np.ndarray
+"""A time, a tolerance, an order: a number, or an array ()."""
+
+IntScalarLike: TypeAlias = int | Array | np.ndarray
+"""A direction, a whole number."""
+
+BoolScalarLike: TypeAlias = bool | Array | np.ndarray
+"""Yes or no: a truth value, or an array ()."""
+
+Y: TypeAlias = PyTree[Array]
+"""The state that is integrated, in any form; errors and changes of it are trees like it."""
+
+VF: TypeAlias = PyTree[Array]
+"""The rates of a state: a tree like it."""
+
+Args: TypeAlias = PyTree
+"""What a vector field takes beside the time and the state: whatever its term was written for."""
+
+Terms: TypeAlias = PyTree[diffrax.AbstractTerm]
+"""The equations; all methods here take a single term."""
+
+DenseInfo: TypeAlias = dict[str, PyTree[Array]]
+"""What the interpolation of a step is made of, by the names of its attributes."""
+
+StepResult: TypeAlias = tuple[Y, Y, DenseInfo, VF | None, diffrax.RESULTS]
+"""The state at the end of a step, its error, its interpolation, the method's own state, whether the step succeeded."""
+
+Norm: TypeAlias = Callable[[PyTree[Array]], RealScalarLike]
+"""The size of a tree of numbers."""
+
+Tangents: TypeAlias = PyTree[Array | None]
+"""A tree like that of primal values, each array with a last axis over the tangent directions; None where all of them are 0."""
+
+Mapped: TypeAlias = PyTree[bool]
+"""A tree like that of values: whether each of them has an axis over the batch."""
