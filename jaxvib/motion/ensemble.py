@@ -22,7 +22,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
-from jaxvib.motion.start import initial_state
+from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.results.fields import in_unit, part
@@ -140,6 +140,7 @@ def ensemble(
     end = number(until, "s", "until", low=0.0, open_low=True)
     lanes = min(count(lanes, "lanes"), runs)
     made = _made(make, values)
+    require_start(made[0], made[1].angle)
     known = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.
     shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]

@@ -7,7 +7,6 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
@@ -18,7 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, numbers, traced
 
-__all__ = ["Start", "brought_up", "initial_state", "require_numbers", "whole_state"]
+__all__ = ["Start", "brought_up", "initial_state", "require_start", "whole_state"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
@@ -70,6 +69,7 @@ def initial_state(
         rotor = None if scene.drive.ideal else (zero[0], zero[0])
         first, *others = scene.loads.rest()
         angle = (phases(first), *others)
+        require_start(scene, angle)
         return State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor)
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
@@ -79,6 +79,7 @@ def initial_state(
         )
     jam = jam_modes(scene).select(mode, throw=throw)
     angle = phases(0.0)
+    require_start(scene, (angle,))
     displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
     return State(
         displacement.real,
@@ -86,13 +87,6 @@ def initial_state(
         (angle,),
         (jnp.full((n,), jam.omega),),
     )
-
-
-def require_numbers(scene: Scene) -> None:
-    """**Raises** `InputError` for a scene that holds NaN: with it every step would be refused."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
-        if eqx.is_array(leaf) and not traced(leaf) and np.any(np.isnan(leaf)):
-            raise InputError(f"scene{jax.tree_util.keystr(path)}", "is not a number (nan); give one, see how it was computed")
 
 
 def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
@@ -129,4 +123,12 @@ def whole_state(scene: Scene, state: State, mode: int | None) -> State:
         shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
         if any(shape != (length,) for shape in shapes):
             raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
+    require_start(scene, state.angle)
     return state
+
+
+def require_start(scene: Scene, u: tuple[Array, ...]) -> None:
+    """**Raises** `InputError` where an effect says that the loads cannot start from coordinates `u` (..., count), if known."""
+    if not any(map(traced, u)):
+        for effect in scene.effects:
+            effect.check_start(scene.loads, u)

@@ -80,6 +80,9 @@ class Effect(eqx.Module):
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
 
+    def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
+        """**Raises** `InputError` where loads cannot start from the coordinates `u`, (..., count) each and known."""
+
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array | None:
         """Potential energy of the loads, J, an entry a load or a pair of them; None where the effect has none."""
         return None
