@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
@@ -101,7 +102,7 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return linear_model(scene).modes()[0]
+    return linear_model(checked(scene)).modes()[0]
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:

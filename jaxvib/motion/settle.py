@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
@@ -60,6 +61,7 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
+    scene = checked(scene)
     if not scene.drive.constant:
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed only")
     count(periods, "periods")

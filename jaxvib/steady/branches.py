@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit, part
@@ -112,13 +113,14 @@ def branches(
 
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
+    scene = checked(scene)
     if exact:
         from jaxvib.steady.orbits.diagram import exact_branches  # needs the time integrator: only who asks pays
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
         raise InputError("least", "goes with exact=True only; light loads have a branch down to speed 0")
-    count(points, "points", low=2)
+    count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))
     return _branches(scene, top, points, per_side)

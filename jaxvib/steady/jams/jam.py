@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, peak_force
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
@@ -161,6 +162,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
+    scene = checked(scene)
     drag = jammed_loads(scene).drag
     if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")

@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
@@ -140,10 +141,11 @@ def phase_jams(
 
     Source: Artyunin 2013, section V; leading order of the loads' mass, see `jam_modes` for loads at one angle.
     """
+    scene = checked(scene)
     if near is not None:
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
-    number = count(starts, "starts")
+    number = count(starts, "starts", each=64.0 * loads.count * _GRID)
     parts = parts_of(scene)
     speeds = _load_speeds(parts)
     rng = np.random.default_rng(count(seed, "seed", low=0))

@@ -108,7 +108,7 @@ def exact_branches(
     >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
-    count(points, "points", low=2)
+    count(points, "points", low=2, each=1e4)
     crowded, resonances = _fold_points(scene)
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
     low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)
