@@ -15,16 +15,15 @@ import pathlib
 import time
 from collections.abc import Callable
 
-import jaxvib as jv
-
-jv.prepare_cpu()
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
 from jaxvib.motion.integrate import natural_units
+
+jv.prepare_cpu()
 
 UNTIL, MAX_STEPS, BEST = 6.0, 2**18, 3e-13
 Draw = Callable[[float, float], float]
@@ -139,7 +138,12 @@ def table(rows: list[dict]) -> str:
             some = [r for r in rows if kind in (r["kind"], "all") and r["dtype"] == dtype and r["best"] == "done"]
             if not some:
                 continue
-            done = [(r[f"{n}_error"], r[f"{n}_estimate"]) for r in some for n in ("tolerance", "accuracy") if r[f"{n}_status"] == "done"]
+            done = [
+                (r[f"{n}_error"], r[f"{n}_estimate"])
+                for r in some
+                for n in ("tolerance", "accuracy")
+                if r[f"{n}_status"] == "done"
+            ]
             ratio = np.array([error / estimate for error, estimate in done])
             kept = np.array([r["accuracy_error"] / r["accuracy"] for r in some if r["accuracy_status"] == "done"])
             lines.append(

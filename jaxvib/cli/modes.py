@@ -12,6 +12,8 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
+from jaxvib.steady.jams.jam import JUDGED
+from jaxvib.steady.jams.phases import growth_apart
 
 _RPM = 30.0 / np.pi
 
@@ -45,15 +47,19 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
     if picture is not None:
         jv.branches(loaded).plot(unit=unit).savefig(picture)
     jams = [found.select(k) for k in found.mode_numbers()]
+    growth = dict(zip(found.mode.tolist(), growth_apart(loaded, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
         "rotor_speed": float(loaded.drive.speed),
         "resonances": found.resonances.tolist(),
+        "judged": JUDGED,
         "modes": [
             {
                 "mode": int(jam.mode),
                 "omega": float(jam.omega),
                 "stable": bool(jam.stable),
+                "growth_apart": growth[int(jam.mode)],
+                "status": jam.message,
                 "amplitude": jam.amplitude.tolist(),
                 "foundation_force": float(jam.foundation_force),
             }
@@ -68,7 +74,8 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
                 f"{int(jam.mode)}",
                 f"{float(jam.omega):.5g}",
                 f"{_RPM * float(jam.omega):.5g}",
-                "stable" if jam.stable else "unstable",
+                {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "apart"),
+                _apart(growth[int(jam.mode)]),
                 *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.4g}",
             ]
@@ -76,17 +83,28 @@ def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, 
         ]
         speed = float(loaded.drive.speed)
         resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
-        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in structure.coordinates), "force on bed, N"]
+        head = ["mode", "rad/s", "rpm", "by slope", "loads free", *(f"{name}, mm" for name in structure.coordinates), "force"]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            table("jam modes of light loads; amplitudes and force zero to peak", head, rows) if rows else "no jam mode here",
+            table("jam modes of light loads; amplitudes zero to peak, force on the bed in N", head, rows)
+            if rows
+            else "no jam mode here",
         ]
+        if rows:
+            lines.append(
+                "by slope: of loads that stay together; loads free: each moves for itself (growth of a disturbance, 1/s)"
+            )
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
         return "\n".join([*lines, *_left_out(loaded)])
 
     output.done(document, text, "modes")
+
+
+def _apart(growth: float) -> str:
+    """What is known of a jam whose loads may part."""
+    return "not known" if np.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
@@ -104,6 +122,7 @@ def _phases(scene: jv.Scene, unit: Any, output: Output) -> None:
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": float(scene.drive.speed),
+        "judged": "by the growth of small disturbances, for light loads of which each moves for itself",
         "phase_jams": [
             {
                 "omega": float(jam.omega),
@@ -157,6 +176,7 @@ def _exact(scene: jv.Scene, unit: Any, output: Output) -> None:
     document = {
         "rotor_speed": float(scene.drive.speed),
         "resonances": light.resonances.tolist(),
+        "judged": "by the multipliers of the full equations",
         "modes": [
             {
                 "mode": k,

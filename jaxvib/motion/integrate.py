@@ -169,7 +169,14 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
+        together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
     )
+
+
+def _is_together(angle: Array) -> Array:
+    """Whether several loads have one angle (..., count) all the time, but for what rounding may have grown to."""
+    apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
+    return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
 
 
 def _grew(scene: Scene, first: State, last: State) -> Array:

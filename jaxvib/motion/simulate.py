@@ -51,6 +51,7 @@ def simulate(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
+    apart: Number = 0.0,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
@@ -69,7 +70,8 @@ def simulate(
 
     - `until`: end time, s or text such as "20 s"
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
-      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
+      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`. Loads start together
+      unless said how far `apart`, rad: where they share every number they then stay together (`Run.together`), stable or not
     - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16384, for runs of more than 1024 turns of the
       rotor 262144, and 2000 under a JAX transformation); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
@@ -116,7 +118,9 @@ def simulate(
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
-    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, throw=throw)
+    if given and (traced(apart) or apart != 0.0):
+        raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
+    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
@@ -269,21 +273,21 @@ def _in_stretches(
         controller = StepControl(steps=jnp.ceil(controller.steps / number))
     length = whole_turns(scene, float(end) / number)
     last = float(end) - (number - 1) * length
-    taken, rejected, evaluations = 0, 0, 0
+    taken, rejected, evaluations, together = 0, 0, 0, True
     found = None
     for k in range(number):
         span = jnp.asarray(length if k < number - 1 else last, end.dtype)
         found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, None)
         state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
-        evaluations += int(found.evaluations)
+        evaluations, together = evaluations + int(found.evaluations), found.together & together
         if not bool(found.status == RunStatus.done):
             break
     assert found is not None
     counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
-    return _with(found, seconds=time.perf_counter() - begun)
+    return _with(found, seconds=time.perf_counter() - begun, together=together)
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:

@@ -7,6 +7,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
@@ -15,7 +16,7 @@ from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import Number, numbers, traced
+from jaxvib.units import Number, number, numbers, traced
 
 __all__ = ["Start", "brought_up", "initial_state", "require_start", "whole_state"]
 
@@ -24,7 +25,13 @@ Start = Literal["rest", "jam", "spin_up"]
 
 
 def initial_state(
-    scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Number | None = None, throw: bool = True
+    scene: Scene,
+    start: Start = "rest",
+    *,
+    mode: int | None = None,
+    angles: Number | None = None,
+    apart: Number = 0.0,
+    throw: bool = True,
 ) -> State:
     """A state to start from.
 
@@ -36,6 +43,8 @@ def initial_state(
     - `angles`: the loads' angles about the rotor's axis, one number or (count,), rad, in place of the named ones (those of
       `Loads.rest` at rest, 0 in a jam, where the platforms go with the mean angle; loads that touch each other lie side by side
       there)
+    - `apart`: how far the outermost loads start from the middle, rad, the others evenly between them: what only loads that are
+      exactly together would keep up, does not last then
     - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
@@ -57,13 +66,16 @@ def initial_state(
     mass = scene.machine.structure().mass
     zero = jnp.zeros(mass.shape[:1], mass.dtype)
 
+    half = number(apart, "rad", "apart", low=0.0)
+    spread = half * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1), zero.dtype)
+
     def phases(value: float | Array) -> Array:
         if angles is not None:
-            return numbers(angles, "rad", "angles", n)
+            return numbers(angles, "rad", "angles", n) + spread
         touching = any(effect.couples_loads for effect in scene.effects)
         if touching and isinstance(scene.loads, CircularLoads):
-            return value + scene.loads.offsets()
-        return value + jnp.zeros((n,), zero.dtype)
+            return value + scene.loads.offsets() + spread
+        return value + spread
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])

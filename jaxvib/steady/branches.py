@@ -19,7 +19,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, fold_points
-from jaxvib.steady.jams.jam import AbstractJam, Jam, branch_points
+from jaxvib.steady.jams.jam import JUDGED, AbstractJam, Jam, branch_points
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.units import Number, count, number
 
@@ -48,7 +48,7 @@ class Branches(AbstractJam):
         folds = zip(
             *(np.asarray(x)[np.asarray(self.folds.exists)] for x in (self.folds.omega, self.folds.rotor_speed)), strict=True
         )
-        return branch_summary(self, [("fold", w, n) for w, n in folds])
+        return branch_summary(self, [("fold", w, n) for w, n in folds], JUDGED)
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
@@ -61,7 +61,7 @@ class Branches(AbstractJam):
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
-        return picture(self, marks, unit, most)
+        return picture(self, marks, unit, most, JUDGED)
 
 
 @overload

@@ -37,6 +37,9 @@ _LANES = 32
 _POINTS = (8, 16, 32, 64)
 
 
+_JUDGED = "by the multipliers of the full equations"
+
+
 class SpecialPoint(NamedTuple):
     """Where the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker), "period_doubling"
     or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
@@ -74,11 +77,11 @@ class ExactBranches(Result):
 
     def summary(self) -> str:
         """The ranges of the branch, its resonances and its special points, for a person to read."""
-        return f"{branch_summary(self, list(self.special))}\n{self.message}"
+        return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
-        return picture(self, list(self.special), unit, most)
+        return picture(self, list(self.special), unit, most, _JUDGED)
 
 
 def exact_branches(
