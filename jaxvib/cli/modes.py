@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.errors import InputError
 from jaxvib.steady.jams.jam import JUDGED
 from jaxvib.steady.jams.phases import growth_apart
@@ -24,13 +24,16 @@ _RPM = 30.0 / np.pi
 @click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
+@WITHOUT
 @shared
-def modes(scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, output: Output) -> None:
+def modes(
+    scene: Path, speed: str | None, unit: Any, exact: bool, phases: bool, without: tuple[str, ...], output: Output
+) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
     Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
     with platforms and with a rotor that does not tilt, where no load has a station of its own and nothing is out of balance."""
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene, without)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
     if exact and phases:

@@ -89,7 +89,12 @@ def initial_state(
         raise InputError(
             "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
         )
-    jam = jam_modes(scene).select(mode, throw=throw)
+    try:
+        modes = jam_modes(scene)
+    except InputError as error:
+        why = error.problem.split(";")[0]
+        raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
+    jam = modes.select(mode, throw=throw)
     angle = phases(0.0)
     require_start(scene, (angle,))
     displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))

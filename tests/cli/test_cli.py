@@ -99,6 +99,9 @@ def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
     assert said in typed("modes", "shaken.toml", "--phases")[1]
     code, _, err = typed("modes", "shaken.toml", "--exact")
     assert code == 2 and "effects.static_imbalance shakes the machine at the rotor's own speed" in err
+    assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0
+    code, _, err = typed("modes", "shaken.toml", "--without", "stop")
+    assert code == 2 and "--without is 'stop'; the scene's effects are: static_imbalance" in err
 
 
 def test_a_machine_without_springs_ends_in_a_sentence(typed, tmp_path):
