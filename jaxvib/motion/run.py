@@ -48,15 +48,15 @@ class Run(AbstractMeasured, Result):
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
     were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran;
-    `together`: whether several loads started at one angle and stayed there, as equal ones do until rounding parts them: then a
-    motion may look settled that loads a little apart would leave (start them `apart` to see). What it cost, the runs with larger
-    steps that were made for its error included: `evaluations` of the vector field (0 where the method does not say) and
+    `together`: whether several loads started at one angle and stayed there, as equal ones do until rounding parts them: such a
+    motion may look settled where loads a little apart would leave it (start them `apart` to see). What it cost, the runs with
+    larger steps that were made for its error included: `evaluations` of the vector field (0 where the method does not say) and
     `seconds`, compiling included where the program was new, NaN under a JAX transformation.
 
     The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles
     in rad, speeds of loads relative to the rotor's. It is what is left of the difference to a run with larger steps, of which
-    not all is counted on to vanish with smaller ones. A motion that forgets its phase has a large error and may have exact
-    amplitudes all the same.
+    not all is counted on to vanish with smaller ones, and twice of it where an effect is not `smooth`; rounding counts too. A
+    motion that forgets its phase has a large error and may have exact amplitudes all the same.
     """
 
     status: RunStatus

@@ -19,7 +19,7 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
@@ -198,12 +198,13 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _shrink(fine: StepControl, coarse: StepControl) -> Array:
-    """What share of the difference between two runs is the error of the finer one: for a method of order 8 the error falls with
-    the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.6 and 3, so that the estimate errs upward."""
+    """What share of the difference between two runs is the error of the finer one, where the motion is smooth: for a method of
+    order 8 the error falls with the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.45 and 3, so that the
+    estimate errs upward."""
     if fine.steps is not None and coarse.steps is not None:
         return (coarse.steps / fine.steps) ** 3
     assert fine.tolerance is not None and coarse.tolerance is not None
-    return (fine.tolerance / coarse.tolerance) ** 0.6
+    return (fine.tolerance / coarse.tolerance) ** 0.45
 
 
 def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: list[Run]) -> Run:
@@ -214,7 +215,9 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
         known = known & (control.steps != coarser.steps)
     ours, theirs = fine.window.state, coarse.window.state
     theirs = turned(theirs, ours) if wrap_angles(scene, fine.error.dtype)[0] else theirs
-    error = scaled_error(ours, theirs, error_scale(ours, natural_units(scene))) * _shrink(control, coarser)
+    difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
+    radians = fastest_and_slowest(scene)[0] * fine.window.time[-1]
+    error = estimated_error(difference, _shrink(control, coarser), scene, fine.steps, radians)
     error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
     return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))

@@ -119,8 +119,8 @@ def jam_orbit(
         which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
 
     if points is not None:
-        loads = 1 if frozen.loads.alike else frozen.loads.count
-        count(points, "points", low=2, each=16.0 * loads**2 * float(points if isinstance(points, int) else 1))
+        bodies = 1 if jammed_loads(frozen).alike else frozen.loads.count
+        count(points, "points", low=2, each=16.0 * bodies**2 * float(points if isinstance(points, int) else 1))
     half = has_half_turn(scene)
     if points is None and not concrete:
         points = 16 if half else 33

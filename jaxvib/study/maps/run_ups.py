@@ -160,7 +160,7 @@ def run_ups(
     else:
         sets = np.asarray(initial_state(scene).azimuth)[None]
     count(batch, "batch")
-    require_start(scene, (sets,))
+    require_start(scene, (jnp.asarray(sets),))
 
     grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))
     shape = (len(drags), len(sets))
