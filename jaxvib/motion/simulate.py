@@ -216,11 +216,15 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
     ours, theirs = fine.window.state, coarse.window.state
     theirs = turned(theirs, ours) if wrap_angles(scene, fine.error.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
-    radians = fastest_and_slowest(scene)[0] * fine.window.time[-1]
-    error = estimated_error(difference, _shrink(control, coarser), scene, fine.steps, radians)
+    error = estimated_error(difference, _shrink(control, coarser), scene, fine.steps, _radians(scene, fine))
     error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
     return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
+
+
+def _radians(scene: Scene, run: Run) -> Array:
+    """What moves fastest turns by so much in a run."""
+    return fastest_and_slowest(scene)[0] * run.window.time[-1]
 
 
 def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
@@ -236,7 +240,8 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
         tolerance = float(cast(Array, control.tolerance))
         if float(found.error) <= accuracy:
             return found
-        if tolerance <= floor:
+        # Smaller steps only add to what rounding alone makes of the error.
+        if tolerance <= floor or float(estimated_error(0.0, 0.0, scene, latest.steps, _radians(scene, latest))) > accuracy:
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
