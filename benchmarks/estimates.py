@@ -169,11 +169,11 @@ def main() -> None:
         for dtype in (np.float64, np.float32):
             rows += [measured(kind, k, dtype) for k in range(given.first, given.first + given.scenes)]
             print(f"{kind}, {dtype.__name__}: {time.perf_counter() - begun:.0f} s", flush=True)
+            if given.out is not None:  # what is done so far
+                given.out.mkdir(parents=True, exist_ok=True)
+                (given.out / "estimates.json").write_text(json.dumps(rows, indent=1) + "\n")
     print(table(rows))
     print("above: true error above the estimate; broken: above the accuracy asked for, status done; median: estimate / error")
-    if given.out is not None:
-        given.out.mkdir(parents=True, exist_ok=True)
-        (given.out / "estimates.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":
