@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias, runtime_checkable
@@ -204,10 +205,10 @@ def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low:
     return array
 
 
-def count(value: object, field: str, *, low: int = 1) -> int:
-    """A whole number of things, at least `low`.
+def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
+    """A whole number of things, at least `low`, of which `each` takes so many bytes.
 
-    **Raises** `InputError` for anything else.
+    **Raises** `InputError` for anything else, and for more than fit into half of this machine's memory.
 
     >>> count(0, "loads.count")
     Traceback (most recent call last):
@@ -216,4 +217,9 @@ def count(value: object, field: str, *, low: int = 1) -> int:
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
         raise InputError(field, f"is {value!r}; it must be a whole number, at least {low}")
+    if each and value * each > 2.0**30:
+        room = 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2.0**33
+        if value * each > room:
+            needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of this machine's memory"
+            raise InputError(field, f"is {value}, which {needs}; {int(room / each)} at most fit")
     return int(value)

@@ -314,6 +314,15 @@ def test_former_spellings_and_other_choices_of_steps_are_refused(ask, says):
         ask()
 
 
+def test_places_that_cannot_be_written_to(tmp_path):
+    (tmp_path / "folder.npz").mkdir()
+    for name, why in (("folder", "Is a directory"), ("missing/file", "No such file or directory")):
+        with pytest.raises(jv.InputError, match=rf"path is .* cannot be written \({why}\); name another file"):
+            RESULTS["Run"]().save(tmp_path / name)
+    with pytest.raises(jv.InputError, match="cannot be written"):
+        jv.save_scene(SCENE, tmp_path)
+
+
 def test_what_no_file_can_hold():
     odd = eqx.tree_at(lambda cost: cost.quantity, RESULTS["Cost"](), print)
     with pytest.raises(jv.InputError, match="which no file can hold"):

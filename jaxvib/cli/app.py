@@ -6,15 +6,18 @@ import importlib
 import json
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from jaxvib.errors import ComputationError, InputError
 
-__all__ = ["Output", "app", "run", "shared", "table"]
+if TYPE_CHECKING:
+    from jaxvib.machine.scene import Scene
+
+__all__ = ["WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
 
 
 class Output:
@@ -65,6 +68,24 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
+    """The scene of a file, the effects of the kinds `without` left out. **Raises** `InputError` for one that it has not."""
+    from jaxvib.machine.files import load_scene  # slow to import, and --help needs none of it
+    from jaxvib.machine.scene import Scene
+
+    scene = load_scene(path)
+    there = [effect.kind for effect in scene.effects]
+    for kind in without:
+        if kind not in there:
+            raise InputError("--without", f"is {kind!r}; the scene's effects are: {', '.join(there) or 'none'}")
+    kept = tuple(effect for effect in scene.effects if effect.kind not in without)
+    return scene if len(kept) == len(there) else Scene(scene.machine, scene.loads, scene.drive, kept)
+
+
+WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
+"""The option of commands whose theories do not know every effect."""
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:

@@ -48,6 +48,7 @@ def new(kind: str, output: Output) -> None:
     "--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state."
 )
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
+@click.option("--apart", default="0", help="How far from their middle the outermost loads start, such as '3 deg'.")
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-8].")
 @click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
@@ -59,6 +60,7 @@ def simulate(
     until: str,
     start: Start,
     mode: int | None,
+    apart: str,
     spin_up: str | None,
     tolerance: float | None,
     accuracy: float | None,
@@ -73,6 +75,7 @@ def simulate(
         until,
         start=start,
         mode=mode,
+        apart=apart,
         spin_up=spin_up,
         stepsize_controller=_steps(tolerance, accuracy),
         max_steps=max_steps,
@@ -98,6 +101,7 @@ def simulate(
         "drift": float(run.drift),
         "regime": _regime(run.regime),
         "settled": bool(run.settled),
+        "together": bool(run.together),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
         "error": float(run.error),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
 from jaxvib.steady.balance.states import balanced_intervals
 
@@ -21,10 +21,11 @@ _RPM = 30.0 / np.pi
 @app.command("criterion")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--check", is_flag=True, help="Add the exact boundaries, from Floquet multipliers of the full equations.")
+@WITHOUT
 @shared
-def criterion(scene: Path, check: bool, output: Output) -> None:
+def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
     """Where collected loads of SCENE stay together and where they spread and balance the rotor, by the empirical criterion."""
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene, without)
     judged = jv.criterion(loaded)
     document = criterion_table(judged)
     top = 1.5 * max([*document["resonances"], *document["damped_resonances"], float(loaded.drive.speed)])

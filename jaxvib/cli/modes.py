@@ -10,8 +10,10 @@ import jax
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.errors import InputError
+from jaxvib.steady.jams.jam import JUDGED
+from jaxvib.steady.jams.phases import growth_apart
 
 _RPM = 30.0 / np.pi
 
@@ -24,13 +26,16 @@ SpeedUnit: TypeAlias = Literal["rad/s", "rpm"]
 @click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
+@WITHOUT
 @shared
-def modes(scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: bool, output: Output) -> None:
+def modes(
+    scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: bool, without: tuple[str, ...], output: Output
+) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
     Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
     with platforms and with a rotor that does not tilt, where no load has a station of its own and nothing is out of balance."""
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene, without)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
     if exact and phases:
@@ -47,15 +52,19 @@ def modes(scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: 
     if picture is not None:
         jv.branches(loaded).plot(unit=unit).savefig(picture)
     jams = [found.select(k) for k in found.mode_numbers()]
+    growth = dict(zip(found.mode.tolist(), growth_apart(loaded, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
         "rotor_speed": float(loaded.drive.speed),
         "resonances": found.resonances.tolist(),
+        "judged": JUDGED,
         "modes": [
             {
                 "mode": int(jam.mode),
                 "omega": float(jam.omega),
                 "stable": bool(jam.stable),
+                "growth_apart": growth[int(jam.mode)],
+                "status": jam.message,
                 "amplitude": jam.amplitude.tolist(),
                 "foundation_force": float(jam.foundation_force),
             }
@@ -70,7 +79,8 @@ def modes(scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: 
                 f"{int(jam.mode)}",
                 f"{float(jam.omega):.5g}",
                 f"{_RPM * float(jam.omega):.5g}",
-                "stable" if jam.stable else "unstable",
+                {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "apart"),
+                _apart(growth[int(jam.mode)]),
                 *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.4g}",
             ]
@@ -78,17 +88,28 @@ def modes(scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: 
         ]
         speed = float(loaded.drive.speed)
         resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
-        head = ["mode", "rad/s", "rpm", "by slope", *(f"{name}, mm" for name in structure.coordinates), "force on bed, N"]
+        head = ["mode", "rad/s", "rpm", "by slope", "loads free", *(f"{name}, mm" for name in structure.coordinates), "force"]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            table("jam modes of light loads; amplitudes and force zero to peak", head, rows) if rows else "no jam mode here",
+            table("jam modes of light loads; amplitudes zero to peak, force on the bed in N", head, rows)
+            if rows
+            else "no jam mode here",
         ]
+        if rows:
+            lines.append(
+                "by slope: of loads that stay together; loads free: each moves for itself (growth of a disturbance, 1/s)"
+            )
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
         return "\n".join([*lines, *_left_out(loaded)])
 
     output.done(document, text, "modes")
+
+
+def _apart(growth: float) -> str:
+    """What is known of a jam whose loads may part."""
+    return "not known" if np.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
@@ -106,6 +127,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": float(scene.drive.speed),
+        "judged": "by the growth of small disturbances, for light loads of which each moves for itself",
         "phase_jams": [
             {
                 "omega": float(jam.omega),
@@ -159,6 +181,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     document = {
         "rotor_speed": float(scene.drive.speed),
         "resonances": light.resonances.tolist(),
+        "judged": "by the multipliers of the full equations",
         "modes": [
             {
                 "mode": k,

@@ -71,6 +71,7 @@ def branch_diagram(
     units: Sequence[str] | None = None,
     at: float | None = None,
     unit: str = "rad/s",
+    title: str = "",
 ) -> Figure:
     """Three panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N.
 
@@ -101,6 +102,7 @@ def branch_diagram(
         axis.set_xlim(low, high)
         if at is not None:
             axis.axvline(scale * at, color="#c8501e", lw=0.9, ls="-.")
+    figure.suptitle(title, fontsize="medium")
     axes[0].set_ylim(0.0, None)
     axes[0].legend(loc="upper left")
     axes[1].legend(loc="best")

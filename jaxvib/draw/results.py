@@ -44,7 +44,7 @@ def modes_chart(
         top.legend(loc="best")
     top.set_ylabel("speed of loads, rad/s")
     bottom.set_ylabel("amplitude, m")
-    bottom.set_xlabel("jam mode (hollow: unstable)")
+    bottom.set_xlabel("jam mode (hollow: unstable by slope)")
     if np.any(amplitude > 0.0):
         bottom.set_yscale("log")
     bottom.set_xticks(mode)

@@ -45,8 +45,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.equations.linear import LinearModel, linear_model, turning_loads
-from jaxvib.errors import InputError
+from jaxvib.equations.linear import LinearModel, linear_model, require_effects, turning_loads
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -163,10 +162,10 @@ def averaged_loads(scene: Scene) -> CircularLoads:
     **Raises** `InputError`, besides what `turning_loads` refuses, for effects that `has_imbalance` or `couples_loads`.
     """
     loads = turning_loads(scene)
-    for effect in scene.effects:
-        for name in ("has_imbalance", "couples_loads"):
-            if getattr(effect, name):
-                raise InputError(f"effects.{effect.kind}", f"is not averaged (property {name}); leave it out here, or simulate")
+    for name in ("has_imbalance", "couples_loads"):
+        require_effects(
+            [effect.kind for effect in scene.effects if getattr(effect, name)], f"is|are not averaged (property {name})"
+        )
     return loads
 
 

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, jammed_loads
-from jaxvib.errors import InputError
+from jaxvib.equations.linear import LinearModel, jammed_loads, require_effects
 from jaxvib.machine.effects.base import Effect, total_gravity
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -105,11 +104,8 @@ def collected_model(linear: LinearModel) -> CollectedModel:
 def require_collected(scene: Scene) -> CircularLoads:
     """The loads of a scene whose jams repeat. **Raises** `InputError` for a rotor out of balance, and as `jammed_loads`."""
     loads = jammed_loads(scene)
-    for effect in scene.effects:
-        if effect.has_imbalance:
-            raise InputError(
-                f"effects.{effect.kind}", "shakes the machine at the rotor's own speed, so that no motion repeats; leave it out"
-            )
+    shaking = [effect.kind for effect in scene.effects if effect.has_imbalance]
+    require_effects(shaking, "shakes|shake the machine at the rotor's own speed, so that no motion repeats", "or simulate")
     return loads
 
 

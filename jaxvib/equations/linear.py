@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
@@ -22,6 +24,7 @@ __all__ = [
     "linear_model",
     "natural_frequencies",
     "peak_force",
+    "require_effects",
     "require_one_point",
     "steady_displacement",
     "turning",
@@ -101,7 +104,7 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return linear_model(scene).modes()[0]
+    return linear_model(checked(scene)).modes()[0]
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
@@ -177,10 +180,21 @@ def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
             "drive.kind",
             f"is {drive.kind!r}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
-    for effect in scene.effects:
-        if not (effect.averages_out or (friction and effect.has_friction)):
-            named = "averages_out or has_friction" if friction else "averages_out"
-            raise InputError(
-                f"effects.{effect.kind}", f"is not part of this theory (property {named}); leave it out here, or simulate"
-            )
+    named = "averages_out or has_friction" if friction else "averages_out"
+    require_effects(
+        [effect.kind for effect in scene.effects if not (effect.averages_out or (friction and effect.has_friction))],
+        f"is|are not part of this theory (property {named})",
+    )
     return cast(CircularLoads, loads)
+
+
+def require_effects(kinds: Sequence[str], problem: str, advice: str = "here, or simulate") -> None:
+    """**Raises** `InputError` that names all effects of these `kinds` at once, if there are any, with their `problem`: a verb
+    for one and, after |, for several, and the rest of the sentence."""
+    named = list(dict.fromkeys(kinds))
+    verbs, rest = problem.split(" ", 1)
+    one, several = verbs.split("|")
+    if len(named) == 1:
+        raise InputError(f"effects.{named[0]}", f"{one} {rest}; leave it out {advice}")
+    if named:
+        raise InputError("effects", f"{', '.join(named[:-1])} and {named[-1]} {several} {rest}; leave them out {advice}")

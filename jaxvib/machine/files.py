@@ -30,6 +30,7 @@ __all__ = [
     "closest",
     "load_scene",
     "read_toml",
+    "rebuilt",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
@@ -113,7 +114,7 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
 
     **Arguments**: `scene`; `path` of the file, which is overwritten.
 
-    **Returns** its path. **Raises** `OSError` where it cannot be written.
+    **Returns** its path. **Raises** `InputError` where it cannot be written.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -123,7 +124,10 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
     True
     """
     path = Path(path)
-    path.write_text(scene_to_toml(scene), encoding="utf-8")
+    try:
+        path.write_text(scene_to_toml(scene), encoding="utf-8")
+    except OSError as error:
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
     return path
 
 
@@ -211,6 +215,14 @@ def called(build: Callable[..., T], values: Mapping[str, object], section: str) 
         if parameter.default is parameter.empty and name not in values:
             raise InputError(f"{section}.{name}", f"is missing; needed here: {', '.join(_needed(parameters))}")
     return build(**values)
+
+
+def rebuilt(part: Any, section: str) -> Any:
+    """A part of a scene made anew from its numbers by its constructor, which checks them; itself where no file can hold it."""
+    build = {**_MACHINES, **_LOADS, **_DRIVES, **_EFFECTS}.get(part.kind)
+    if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
+        return part
+    return called(build, _fields(part, build), section)
 
 
 def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:

@@ -32,6 +32,11 @@ class Loads(eqx.Module):
     circular: ClassVar[bool] = False
     """Whether the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
 
+    @property
+    def has_bearing(self) -> bool:
+        """Whether each load hangs on the shaft by a bearing of its own, as a pendulum does."""
+        return False
+
     @abc.abstractmethod
     def position(self, *u: Array) -> tuple[Array, ...]:
         """The load's own position p(u), m: (across, up) in the rotor's plane, and along its axis where it moves there."""
@@ -73,6 +78,11 @@ class CircularLoads(Loads):
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
     own_radius: Array | None = None
+
+    @property
+    def has_bearing(self) -> bool:
+        """A pendulum has one; a ball or a roller rolls in its track."""
+        return self.inertia is not None
 
     @property
     def alike(self) -> bool:
@@ -125,7 +135,7 @@ def _circular(
     inertia: Numbers | None,
     own_radius: Number | None = None,
 ) -> CircularLoads:
-    n = count(count_, "loads.count")
+    n = count(count_, "loads.count", each=256)
 
     def each(value: Numbers, unit: str, name: str, open_low: bool) -> Array:
         return numbers(value, unit, f"loads.{name}", n, low=0.0, open_low=open_low, shared=True)

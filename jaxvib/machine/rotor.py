@@ -107,7 +107,8 @@ def rotor(
     where they are not what the supports make, see `Rotor`.
 
     **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports that are both at
-    one place, and for terms that no supports can have (negative ones, or c2^2 > c1 c3).
+    one place, for a polar inertia above twice the transverse one, and for terms that no supports can have (negative ones, or
+    c2^2 > c1 c3).
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
@@ -140,10 +141,15 @@ def rotor(
     if stiffness_terms is None and not traced(places) and places[0] == places[1]:
         problem = "where nothing holds the rotor's tilt; give two places, such as [0.165, -0.155]"
         raise InputError("machine.position", f"puts both supports at {float(places[0]):g} m, {problem}")
+    across = number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True)
+    along = number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0)
+    if not traced(across) and not traced(along) and float(along) > 2.0 * float(across) * (1.0 + 1e-6):
+        most = f"no body has more than twice its transverse inertia, {2.0 * float(across):g} kg m^2 (a thin disc)"
+        raise InputError("machine.polar_inertia", f"is {float(along):g} kg m^2; {most}")
     return Rotor(
         mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
-        transverse_inertia=number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True),
-        polar_inertia=number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0),
+        transverse_inertia=across,
+        polar_inertia=along,
         stiffness=numbers(stiffness, "N/m", "machine.stiffness", 2, low=0.0),
         damping=numbers(damping, "N s/m", "machine.damping", 2, low=0.0),
         position=places,

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import equinox as eqx
+import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
+from jaxvib.units import traced
 
-__all__ = ["Scene"]
+__all__ = ["Scene", "require_comparable"]
+
+_LEAST = 1e-15
+"""Share of another number below which double precision does not feel one beside it."""
 
 
 class Scene(eqx.Module):
@@ -62,9 +67,37 @@ class Scene(eqx.Module):
             )
         for effect in effects:
             effect.check(machine, loads)
+        require_comparable(machine, loads, drive)
         self.machine = machine
         self.loads = loads
         self.drive = drive
         # The order has no meaning; it is the one in which a scene file names them.
         first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
         self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
+
+
+def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
+    """**Raises** `InputError` for numbers, where they are known, of which one is lost in the rounding of another: loads too
+    heavy or too light beside the machine, drag too weak beside their inertia."""
+    platforms, mass, drag = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None)
+    if any(traced(x) for x in (platforms, mass, drag, drive.speed)):
+        return
+    each = np.broadcast_to(np.asarray(mass, dtype=float), (loads.count,))
+    if platforms is not None:
+        whole, total = float(np.sum(np.asarray(platforms, dtype=float))), float(np.sum(each))
+        if not _LEAST <= total / whole <= 1.0 / _LEAST:
+            raise InputError(
+                "loads.mass",
+                f"makes {total:.3g} kg in all on a machine of {whole:.3g} kg, so that rounding loses one beside the other; "
+                f"loads may have {_LEAST:g} to {1.0 / _LEAST:g} times the machine's mass",
+            )
+    if drag is not None:
+        share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
+        lost = (share > 0.0) & (share < _LEAST)
+        if np.any(lost):
+            least = _LEAST * float(np.max(each[lost])) * float(drive.speed)
+            raise InputError(
+                "loads.drag",
+                f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by a radian, which is lost in "
+                f"rounding; give 0, or {least:.1g} N s/m at least",
+            )

@@ -21,9 +21,9 @@ from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
-from jaxvib.motion.start import initial_state
+from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y
@@ -149,6 +149,7 @@ def ensemble(
     end = number(until, "s", "until", low=0.0, open_low=True)
     lanes = min(count(lanes, "lanes"), runs)
     made = _made(make, values)
+    require_start(made[0], made[1].angle)
     known = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.
     shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]
@@ -169,7 +170,12 @@ def ensemble(
     counts = np.asarray([each, coarse] if compared else [each], end.dtype)
     last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs)
     # What a method of order 3 would leave of the difference; this one is of order 8.
-    error = apart * (coarse / each) ** 3 if compared else jnp.asarray(np.full(runs, np.inf if estimate else np.nan, end.dtype))
+    radians = made[0].drive.speed * end
+    share = (coarse / each) ** 3
+    unknown = np.inf if estimate else np.nan
+    error = jnp.asarray(np.full(runs, unknown, end.dtype))
+    if compared:
+        error = estimated_error(apart, share, made[0], taken, radians)
     found = Ensemble(last, load_speed, error, finite, taken[0], jnp.asarray(jnp.nan, end.dtype))
     if not known:
         return found

@@ -28,6 +28,9 @@ WINDOW = 4096
 PER_TURN = 16
 """Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
 
+_UNBOUNDED = 1e8
+"""So many times its start, or its natural units, no motion reaches that has bounds."""
+
 
 class StepControl(eqx.Module):
     """How steps are chosen: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
@@ -114,6 +117,7 @@ def integrate(
     longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
+    saves.append(diffrax.SubSaveAt(t1=True))
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wrap_angles(scene, state.displacement.dtype)
@@ -145,13 +149,17 @@ def integrate(
     assert solution.ts is not None and solution.ys is not None
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
-    whole = trajectory(scene, solution.ts[1], motion.unpack(solution.ys[1])) if samples else None
+    whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if samples else None
     seen = (measure(scene, field, times, states), window, whole)
     measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
+    last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
+    # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
+    ended = solution.result == diffrax.RESULTS.successful
+    bounded = jnp.where(ended, is_finite(states), ~_grew(scene, state, last))
     steps = solution.stats["num_steps"]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
-        status=RunStatus.where(exists, _status(solution.result, is_finite(states)), RunStatus.no_start),
+        status=RunStatus.where(exists, _status(solution.result, bounded), RunStatus.no_start),
         trajectory=whole,
         window=window,
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
@@ -161,14 +169,30 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
+        together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
     )
 
 
-def _status(result: diffrax.RESULTS, finite: Array) -> RunStatus:
-    ended = RunStatus.where(finite, RunStatus.done, RunStatus.not_finite)
+def _is_together(angle: Array) -> Array:
+    """Whether several loads have one angle (..., count) all the time, but for what rounding may have grown to."""
+    apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
+    return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
+
+
+def _grew(scene: Scene, first: State, last: State) -> Array:
+    """Whether the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
+    unit = natural_units(scene)
+    pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
+    beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
+    return beyond[0] | beyond[1] | ~is_finite(last)
+
+
+def _status(result: diffrax.RESULTS, bounded: Array) -> RunStatus:
+    ended = RunStatus.where(bounded, RunStatus.done, RunStatus.not_finite)
     # A step that is refused until it is none has numbers in it that are not finite.
     failed = RunStatus.where(result == diffrax.RESULTS.dt_min_reached, RunStatus.not_finite, RunStatus.no_step)
     failed = RunStatus.where(result == diffrax.RESULTS.max_steps_reached, RunStatus.max_steps_reached, failed)
+    failed = RunStatus.where(bounded, failed, RunStatus.not_finite)
     return RunStatus.where(result == diffrax.RESULTS.successful, ended, failed)
 
 

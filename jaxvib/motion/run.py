@@ -47,14 +47,16 @@ class Run(AbstractMeasured, Result):
 
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
-    were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran. What
-    it cost, the runs with larger steps that were made for its error included: `evaluations` of the vector field (0 where the
-    method does not say) and `seconds`, compiling included where the program was new, NaN under a JAX transformation.
+    were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran;
+    `together`: whether several loads started at one angle and stayed there, as equal ones do until rounding parts them: such a
+    motion may look settled where loads a little apart would leave it (start them `apart` to see). What it cost, the runs with
+    larger steps that were made for its error included: `evaluations` of the vector field (0 where the method does not say) and
+    `seconds`, compiling included where the program was new, NaN under a JAX transformation.
 
     The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles
     in rad, speeds of loads relative to the rotor's. It is what is left of the difference to a run with larger steps, of which
-    not all is counted on to vanish with smaller ones. A motion that forgets its phase has a large error and may have exact
-    amplitudes all the same.
+    not all is counted on to vanish with smaller ones, and twice of it where an effect is not `smooth`; rounding counts too. A
+    motion that forgets its phase has a large error and may have exact amplitudes all the same.
     """
 
     status: RunStatus
@@ -66,12 +68,14 @@ class Run(AbstractMeasured, Result):
     evaluations: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
     scene: Scene = eqx.field(metadata=SCENE)
+    together: Array | bool = eqx.field(default=False, metadata=in_unit(""))
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled"
+        glued = ["  all loads ran at one angle, as they started: whether they would stay so was not tested; start them apart"]
         return "\n".join(
             [
                 f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
@@ -81,6 +85,7 @@ class Run(AbstractMeasured, Result):
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
                 f"  {self.extent(self.scene)}",
                 f"  {self.regime.summary()}",
+                *(glued if self.together else []),
             ]
         )
 

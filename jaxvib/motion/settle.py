@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-
-import jax.numpy as jnp
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest, wrap_angles
+from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
@@ -60,6 +60,7 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
+    scene = checked(scene)
     if not scene.drive.constant:
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed only")
     count(periods, "periods")
@@ -70,7 +71,7 @@ def settle(
     if isinstance(start, State):
         state = whole_state(scene, start, mode)
     else:
-        state = initial_state(scene, start, mode=mode, angles=_parted(scene, start), throw=throw)
+        state = initial_state(scene, start, mode=mode, apart=_APART if start == "jam" else 0.0, throw=throw)
     _, slowest = fastest_and_slowest(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
@@ -79,7 +80,9 @@ def settle(
         if float(run.drift) < drift or not bool(run.status == RunStatus.done):
             break
         state = last_state(scene, run)
+        together = run.together
         run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
+        run = dataclasses.replace(run, together=run.together & together)
     if throw and not float(run.drift) < drift:
         raise ComputationError(
             "not_settled",
@@ -89,15 +92,6 @@ def settle(
     if throw and mode is not None:
         _require_mode(scene, run, mode)
     return run
-
-
-def _parted(scene: Scene, start: Start) -> list[float] | None:
-    n = scene.loads.count
-    if start != "jam" or n == 1:
-        return None
-    _, touching = wrap_angles(scene, float)
-    beside = scene.loads.offsets() if touching else jnp.zeros(n)  # pyright: ignore[reportAttributeAccessIssue]
-    return [float(beside[k]) + _APART * (2.0 * k / (n - 1) - 1.0) for k in range(n)]
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

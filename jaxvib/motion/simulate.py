@@ -17,11 +17,12 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
@@ -50,6 +51,7 @@ def simulate(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
+    apart: Number = 0.0,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
@@ -68,7 +70,8 @@ def simulate(
 
     - `until`: end time, s or text such as "20 s"
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
-      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
+      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`. Loads start together
+      unless said how far `apart`, rad: where they share every number they then stay together (`Run.together`), stable or not
     - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16384, for runs of more than 1024 turns of the
       rotor 262144, and 2000 under a JAX transformation); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
@@ -106,17 +109,18 @@ def simulate(
 
     Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
     """
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    scene = checked(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
-    samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2)
+    samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
     periods = jnp.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
-    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, throw=throw)
+    if given and (traced(apart) or apart != 0.0):
+        raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
+    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
@@ -194,12 +198,13 @@ def _coarser(control: StepControl) -> StepControl:
 
 
 def _shrink(fine: StepControl, coarse: StepControl) -> Array:
-    """What share of the difference between two runs is the error of the finer one: for a method of order 8 the error falls with
-    the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.6 and 3, so that the estimate errs upward."""
+    """What share of the difference between two runs is the error of the finer one, where the motion is smooth: for a method of
+    order 8 the error falls with the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.45 and 3, so that the
+    estimate errs upward."""
     if fine.steps is not None and coarse.steps is not None:
         return (coarse.steps / fine.steps) ** 3
     assert fine.tolerance is not None and coarse.tolerance is not None
-    return (fine.tolerance / coarse.tolerance) ** 0.6
+    return (fine.tolerance / coarse.tolerance) ** 0.45
 
 
 def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: list[Run]) -> Run:
@@ -210,10 +215,16 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
         known = known & (control.steps != coarser.steps)
     ours, theirs = fine.window.state, coarse.window.state
     theirs = turned(theirs, ours) if wrap_angles(scene, fine.error.dtype)[0] else theirs
-    error = scaled_error(ours, theirs, error_scale(ours, natural_units(scene))) * _shrink(control, coarser)
+    difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
+    error = estimated_error(difference, _shrink(control, coarser), scene, fine.steps, _radians(scene, fine))
     error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
     return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
+
+
+def _radians(scene: Scene, run: Run) -> Array:
+    """What moves fastest turns by so much in a run."""
+    return fastest_and_slowest(scene)[0] * run.window.time[-1]
 
 
 def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
@@ -229,7 +240,8 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
         tolerance = float(cast(Array, control.tolerance))
         if float(found.error) <= accuracy:
             return found
-        if tolerance <= floor:
+        # Smaller steps only add to what rounding alone makes of the error.
+        if tolerance <= floor or float(estimated_error(0.0, 0.0, scene, latest.steps, _radians(scene, latest))) > accuracy:
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
@@ -269,21 +281,21 @@ def _in_stretches(
         controller = StepControl(steps=jnp.ceil(controller.steps / number))
     length = whole_turns(scene, float(end) / number)
     last = float(end) - (number - 1) * length
-    taken, rejected, evaluations = 0, 0, 0
+    taken, rejected, evaluations, together = 0, 0, 0, True
     found = None
     for k in range(number):
         span = jnp.asarray(length if k < number - 1 else last, end.dtype)
         found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, None)
         state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
-        evaluations += int(found.evaluations)
+        evaluations, together = evaluations + int(found.evaluations), found.together & together
         if not bool(found.status == RunStatus.done):
             break
     assert found is not None
     counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
-    return _with(found, seconds=time.perf_counter() - begun)
+    return _with(found, seconds=time.perf_counter() - begun, together=together)
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:
@@ -307,6 +319,13 @@ def _enough_samples(scene: Scene, end: Array) -> int:
     return 2000 if traced(wanted) else _FEW_SAMPLES if float(wanted) <= _FEW_SAMPLES else _MANY_SAMPLES
 
 
+def _sample_size(scene: Scene) -> float:
+    """Bytes that a state that is kept takes, with the forces that belong to it, held three times while it is made."""
+    structure, coordinates = scene.machine.structure(), len(scene.loads.rest())
+    numbers = 2 * structure.mass.shape[0] + 2 * coordinates * scene.loads.count + structure.bed_stiffness.shape[0] + 5
+    return 3.0 * scene.drive.speed.dtype.itemsize * numbers
+
+
 def enough_steps(scene: Scene, end: Array) -> int:
     """500 steps for each turn of what moves fastest, rounded up to a power of 2: few programs where it is part of one."""
     turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
@@ -314,7 +333,6 @@ def enough_steps(scene: Scene, end: Array) -> int:
         return 2**20
     steps = 4096 + 500 * float(turns)
     if not steps <= _MOST_STEPS:
-        require_numbers(scene)
         raise InputError("until", f"is {float(end):g} s, {float(turns):.2g} turns of what moves fastest; run shorter stretches")
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
@@ -322,7 +340,6 @@ def enough_steps(scene: Scene, end: Array) -> int:
 def _raise_if_failed(run: Run, max_steps: int, chosen: StepChoice | None) -> None:
     if bool(run.status == RunStatus.done):
         return
-    require_numbers(run.scene)
     name, hint = status_name(run.status), ""
     kept = run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)

@@ -16,16 +16,22 @@ from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import Number, Numbers, numbers, traced
+from jaxvib.units import Number, Numbers, number, numbers, traced
 
-__all__ = ["Start", "brought_up", "initial_state", "require_numbers", "whole_state"]
+__all__ = ["Start", "brought_up", "initial_state", "require_start", "whole_state"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
 
 
 def initial_state(
-    scene: Scene, start: Start = "rest", *, mode: int | None = None, angles: Numbers | None = None, throw: bool = True
+    scene: Scene,
+    start: Start = "rest",
+    *,
+    mode: int | None = None,
+    angles: Numbers | None = None,
+    apart: Number = 0.0,
+    throw: bool = True,
 ) -> State:
     """A state to start from.
 
@@ -37,6 +43,8 @@ def initial_state(
     - `angles`: the loads' angles about the rotor's axis, one number or (count,), rad, in place of the named ones (those of
       `Loads.rest` at rest, 0 in a jam, where the platforms go with the mean angle; loads that touch each other lie side by side
       there)
+    - `apart`: how far the outermost loads start from the middle, rad, the others evenly between them: what only loads that are
+      exactly together would keep up, does not last then
     - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
@@ -58,18 +66,22 @@ def initial_state(
     mass = scene.machine.structure().mass
     zero = jnp.zeros(mass.shape[:1], mass.dtype)
 
+    half = number(apart, "rad", "apart", low=0.0)
+    spread = half * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1), zero.dtype)
+
     def phases(value: float | Array) -> Array:
         if angles is not None:
-            return numbers(angles, "rad", "angles", n)
+            return numbers(angles, "rad", "angles", n) + spread
         touching = any(effect.couples_loads for effect in scene.effects)
         if touching and isinstance(scene.loads, CircularLoads):
-            return value + scene.loads.offsets()
-        return value + jnp.zeros((n,), zero.dtype)
+            return value + scene.loads.offsets() + spread
+        return value + spread
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])
         first, *others = scene.loads.rest()
         angle = (phases(first), *others)
+        require_start(scene, angle)
         return State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor)
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
@@ -77,8 +89,14 @@ def initial_state(
         raise InputError(
             "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
         )
-    jam = jam_modes(scene).select(mode, throw=throw)
+    try:
+        modes = jam_modes(scene)
+    except InputError as error:
+        why = error.problem.split(";")[0]
+        raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
+    jam = modes.select(mode, throw=throw)
     angle = phases(0.0)
+    require_start(scene, (angle,))
     displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
     return State(
         displacement.real,
@@ -86,13 +104,6 @@ def initial_state(
         (angle,),
         (jnp.full((n,), jam.omega),),
     )
-
-
-def require_numbers(scene: Scene) -> None:
-    """**Raises** `InputError` for a scene that holds NaN: with it every step would be refused."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
-        if eqx.is_array(leaf) and not traced(leaf) and np.any(np.isnan(leaf)):
-            raise InputError(f"scene{jax.tree_util.keystr(path)}", "is not a number (nan); give one, see how it was computed")
 
 
 def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
@@ -129,4 +140,12 @@ def whole_state(scene: Scene, state: State, mode: int | None) -> State:
         shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
         if any(shape != (length,) for shape in shapes):
             raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
+    require_start(scene, state.angle)
     return state
+
+
+def require_start(scene: Scene, u: tuple[Array, ...]) -> None:
+    """**Raises** `InputError` where an effect says that the loads cannot start from coordinates `u` (..., count), if known."""
+    if not any(map(traced, u)):
+        for effect in scene.effects:
+            effect.check_start(scene.loads, u)

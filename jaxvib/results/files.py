@@ -38,13 +38,17 @@ def save(result: eqx.Module, path: str | Path) -> Path:
 
     Arrays are entries of the archive, a scene is a TOML text, all else stands in a JSON text.
 
-    **Returns** the path written to. **Raises** `InputError` for a result that holds what cannot be written.
+    **Returns** the path written to. **Raises** `InputError` for a result that holds what cannot be written, and for a path that
+    cannot be written to.
     """
     arrays: dict[str, np.ndarray] = {}
     layout = json.dumps(_encoded(result, arrays))
     path = Path(path)
     path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-    np.savez(path, **{_LAYOUT: np.asarray(layout)}, **arrays)  # pyright: ignore[reportArgumentType]
+    try:
+        np.savez(path, **{_LAYOUT: np.asarray(layout)}, **arrays)  # pyright: ignore[reportArgumentType]
+    except OSError as error:
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
     return path
 
 

@@ -40,6 +40,7 @@ __all__ = [
     "no_host_checks",
     "traced",
     "user_folder",
+    "wide_vectors_are_right",
 ]
 
 _TESTED = ((0, 10), (0, 12))
@@ -108,8 +109,7 @@ def accepted_flags(flags: list[str]) -> list[str]:
 
     A version that is not known to accept them is asked, in a process of its own (seconds); the answer is remembered in a file.
     """
-    version = importlib.metadata.version("jaxlib")
-    number = tuple(int(part) for part in version.split(".")[:2])
+    version, number = importlib.metadata.version("jaxlib"), _jaxlib()
     if _TESTED[0] <= number <= _TESTED[1]:
         return [flag for flag in flags if number < _GONE.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
@@ -123,6 +123,18 @@ def accepted_flags(flags: list[str]) -> list[str]:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             path.write_text(json.dumps(answers))
     return [flag for flag in flags if answers[flag]]
+
+
+def wide_vectors_are_right(flags: list[str]) -> bool:
+    """Whether programs are right that use vectors of 512 bits, under these XLA_FLAGS.
+
+    The newer code generator of jaxlib 0.10 then gives 0 for the arctangent of arrays of 64 numbers and more.
+    """
+    return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
+
+
+def _jaxlib() -> tuple[int, ...]:
+    return tuple(int(part) for part in importlib.metadata.version("jaxlib").split(".")[:2])
 
 
 def starts_with(flags: list[str]) -> bool:

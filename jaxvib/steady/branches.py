@@ -13,12 +13,13 @@ from jax import Array
 
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, fold_points
-from jaxvib.steady.jams.jam import AbstractJam, Jam, branch_points
+from jaxvib.steady.jams.jam import JUDGED, AbstractJam, Jam, branch_points
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.units import Number, count, number
 
@@ -47,7 +48,7 @@ class Branches(AbstractJam):
         folds = zip(
             *(np.asarray(x)[np.asarray(self.folds.exists)] for x in (self.folds.omega, self.folds.rotor_speed)), strict=True
         )
-        return branch_summary(self, [("fold", w, n) for w, n in folds])
+        return branch_summary(self, [("fold", w, n) for w, n in folds], JUDGED)
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
@@ -60,7 +61,7 @@ class Branches(AbstractJam):
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
-        return picture(self, marks, unit, most)
+        return picture(self, marks, unit, most, JUDGED)
 
 
 @overload
@@ -112,13 +113,14 @@ def branches(
 
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
+    scene = checked(scene)
     if exact:
         from jaxvib.steady.orbits.diagram import exact_branches  # needs the time integrator: only who asks pays
 
         return exact_branches(scene, points=points, least=least, most=most, accuracy=accuracy)
     if least is not None:
         raise InputError("least", "goes with exact=True only; light loads have a branch down to speed 0")
-    count(points, "points", low=2)
+    count(points, "points", low=2, each=1e3)
     top = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
     per_side = max(2, math.ceil(points / (2 * scene.machine.structure().mass.shape[0])))
     return _branches(scene, top, points, per_side)

@@ -13,6 +13,7 @@ from jax import Array
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
@@ -187,8 +188,7 @@ def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
 
 
 def _two_directions(scene: Scene) -> LinearModel:
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    scene = checked(scene)
     model = linear_model(scene)
     carrier = model.carrier
     if carrier.axes != (0, 1):

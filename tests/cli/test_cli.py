@@ -39,8 +39,9 @@ def test_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--json")
     document = json.loads(out)
     assert code == 0 and err == ""
-    assert set(document) == {"rotor_speed", "resonances", "modes", "folds"}
-    assert set(document["modes"][0]) == {"mode", "omega", "stable", "amplitude", "foundation_force"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "folds"}
+    keys = {"mode", "omega", "stable", "growth_apart", "status", "amplitude", "foundation_force"}
+    assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
     assert set(document["folds"][0]) == {"omega", "rotor_speed"}
     modes = jv.jam_modes(scene("two_mass", speed=150.0))
     assert [m["mode"] for m in document["modes"]] == modes.mode_numbers()
@@ -50,7 +51,8 @@ def test_modes_json_has_the_promised_keys(typed):
 
 def test_modes_writes_table_and_picture(typed, tmp_path):
     code, out, _ = typed("modes", "machine.toml", "--out", "pictures")
-    assert code == 0 and "mode" in out and "stable" in out and "wrote" in out
+    assert code == 0 and "mode" in out and "by slope: of loads that stay together" in out and "wrote" in out
+    assert "stable (-" in out and "unstable (" in out
     assert (tmp_path / "pictures" / "branches.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "pictures" / "modes.json").read_text())["rotor_speed"] == 150.0
 
@@ -61,7 +63,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     jv.save_scene(rotor, tmp_path / "rotor.toml")
     code, out, err = typed("modes", "rotor.toml", "--out", "o", "--json")
     document = json.loads(out)
-    assert code == 0 and err == "" and set(document) == {"rotor_speed", "phase_jams"}
+    assert code == 0 and err == "" and set(document) == {"rotor_speed", "judged", "phase_jams"}
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
@@ -82,7 +84,7 @@ def test_exact_modes_json_has_the_promised_keys(typed):
     code, out, err = typed("modes", "machine.toml", "--exact", "--json")
     document = json.loads(out)
     assert code == 0 and err == ""
-    assert set(document) == {"rotor_speed", "resonances", "modes", "special", "missing"}
+    assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "special", "missing"}
     assert set(document["special"][0]) == {"omega", "rotor_speed", "kind"}
     assert {"fold"} <= {point["kind"] for point in document["special"]}
 
@@ -97,6 +99,9 @@ def test_modes_say_that_an_imbalance_is_left_out(typed, tmp_path):
     assert said in typed("modes", "shaken.toml", "--phases")[1]
     code, _, err = typed("modes", "shaken.toml", "--exact")
     assert code == 2 and "effects.static_imbalance shakes the machine at the rotor's own speed" in err
+    assert typed("modes", "shaken.toml", "--exact", "--without", "static_imbalance")[0] == 0
+    code, _, err = typed("modes", "shaken.toml", "--without", "stop")
+    assert code == 2 and "--without is 'stop'; the scene's effects are: static_imbalance" in err
 
 
 def test_a_machine_without_springs_ends_in_a_sentence(typed, tmp_path):

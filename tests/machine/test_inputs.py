@@ -69,6 +69,10 @@ WRONG = {
     "gravity in kg": (lambda: jv.Gravity("9.81 kg"), "effects.gravity.g is '9.81 kg', which is not in m/s^2"),
     "no machine": (lambda: jv.Scene(3, balls(), jv.ConstantSpeed(1.0)), "machine is 3; it must be a Machine, for example"),
     "no drive": (lambda: jv.Scene(machine(), balls(), 5.0), "drive is 5.0; it must be a Drive, for example ConstantSpeed("),
+    "bearings of balls": (
+        lambda: scene(effects=(jv.DryFriction(0.1, 0.01),)),
+        "effects.dry_friction is that of a bearing, and a ball rolls without one (property has_bearing); give pendulums",
+    ),
     "no effect": (lambda: scene(effects=(5,)), "effects[0] is 5; it must be an Effect, for example Gravity()"),
     "twice": (lambda: scene(effects=(jv.Gravity(), jv.Gravity())), "effects names gravity 2 times; once is allowed"),
 }
@@ -157,6 +161,10 @@ WRONG_ROTORS = {
     "negative term": (
         lambda: jv.rotor(**ROTOR, damping_terms=(8e2, 0.0, -1.0)),
         r"damping_terms .* the outer two must be at least 0",
+    ),
+    "a polar inertia that no body has": (
+        lambda: jv.rotor(**{**ROTOR, "polar_inertia": 0.96}),
+        r"machine\.polar_inertia is 0\.96 kg m\^2; no body has more than twice its transverse inertia, 0\.958 kg m\^2",
     ),
     "supports at one place": (
         lambda: jv.rotor(**{**ROTOR, "position": 0.165}),

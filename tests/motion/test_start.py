@@ -59,3 +59,17 @@ def test_touching_loads_start_a_jam_side_by_side():
     start = jv.initial_state(s, "jam", mode=1)
     np.testing.assert_allclose(np.diff(start.angle[0]), 2.0 * np.arcsin(0.05), rtol=1e-12)
     np.testing.assert_allclose(jnp.mean(start.angle[0]), 0.0, atol=1e-12)
+
+
+def test_starts_that_cannot_be_say_what_else_to_start_from():
+    effects = (jv.CubicSupport(1e9), jv.Stop(1e6, gap=1e-3))
+    for ask in (lambda s: jv.simulate(s, 1.0, start="jam", mode=3), lambda s: jv.settle(s, mode=3)):
+        with pytest.raises(jv.InputError) as error:
+            ask(scene(effects=effects))
+        assert str(error.value) == (
+            "start is 'jam', but effects cubic_support and stop are not part of this theory (property averages_out or "
+            "has_friction); start at 'rest', or from a State"
+        )
+    with pytest.raises(jv.InputError, match=r"apart is 0\.1, which goes with named starts"):
+        jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), apart=0.1)
+    np.testing.assert_allclose(jv.initial_state(scene(), apart="3 deg").azimuth, -np.pi / 2 + np.deg2rad([-3.0, 0.0, 3.0]))

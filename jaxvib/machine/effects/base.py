@@ -69,6 +69,10 @@ class Effect(eqx.Module):
     half_turn_symmetric: ClassVar[bool] = False
     """Whether the equations with it stay the same under phi + pi, -q: then a jam's deviations have even harmonics only."""
 
+    smooth: ClassVar[bool] = False
+    """Whether its forces have all derivatives. Where they bend, or change as fast as dry friction, errors of a time integration
+    do not fall with the method's order, and less is counted on where they are estimated."""
+
     couples_loads: ClassVar[bool] = False
     """Whether loads act on each other by it, so that their order and their distances count."""
 
@@ -79,6 +83,9 @@ class Effect(eqx.Module):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
+
+    def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
+        """**Raises** `InputError` where loads cannot start from the coordinates `u`, (..., count) each and known."""
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array | None:
         """Potential energy of the loads, J, an entry a load or a pair of them; None where the effect has none."""
@@ -152,6 +159,7 @@ class Gravity(Effect):
     """
 
     averages_out = True
+    smooth = True
 
     g: Array
     kind: str = eqx.field(static=True)
@@ -187,6 +195,7 @@ class StaticImbalance(Effect):
     """
 
     averages_out = True
+    smooth = True
 
     moment: Array
     angle: Array
@@ -221,6 +230,7 @@ class MomentImbalance(Effect):
     """
 
     averages_out = True
+    smooth = True
 
     moment: Array
     angle: Array

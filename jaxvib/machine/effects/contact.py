@@ -5,6 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
@@ -54,6 +55,15 @@ class LoadContact(Effect):
             raise InputError("effects.load_contact", "needs loads that have a size: give balls or rollers their own_radius")
         if machine.structure().stations is not None:
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
+
+    def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
+        """In the order of the track, less than a turn from the first to the last."""
+        phi = np.asarray(u[0])
+        wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
+        if np.any(wrong):
+            which = np.round(phi[wrong][0] if phi.ndim > 1 else phi, 4).tolist()
+            problem = "loads in contact never pass each other: each angle must be above the one before, all within one turn"
+            raise InputError("start.angle", f"is {which} rad; {problem} (add 2 pi where a load is a turn behind, or sort them)")
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
         """k (2 r - s)^2 / 2 of each pair that overlaps."""

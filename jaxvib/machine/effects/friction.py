@@ -93,9 +93,14 @@ class DryFriction(Effect):
         self.kind = "dry_friction"
 
     def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads on a circle."""
+        """Loads on a circle that hang on bearings."""
         if not loads.circular:
             raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {loads.kind!r}")
+        if not loads.has_bearing:
+            raise InputError(
+                "effects.dry_friction",
+                f"is that of a bearing, and a {loads.kind} rolls without one (property has_bearing); give pendulums, or drag",
+            )
 
     def friction(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float) -> Friction:
         """mu2 d/2 and N."""

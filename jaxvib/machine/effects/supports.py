@@ -64,6 +64,8 @@ class CubicSupport(_Support):
     2000000000.0
     """
 
+    smooth = True
+
     stiffness: Array
     platform: int | None = eqx.field(static=True)
     position: Array | None

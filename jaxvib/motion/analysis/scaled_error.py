@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State
+from jaxvib.machine.scene import Scene
 from jaxvib.units import traced
 
-__all__ = ["error_scale", "scaled_error", "turned"]
+__all__ = ["error_scale", "estimated_error", "scaled_error", "turned"]
 
 
 def error_scale(state: State, unit: State) -> State:
@@ -61,6 +63,23 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
             return xp.max(xp.abs(xp.asarray(x) - xp.asarray(y))) / xp.asarray(unit)
 
     return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
+
+
+def estimated_error(difference: Array, share: ArrayLike, scene: Scene, steps: ArrayLike, radians: ArrayLike) -> Array:
+    """The error of a run, from its `difference` to one with larger steps.
+
+        difference x share + 2 eps (steps + radians)
+
+    The `share` is what a smooth motion leaves of the difference. Where an effect is not `smooth` the error falls by jumps, as
+    steps happen to meet what bends the motion, and both runs may miss it alike: twice the difference counts. Rounding adds
+    2 eps for each step, and for each radian of what moves fastest, whose phase hangs on times that are rounded.
+
+    **Arguments**: `difference` see `scaled_error`; `steps` of the run; `radians` that the fastest speed or frequency turns by.
+
+    **Returns** a number, or an array of them.
+    """
+    kept = share if all(effect.smooth for effect in scene.effects) else 2.0
+    return difference * kept + 2.0 * float(np.finfo(scene.drive.speed.dtype).eps) * (steps + radians)
 
 
 def turned(state: State, to: State) -> State:

@@ -17,11 +17,12 @@ from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, avera
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
-from jaxvib.motion.start import Start, brought_up, initial_state, require_numbers, whole_state
+from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require, small_number
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, moved_on
@@ -159,13 +160,12 @@ def envelope(
 
     Source: see `averaged_field`.
     """
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    scene = checked(scene)
     averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
-    count(samples, "samples", low=2)
+    count(samples, "samples", low=2, each=1e3)
     count(turns, "turns")
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
@@ -351,7 +351,6 @@ def _units(scene: Scene) -> _Units:
 def _raise_if_failed(run: Envelope, max_steps: int) -> None:
     if bool(run.status == EnvelopeStatus.done):
         return
-    require_numbers(run.scene)
     hint = {
         "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
         "no_step": "; give a smaller tolerance, or leave the solver out",

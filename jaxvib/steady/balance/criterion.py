@@ -9,7 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import circular_loads, turning
+from jaxvib.equations.linear import circular_loads, require_one_point, turning
+from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -109,7 +111,8 @@ def criterion(scene: Scene) -> Criterion:
     The functional f of `criterion_functional` changes sign at the characteristic speeds alone, from + to - at a
     resonance and back at an additional speed, so these are the ends of the intervals.
 
-    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`. **Raises** `InputError` as there.
+    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`. **Raises** `InputError` as there, for a single
+    load, and for effects whose potential turns a load by itself (`Gravity`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,
@@ -119,6 +122,16 @@ def criterion(scene: Scene) -> Criterion:
 
     Source: Filimonikhin et al. 2022, sections 5.1-5.3, for any carrier.
     """
+    scene = checked(scene)
+    require_one_point(scene)
+    if scene.loads.count < 2:
+        raise InputError(
+            "loads.count", "is 1; the criterion tells loads that gather from loads that spread: it needs 2 or more"
+        )
+    for effect in scene.effects:
+        if effect.has_load_potential and not effect.couples_loads:
+            problem = "pulls at each load by its angle (property has_load_potential), which the criterion knows nothing of"
+            raise InputError(f"effects.{effect.kind}", f"{problem}; leave it out, or simulate")
     speeds = characteristic_speeds(scene)
     return Criterion(
         status=speeds.status,

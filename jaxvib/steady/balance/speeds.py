@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.numerics.roots import bracketed_root
@@ -157,6 +158,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
     Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints mended, for any carrier.
     """
+    scene = checked(scene)
     require_one_point(scene)
     _require_port_that_moves(scene)
     return _characteristic_speeds(scene)

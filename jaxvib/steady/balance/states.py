@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -134,6 +135,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
     """
+    scene = checked(scene)
     loads = _sides(circular_loads(scene))
     n = loads.size
     imbalance = _imbalance(scene)

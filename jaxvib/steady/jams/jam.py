@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, peak_force
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
@@ -24,7 +25,10 @@ from jaxvib.units import traced
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["AbstractJam", "Jam", "JamModes", "JamStatus", "jam_modes"]
+__all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_modes"]
+
+JUDGED = "by slope, for light loads that stay together"
+"""How the stability of a jam mode is judged, and for whom that holds."""
 
 
 class JamStatus(eqx.Enumeration):
@@ -33,6 +37,7 @@ class JamStatus(eqx.Enumeration):
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
+    apart = "these loads cannot stay together here: one needs more torque than the vibration has at any phase"
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
 
 
@@ -40,9 +45,10 @@ class AbstractJam(Result):
     """Jam modes of a scene, one or several.
 
     **Attributes**: `mode` number; `status` a `JamStatus`; `omega` speed of the loads, rad/s; `rotor_speed` rad/s; `stable` by
-    the slope; `slope` dn/dOmega; `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude`
-    (nd,) m, of tilts rad, and `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed
-    squares of their peaks (sqrt 2 times the force of a circular whirl); `coordinates` the names of the nd coordinates.
+    the slope dn/dOmega > 0, for light loads that stay together (whether they do, `phase_jams` tells); `slope` dn/dOmega;
+    `displacement` (nd,) complex amplitudes, m, of tilts rad, at load angle Omega t; `amplitude` (nd,) m, of tilts rad, and
+    `foundation_force` N, zero to peak; of two directions of the force it is the root of the summed squares of their peaks
+    (sqrt 2 times the force of a circular whirl); `coordinates` the names of the nd coordinates.
     """
 
     mode: Array = eqx.field(metadata=in_unit("", "*"))
@@ -66,9 +72,16 @@ class Jam(AbstractJam):
             return f"mode {int(self.mode)}: {self.message}"
         amplitude = ", ".join(f"{float(a):.4g}" for a in self.amplitude)
         return (
-            f"mode {int(self.mode)}: Omega {float(self.omega):.6g} rad/s, {'stable' if self.stable else 'unstable'}, "
+            f"mode {int(self.mode)}: Omega {float(self.omega):.6g} rad/s, {self.judgement}, "
             f"amplitude {amplitude} m, foundation force {float(self.foundation_force):.4g} N"
         )
+
+    @property
+    def judgement(self) -> str:
+        """ "stable" or "unstable" by slope, or that loads which differ cannot stay together."""
+        if bool(self.status == JamStatus.apart):
+            return "loads cannot stay together"
+        return f"{'stable' if self.stable else 'unstable'} by slope"
 
     def plot(self) -> Figure:
         """The speed of the loads and the amplitudes. **Returns** a matplotlib figure."""
@@ -120,7 +133,7 @@ class JamModes(AbstractJam):
         """A table a person can read; amplitudes zero to peak."""
         lines = [f"rotor speed {float(self.rotor_speed[0]):.6g} rad/s, resonances "]
         lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
-        return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers())])
+        return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
 
     def plot(self) -> Figure:
         """Speeds of the loads among the resonances, and amplitudes, by mode. **Returns** a matplotlib figure."""
@@ -163,6 +176,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
+    scene = checked(scene)
     drag = jammed_loads(scene).drag
     if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
@@ -211,18 +225,31 @@ def _jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array,
     displacement = jnp.where(bounded, displacement, jnp.nan)
     slope = jnp.where(bounded, branch_slope(model, omega), jnp.nan)
     status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
+    held = _held(model, omega, rotor_speed, displacement)
+    status = JamStatus.where(held, status, JamStatus.apart)
     return Jam(
         mode=number,
         status=JamStatus.where(bounded, status, JamStatus.unbounded),
         omega=omega,
         rotor_speed=rotor_speed,
-        stable=slope > 0.0,
+        stable=held & (slope > 0.0),
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
         foundation_force=peak_force(model.carrier.bed_force(displacement, 1j * omega * displacement)),
         coordinates=model.carrier.coordinates,
     )
+
+
+def _held(model: LinearModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
+    """Whether the vibration, which is largest where loads are together, has the torque S w^2 |e^H B Y| / 2 >= b_W R^2 (n - w)
+    that each load needs at some phase; loads that are alike share what there is."""
+    loads = jammed_loads(model.scene)
+    if loads.alike:
+        return True
+    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.direction.conj() * displacement)) / 2.0
+    need = loads.drag * loads.radius**2 * (rotor_speed - omega)
+    return jnp.all(~(most < (1.0 - 1e-6) * need))
 
 
 def branch_points(model: LinearModel, omega: Array) -> tuple[Jam, Folds]:

@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
@@ -47,6 +48,9 @@ _SHOWN = 30.0
 
 _SAME_LINE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
+
+_SAME = 1e-6
+"""Jams whose speeds differ by less, relative, and whose phases do not, are one."""
 
 _HALVINGS = 6
 """Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
@@ -141,10 +145,11 @@ def phase_jams(
 
     Source: Artyunin 2013, section V; leading order of the loads' mass, see `jam_modes` for loads at one angle.
     """
+    scene = checked(scene)
     if near is not None:
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
-    number = count(starts, "starts")
+    number = count(starts, "starts", each=64.0 * loads.count * _GRID)
     parts = parts_of(scene)
     speeds = _load_speeds(parts)
     rng = np.random.default_rng(count(seed, "seed", low=0))
@@ -155,26 +160,38 @@ def phase_jams(
     many = _power_of_2(omega.size)
     omega, phase = (np.asarray(x)[: omega.size] for x in _many(parts, jnp.asarray(omega[many]), jnp.asarray(phase[many])))
     groups = _equal_loads(parts)
-    unique: list[tuple[float, np.ndarray]] = []
+    starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
+    places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
+    # Where a start was solved for hardly, the same jam comes out once more: what is distinct is told of the jams themselves.
+    jams = [jam_from(scene, jnp.asarray(omega[k]), jnp.asarray(phase[k])) for k in starts_at[places]]
+    found = [k for k, jam in enumerate(jams) if bool(jam.status == PhaseStatus.found)]
+    speeds, angles = (np.asarray([getattr(jams[k], name) for k in found]) for name in ("omega", "phase"))
+    places, reached = _distinct(speeds, angles, reached[found], groups)
+    if not found:
+        # Nothing was found: the arrays are empty.
+        jams = [jam_from(scene, parts.speed, jnp.asarray(phases[0]))]
+    order = sorted(range(len(places)), key=lambda i: (-round(speeds[places[i]], 6), not bool(jams[found[places[i]]].stable)))
+    keep = np.asarray([found[places[i]] for i in order], dtype=int)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[keep], *jams)
+    fields = {name: getattr(stacked, name) for name in PhaseJam.__dataclass_fields__}
+    return PhaseJams(**fields, starts=jnp.asarray(reached[order], dtype=int), scene=scene)
+
+
+def _distinct(
+    omega: np.ndarray, phase: np.ndarray, starts: np.ndarray, groups: list[np.ndarray]
+) -> tuple[list[int], np.ndarray]:
+    """Places of jams (n,) that differ, by falling speed, and how many of the `starts` (n,) of all of them led to each."""
+    places: list[int] = []
     reached: list[int] = []
     for k in np.argsort(-omega, kind="stable"):
-        if not (np.isfinite(omega[k]) and 0.0 < omega[k] < float(parts.speed)):
-            continue
-        places = (i for i, (w, a) in enumerate(unique) if abs(w - omega[k]) < 1e-6 * w and _same(a, phase[k], groups))
-        place = next(places, None)
+        same = (i for i, p in enumerate(places) if abs(omega[p] - omega[k]) < _SAME * omega[p])
+        place = next((i for i in same if _same(phase[places[i]], phase[k], groups)), None)
         if place is None:
-            unique.append((float(omega[k]), phase[k]))
-            reached.append(1)
+            places.append(int(k))
+            reached.append(int(starts[k]))
         else:
-            reached[place] += 1
-    jams = [jam_from(scene, jnp.asarray(w), jnp.asarray(a)) for w, a in unique]
-    keep = [k for k, jam in enumerate(jams) if bool(jam.status == PhaseStatus.found)]
-    if not keep:
-        # Nothing was found: the arrays are empty.
-        jams, keep, reached = [jam_from(scene, parts.speed, jnp.asarray(phases[0]))], [], []
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[np.asarray(keep, dtype=int)], *jams)
-    fields = {name: getattr(stacked, name) for name in PhaseJam.__dataclass_fields__}
-    return PhaseJams(**fields, starts=jnp.asarray([reached[k] for k in keep], dtype=int), scene=scene)
+            reached[place] += int(starts[k])
+    return places, np.asarray(reached, dtype=int)
 
 
 def _starts(

@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "phase_jam", "phase_torques"]
+__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "growth_apart", "phase_jam", "phase_torques"]
+
+_NEAR = 0.02
+"""Relative distance of load speeds up to which two theories speak of the same jam."""
 
 
 class PhaseStatus(eqx.Enumeration):
@@ -266,3 +269,33 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
         torque=kept(torque),
         residual=residual,
     )
+
+
+def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
+    """Growth of small disturbances of jams whose loads are together, every load moving for itself, (n,) 1/s.
+
+    **Arguments**: `omega` (n,) rad/s of the jams that collected light loads have.
+
+    **Returns** the `growth` of `PhaseJam` for each; NaN where there is no such jam nearby, as for `omega` that is NaN, and
+    where loads lie side by side or rub, of which the theory knows nothing.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
+    >>> [round(float(x), 1) for x in growth_apart(scene, jv.jam_modes(scene).omega[jnp.array([0, 1, 4])])]
+    [-0.4, 19.4, 23.3]
+    """
+    loads, speeds = turning_loads(scene, friction=True), np.asarray(omega)
+    known = np.isfinite(speeds)
+    if loads.own_radius is not None or any(effect.has_friction for effect in scene.effects):
+        return np.full(speeds.shape, np.nan)
+    starts = np.where(known, speeds, float(scene.drive.speed))
+    found = _growths(scene, jnp.asarray(starts))
+    near = known & (np.abs(found.omega - starts) < _NEAR * starts) & np.asarray(found.pattern == PhasePattern.together)
+    return np.where(near, found.growth, np.nan)
+
+
+@eqx.filter_jit
+def _growths(scene: Scene, omega: Array) -> PhaseJam:
+    together = jnp.zeros(scene.loads.count, omega.dtype)
+    return jax.vmap(lambda w: jam_from(scene, w, together))(omega)

@@ -28,25 +28,26 @@ class _Branch(Protocol):
     scene: Scene
 
 
-def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]]) -> str:
-    """The ranges of a branch and its special points (kind, load speed, rotor speed), for a person to read."""
+def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], judged: str) -> str:
+    """The ranges of a branch and its special points (kind, load speed, rotor speed), for a person to read; how stability is
+    `judged`."""
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
     natural = ", ".join(f"{float(w):.6g}" for w in natural_frequencies(branch.scene))
     lines = [
-        f"{omega.size} points from {np.min(omega):.6g} to {np.max(omega):.6g} rad/s, {np.mean(stable):.1%} of them stable; "
-        f"resonances {natural} rad/s"
+        f"{omega.size} points from {np.min(omega):.6g} to {np.max(omega):.6g} rad/s, {np.mean(stable):.1%} of them stable "
+        f"{judged}; resonances {natural} rad/s"
     ]
     names = [(kind.replace("_", " "), w, n) for kind, w, n in marks]
     return "\n".join([*lines, *(f"  {kind}: Omega {w:.6g} rad/s, rotor {n:.6g} rad/s" for kind, w, n in names)])
 
 
 def picture(
-    branch: _Branch, marks: Sequence[tuple[str, float, float]], unit: Literal["rad/s", "rpm"], most: float | None
+    branch: _Branch, marks: Sequence[tuple[str, float, float]], unit: Literal["rad/s", "rpm"], most: float | None, judged: str
 ) -> Figure:
     """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
 
     **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
-    rotor speed shown, rad/s (a third above the scene's if None).
+    rotor speed shown, rad/s (a third above the scene's if None); how stability is `judged`.
 
     **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
     """
@@ -69,4 +70,5 @@ def picture(
         units=branch.scene.machine.structure().units,
         at=at,
         unit=unit,
+        title=f"solid: stable {judged}",
     )

@@ -37,6 +37,9 @@ _LANES = 32
 _POINTS = (8, 16, 32, 64)
 
 
+_JUDGED = "by the multipliers of the full equations"
+
+
 class SpecialPoint(NamedTuple):
     """Where the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker), "period_doubling"
     or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
@@ -74,11 +77,11 @@ class ExactBranches(Result):
 
     def summary(self) -> str:
         """The ranges of the branch, its resonances and its special points, for a person to read."""
-        return f"{branch_summary(self, list(self.special))}\n{self.message}"
+        return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
 
     def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
         """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
-        return picture(self, list(self.special), unit, most)
+        return picture(self, list(self.special), unit, most, _JUDGED)
 
 
 def exact_branches(
@@ -108,7 +111,7 @@ def exact_branches(
     >>> [(p.kind, round(p.omega, 4)) for p in diagram.special]
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
-    count(points, "points", low=2)
+    count(points, "points", low=2, each=1e4)
     crowded, resonances = _fold_points(scene)
     lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
     low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)

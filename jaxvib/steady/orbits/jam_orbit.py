@@ -11,6 +11,7 @@ from jax import Array
 from jaxvib.equations.collected import collected_model, has_half_turn
 from jaxvib.equations.linear import jammed_loads, linear_model
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
@@ -20,7 +21,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
-from jaxvib.units import Number, number, traced
+from jaxvib.units import Number, count, number, traced
 
 __all__ = ["exact_mode_speeds", "jam_orbit"]
 
@@ -89,7 +90,7 @@ def jam_orbit(
     if len(named) != 1:
         given = " and ".join(named) if named else "none"
         raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
-    scene = jax.tree.map(jnp.asarray, scene)
+    scene = checked(scene)
     frozen = jax.lax.stop_gradient(scene)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
@@ -117,6 +118,9 @@ def jam_orbit(
         value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
         which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
 
+    if points is not None:
+        bodies = 1 if jammed_loads(frozen).alike else frozen.loads.count
+        count(points, "points", low=2, each=16.0 * bodies**2 * float(points if isinstance(points, int) else 1))
     half = has_half_turn(scene)
     if points is None and not concrete:
         points = 16 if half else 33

@@ -30,12 +30,17 @@ __all__ = ["Identified", "IdentifyStatus", "identify"]
 _MOST_ITERATIONS = 64
 _TOLERANCE = 1e-9
 
+_CONTRADICTS = 0.05
+"""Relative difference of frequencies, besides what instruments leave open, that no ruler and no scales explain."""
+
 
 class IdentifyStatus(eqx.Enumeration):
     """What a fit is worth; the members are the sentences a user reads."""
 
     found = "the fit explains the record up to noise"
     patterned = "what the fit leaves of the record is no noise: the law of friction misses something, and errors are larger"
+    negative = "a coefficient of friction comes out below 0: the swing grows, or its decay is not that of this law"
+    contradicted = "the period contradicts the pendulum's length and inertia, and mu1 is in proportion to them"
     undetermined = "the record cannot tell friction from none: too short, too noisy, or swings of one size only"
     not_converged = "no fit was found: the record does not look like this pendulum's swing"
 
@@ -340,15 +345,22 @@ def _judged(
         notes.append(f"{wanted}: mu1 is in proportion to the moment of inertia, check them")
     for name, estimate in (("mu1", viscous), ("mu2", dry)):
         if estimate is not None and estimate.low <= 0.0:
-            notes.append(f"{name} cannot be told from 0 in this record")
+            below = estimate.high < 0.0
+            notes.append(
+                f"{name} is below 0, its whole interval too" if below else f"{name} cannot be told from 0 in this record"
+            )
     if math.isfinite(stop := float(fit.stopped_at)):
         notes.append(f"dry friction holds the pendulum from {stop + record.time[0]:.4g} s on")
 
     status = IdentifyStatus.found
     if not bool(fit.converged) or float(fit.noise) > 0.5 * float(np.std(record.angle)):
         status = IdentifyStatus.not_converged
+    elif viscous.high < 0.0 or (dry is not None and dry.high < 0.0):
+        status = IdentifyStatus.negative
     elif viscous.low <= 0.0 and (dry is None or dry.low <= 0.0):
         status = IdentifyStatus.undetermined
+    elif abs(frequency.value / small - 1.0) > _CONTRADICTS + instrument:
+        status = IdentifyStatus.contradicted
     elif abs(pattern) > 4.0 / math.sqrt(record.samples) and float(fit.noise) > 10.0 * _TOLERANCE:
         status = IdentifyStatus.patterned
     return Identified(

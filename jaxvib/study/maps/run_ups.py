@@ -12,12 +12,13 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime, RegimeName
 from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
-from jaxvib.motion.start import initial_state
+from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -137,8 +138,7 @@ def run_ups(
 
     Source: Artyunin 2013, section V, where one set of angles stands for all.
     """
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    scene = checked(scene)
     if not scene.loads.circular:
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle")
     loads = cast(CircularLoads, scene.loads)
@@ -155,9 +155,12 @@ def run_ups(
             raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
     elif starts is not None:
         sets = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
+        if any(effect.couples_loads for effect in scene.effects):
+            sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:
         sets = np.asarray(initial_state(scene).azimuth)[None]
     count(batch, "batch")
+    require_start(scene, (jnp.asarray(sets),))
 
     grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))
     shape = (len(drags), len(sets))

@@ -341,3 +341,19 @@ def test_one_trace_judges_a_batch():
     batch = jax.vmap(lambda k: jv.criterion(scaled(k)).balancing)(factors)
     for k, row in zip(factors, batch, strict=True):
         np.testing.assert_allclose(row, jv.criterion(scaled(k)).balancing, rtol=1e-13)
+
+
+def test_the_criterion_is_for_several_loads_that_nothing_pulls():
+    machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
+
+    def asked(count, *effects):
+        loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=1.0, own_radius=0.01)
+        return jv.criterion(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), effects))
+
+    with pytest.raises(jv.InputError, match=r"loads\.count is 1; the criterion tells loads that gather"):
+        asked(1)
+    with pytest.raises(
+        jv.InputError, match=r"effects\.gravity pulls at each load by its angle \(property has_load_potential\)"
+    ):
+        asked(2, jv.Gravity())
+    assert asked(2, jv.LoadContact(1e5)).status_name == "judged"

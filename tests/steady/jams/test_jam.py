@@ -197,7 +197,8 @@ def test_select_says_what_is_wrong():
 
 def test_summary_lists_the_modes():
     text = jv.jam_modes(published().scene()).summary()
-    assert len(text.splitlines()) == 4 and "mode 3: Omega 0.972053 rad/s, stable" in text and "mode 4" in text
+    assert len(text.splitlines()) == 5 and "mode 3: Omega 0.972053 rad/s, stable by slope" in text and "mode 4" in text
+    assert text.endswith("stable: by slope, for light loads that stay together")
 
 
 def test_vmap_over_rotor_speeds_is_a_loop():
@@ -207,3 +208,19 @@ def test_vmap_over_rotor_speeds_is_a_loop():
         one = jv.jam_modes(eqx.tree_at(lambda x: x.drive.speed, s, n))
         for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(one), strict=True):
             np.testing.assert_allclose(a[k], b, rtol=1e-11, atol=1e-300)
+
+
+def test_loads_too_unlike_to_stay_together_are_not_called_stable():
+    """One of two pendulums is dragged so hard that no vibration of this size holds it: its balance has no root at any phase."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
+
+    def modes(drag):
+        return jv.jam_modes(jv.Scene(machine, jv.pendulums(count=2, mass=0.5, radius=0.1, drag=drag), jv.ConstantSpeed(60.0)))
+
+    for drag, holds in (([0.4, 0.5], True), ([0.02, 1.5], False)):
+        jam = modes(drag).select(1)
+        vibration = 0.5 * 0.1 * float(jam.omega) ** 2 * float(jam.amplitude[0]) / 2.0
+        need = max(drag) * 0.01 * (60.0 - float(jam.omega))
+        assert (vibration > need) == holds == bool(jam.stable), (vibration, need)
+        assert jam.status_name == ("found" if holds else "apart") and float(jam.slope) > 0.0
+        assert ("stable by slope" in jam.summary()) == holds and ("cannot stay together" in jam.summary()) != holds

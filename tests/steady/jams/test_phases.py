@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import machines
+from scenes import scene as platforms
 
 import jaxvib as jv
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.steady.jams.phase_search import _same, phase_branch
-from jaxvib.steady.jams.phases import phase_jam, phase_torques
+from jaxvib.steady.jams.phases import growth_apart, phase_jam, phase_torques
 
 K1, K2, L1, L2 = 0.604e6, 0.555e6, 0.165, 0.155
 STATIONS = (0.28, 0.25, -0.25, -0.28)
@@ -260,3 +261,28 @@ def test_wrong_questions():
     assert "stable" in jams.summary() and "all together" in jams.summary()
     with pytest.raises(jv.InputError, match="index is 3; there are 3 jams, counted from 0"):
         jams.select(3)
+
+
+def test_jams_by_slope_are_judged_for_loads_that_may_part():
+    """On platforms only the jam below a resonance keeps free loads: where the slope calls mode 5 stable, they part."""
+    s = platforms()
+    modes = jv.jam_modes(s)
+    growth = growth_apart(s, modes.omega)
+    assert modes.stable.tolist() == [False, False, True, False, True]
+    np.testing.assert_array_equal(np.isnan(growth), [True, True, False, False, False])
+    assert growth[2] < 0.0 < growth[3] and growth[4] > 0.0
+    # The full equations, loads 0.01 rad apart, and together.
+    asked = dict(start="jam", mode=5, estimate=False, samples=2)
+    glued, parted = (jv.simulate(s, 2.0, apart=a, **asked) for a in (0.0, 0.01))
+    apart = [float(np.ptp(run.trajectory.state.angle[0][k])) for run in (glued, parted) for k in (0, -1)]
+    assert apart[0] == 0.0 and apart[1] < 1e-6 and abs(apart[2] - 0.02) < 1e-12 and apart[3] > 0.5
+    assert bool(glued.together) and not bool(parted.together)
+    assert "whether they would stay so was not tested" in glued.summary() and "tested" not in parted.summary()
+
+
+def test_every_jam_is_listed_once_and_in_order():
+    """Of three equal balls on two platforms, whose jams next to the rotor's speed many starts hardly reach."""
+    jams = jv.phase_jams(platforms())
+    omega = np.asarray(jams.omega)
+    assert omega.size == 6 and np.all(np.diff(omega) < 0.0) and np.min(-np.diff(omega)) > 0.5
+    assert jams.stable.tolist() == [False] * 5 + [True] and int(jnp.sum(jams.starts)) > 100

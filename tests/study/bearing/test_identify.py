@@ -110,3 +110,13 @@ def test_student_quantile_is_scipys():
 
     for freedom in (10, 30, 1000):
         np.testing.assert_allclose(student_quantile(freedom), t.ppf(0.975, freedom), rtol=2e-4)
+
+
+def test_a_growing_swing_and_a_wrong_length_are_named():
+    t = np.arange(0.0, 20.0, 0.04)
+    grows = jv.identify(ROD, jv.Record(t, noisy(scipy_swing(ROD, t, 0.1, 0.0, -1e-3)[0], 1e-3, 0)))
+    assert grows.viscous.high < 0.0 and grows.status_name == "negative" and "whole interval" in grows.notes[0]
+    clean = noisy(scipy_swing(ROD, t, 0.3, 0.0, 1e-3)[0], 1e-3, 0)
+    for length, inertia, status in ((0.25, 0.00625, "found"), (0.26, 0.00625, "found"), (0.4, 0.0, "contradicted")):
+        told = jv.BearingPendulum(mass=0.3, length=length, inertia=inertia)
+        assert jv.identify(told, jv.Record(t, clean)).status_name == status, length

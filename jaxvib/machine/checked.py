@@ -1,0 +1,65 @@
+"""A scene is checked once more where a question is asked: `equinox.tree_at` puts in whatever it is given."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import rebuilt
+from jaxvib.machine.scene import Scene, require_comparable
+from jaxvib.units import traced
+
+__all__ = ["checked"]
+
+_FOUND_GOOD: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
+"""Scenes that need not be looked at again, by their identity: a scene never changes."""
+
+
+def checked(scene: Scene) -> Scene:
+    """The scene, every number in it an array; where all of them are known, each is one that its constructor would take.
+
+    **Raises** `InputError` for what is no scene, and for a number that is not allowed where it stands.
+
+    >>> import equinox as eqx, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    >>> checked(eqx.tree_at(lambda s: s.drive.speed, scene, -60.0))
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: drive.speed is -60 rad/s; it must be greater than 0
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if _FOUND_GOOD.get(id(scene)) is scene:
+        return scene
+    leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
+    arrays = [_number(f"scene{jax.tree_util.keystr(path)}", leaf) for path, leaf in leaves]
+    if any(new is not old for new, (_, old) in zip(arrays, leaves, strict=True)):
+        scene = jax.tree.unflatten(structure, arrays)
+    if not any(traced(leaf) for leaf in arrays):
+        for section in ("machine", "loads", "drive"):
+            rebuilt(getattr(scene, section), section)
+        for effect in scene.effects:
+            rebuilt(effect, f"effects.{effect.kind}")
+        require_comparable(scene.machine, scene.loads, scene.drive)
+        _FOUND_GOOD[id(scene)] = scene
+    return scene
+
+
+def _number(name: str, leaf: Any) -> Array:
+    """A leaf as a floating-point array. **Raises** `InputError` for a text, and for what is known and not finite."""
+    if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):
+        try:
+            leaf = jnp.asarray(leaf, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(name, f"is {leaf!r}, which is not a number; put one in, in SI units") from error
+    if not traced(leaf) and not np.all(np.isfinite(leaf)):
+        wrong = np.asarray(leaf)[~np.isfinite(leaf)].ravel()[0]
+        raise InputError(name, f"is {wrong}; a finite number is needed, see how it was computed")
+    return leaf

@@ -1,0 +1,108 @@
+"""What is said about numbers that `equinox.tree_at` puts into a scene, when a question is asked."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from plugin_effect import SealFriction
+from scenes import BALLS, machines, scene
+
+import jaxvib as jv
+from jaxvib.machine.checked import checked
+
+
+def changed(where, value, s=None):
+    return eqx.tree_at(where, scene() if s is None else s, value)
+
+
+def rub(value):
+    return changed(lambda s: s.effects[0].torque, value, scene(effects=(SealFriction(0.1, 0.1),)))
+
+
+WRONG = {
+    "a negative mass": (
+        lambda: changed(lambda s: s.machine.mass, jnp.asarray([120.0, -95.0])),
+        "machine.mass[1] is -95 kg; it must be greater than 0",
+    ),
+    "no number": (lambda: changed(lambda s: s.machine.damping, jnp.full(2, jnp.nan)), "scene.machine.damping is nan; a finite"),
+    "no speed": (lambda: changed(lambda s: s.drive.speed, 0.0), "drive.speed is 0 rad/s; it must be greater than 0"),
+    "a text": (lambda: changed(lambda s: s.drive.speed, "50 rpm"), "scene.drive.speed is '50 rpm', which is not a number"),
+    "another shape": (lambda: changed(lambda s: s.machine.mass, jnp.ones(3)), "machine.mass has 3 values; 2 are needed"),
+    "heavy loads": (lambda: changed(lambda s: s.loads.mass, 1e18), "loads.mass makes 3e+18 kg in all on a machine of 215 kg"),
+    "weak drag": (lambda: changed(lambda s: s.loads.drag, 1e-300), "loads.drag takes 1.0e-302 of a load's speed"),
+    "an effect": (
+        lambda: changed(lambda s: s.effects[0].g, -9.81, scene(effects=(jv.Gravity(),))),
+        "effects.gravity.g is -9.81 m/s^2; it must be at least 0",
+    ),
+    "an effect from outside": (lambda: rub(jnp.inf), "scene.effects[0].torque is inf; a finite number is needed"),
+}
+QUESTIONS = {
+    "jam_modes": jv.jam_modes,
+    "simulate": lambda s: jv.simulate(s, 1.0),
+    "settle": jv.settle,
+    "envelope": lambda s: jv.envelope(s, 1.0),
+    "branches": jv.branches,
+    "phase_jams": jv.phase_jams,
+    "jam_orbit": lambda s: jv.jam_orbit(s, mode=3),
+    "criterion": jv.criterion,
+    "balanced_states": jv.balanced_states,
+    "whirl": jv.whirl,
+    "natural_frequencies": jv.natural_frequencies,
+    "run_ups": lambda s: jv.run_ups(s, 1.0),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_number_is_named(case):
+    make, says = WRONG[case]
+    with pytest.raises(jv.InputError) as error:
+        checked(make())
+    assert str(error.value).startswith(says), error.value
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_every_question_looks(question):
+    with pytest.raises(jv.InputError, match=r"machine\.mass\[1\] is -95 kg; it must be greater than 0"):
+        QUESTIONS[question](WRONG["a negative mass"][0]())
+
+
+def test_plain_numbers_are_numbers():
+    for value in (130.0, 130, np.float64(130.0), np.asarray(130), jnp.asarray(130)):
+        s = checked(changed(lambda s: s.drive.speed, value))
+        assert s.drive.speed.dtype == jnp.float64 and float(s.drive.speed) == 130.0
+    # What needs no change is handed on as it is, a scene being differentiated too.
+    s = scene()
+    assert checked(s) is s and checked(s) is s
+    plain, exact = (jv.jam_modes(changed(lambda s: s.drive.speed, x)).omega for x in (130.0, jnp.asarray(130.0)))
+    np.testing.assert_array_equal(plain, exact)
+    slope = jax.grad(lambda m: jv.natural_frequencies(changed(lambda s: (s.machine.mass, s.drive.speed), (m, 130.0)))[0])
+    assert np.all(np.asarray(slope(s.machine.mass)) < 0.0)
+
+
+def test_numbers_that_rounding_loses_are_refused_when_a_scene_is_made():
+    def made(**changes):
+        return jv.Scene(machines()["two_mass"], jv.balls(**{**BALLS, **changes}), jv.ConstantSpeed(120.0))
+
+    for changes, says in (
+        (dict(mass=1e18), r"loads may have 1e-15 to 1e\+15 times the machine's mass"),
+        (dict(mass=1e-18), r"loads\.mass makes 3e-18 kg in all on a machine of 215 kg"),
+        (dict(drag=1e-300), r"give 0, or 1e-13 N s/m at least"),
+    ):
+        with pytest.raises(jv.InputError, match=says):
+            made(**changes)
+    assert made(drag=0.0).loads.count == made(mass=1e-9, drag=1e-20).loads.count == 3
+
+
+def test_arrays_that_no_memory_holds_are_refused():
+    s = scene()
+    for ask, says in (
+        (lambda: jv.simulate(s, 1.0, samples=10**11), r"samples is 100000000000, which needs .* GiB, more than half of this"),
+        (lambda: jv.branches(s, points=10**11), r"points is 100000000000, which needs"),
+        (lambda: jv.phase_jams(s, starts=10**11), r"starts is 100000000000, which needs"),
+        (lambda: jv.jam_orbit(s, mode=3, points=10**7), r"points is 10000000, which needs"),
+        (lambda: jv.jam_orbit(s, mode=3, points=0), r"points is 0; it must be a whole number, at least 2"),
+        (lambda: jv.balls(**{**BALLS, "count": 10**11}), r"loads\.count is 100000000000, which needs"),
+    ):
+        with pytest.raises(jv.InputError, match=says):
+            ask()
