@@ -17,11 +17,13 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, 
 from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import torus_balls
 
 __all__ = [
     "TEMPLATES",
@@ -42,7 +44,7 @@ _MACHINES = {
     "planar_rotor": planar_rotor,
     "rotor": rotor,
 }
-_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}
+_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums, "torus_ball": torus_balls}
 _DRIVES = {
     "constant_speed": ConstantSpeed,
     "spin_up": SpinUp,
@@ -55,6 +57,7 @@ _EFFECTS = {
     "static_imbalance": StaticImbalance,
     "moment_imbalance": MomentImbalance,
     "dry_friction": DryFriction,
+    "rolling_friction": RollingFriction,
     "cubic_support": CubicSupport,
     "stop": Stop,
     "load_contact": LoadContact,
