@@ -23,6 +23,7 @@ from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 
 __all__ = [
@@ -373,5 +374,6 @@ stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number where al
 # stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of what the supports make
 """
     + _ROTOR,
+    "torus": TORUS,
 }
-"""A commented scene file for every kind of machine."""
+"""A commented scene file for every kind of machine, and for a rotor whose balls run in a torus."""

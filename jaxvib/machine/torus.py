@@ -13,7 +13,7 @@ from jaxvib.machine.loads import Loads, Pressing, require_side_by_side
 from jaxvib.units import Number, number, numbers, traced
 from jaxvib.units import count as whole
 
-__all__ = ["TorusBalls", "torus_balls"]
+__all__ = ["TEMPLATE", "TorusBalls", "torus_balls"]
 
 _ROLLING = 0.4
 """kappa - 1 of a solid ball: its moment of inertia is 2/5 m r^2."""
@@ -152,3 +152,32 @@ def _require_room(count: int, radius: float, tube: float, own_radius: float) -> 
         hint = "give a smaller one, or for balls that only run around the axis balls(...)"
         raise InputError("loads.own_radius", f"is {own_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
     require_side_by_side(count, radius + tube - own_radius, own_radius)
+
+
+TEMPLATE = """# A vertical rotor on one support, with balls in a torus that are to balance it.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "planar_rotor"
+mass = 6.87                 # kg, the torus included, balls not counted
+stiffness = "1372 N/m"      # of the support, alike in both directions
+damping = 98.0              # N s/m
+
+[loads]
+kind = "torus_ball"         # ball, roller, pendulum, torus_ball
+count = 2
+mass = "64 g"               # of one ball
+radius = "200 mm"           # of the tube's middle line
+tube = "15 mm"              # radius of the tube's cross-section
+own_radius = "12.5 mm"      # of a ball; what is left of the tube is the gap in which it rolls up and down
+# drag = 0.0                # N s/m, viscous resistance against the wall
+
+[drive]
+kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
+speed = "140 rad/s"
+
+[effects]                   # only what the scene calls for
+gravity = { along = "axis" }                   # the axis is vertical
+static_imbalance = { moment = "6.87 g m" }     # of the rotor: its mass times its eccentricity
+rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths its sign
+"""
+"""A commented scene file."""
