@@ -77,6 +77,9 @@ from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 
+# Capture in a torus
+from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
+
 # Results
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
@@ -200,6 +203,10 @@ __all__ = [
     "identify",
     "Identified",
     "IdentifyStatus",
+    # Capture in a torus
+    "capture",
+    "Capture",
+    "CaptureStatus",
     # Results
     "Result",
     "load",
