@@ -299,7 +299,7 @@ def vector_field(scene: Scene) -> Dynamics:
         supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
         loads=scene.loads,
         drive=scene.drive,
-        effects=effects,
+        effects=tuple(effect.prepared(scene.loads) for effect in effects),
         axes=carrier.axes,
     )
 

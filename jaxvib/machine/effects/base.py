@@ -105,6 +105,10 @@ class Effect(eqx.Module):
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
 
+    def prepared(self, loads: Loads) -> Effect:
+        """The effect for these loads, with all computed that does not change in time; the equations of motion hold this one."""
+        return self
+
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array | None:
         """Potential energy of the loads, J, an entry a load or a pair of them; None where the effect has none."""
         return None

@@ -23,7 +23,7 @@ __all__ = ["TABLES", "PrintedTorus", "PublishedRow", "printed_torus", "published
 
 _SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
 
-_SIGN_WIDTH = 0.01
+_SIGN_WIDTH = 0.1
 """Over so much of a relative speed, in the rotor's, the printed model's signs are smoothed."""
 
 
