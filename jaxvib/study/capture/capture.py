@@ -115,7 +115,8 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     [0.1248, 70.0]
     """
     loads = scene.loads
-    beside = 2.0 * jnp.arctan(loads.own_radius / loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
+    # Not by arctan: of 64 lanes and more it comes out wrong with vectors of 512 bits (jaxlib 0.10).
+    beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
     turn = scene.drive.speed * (1.0 + jnp.asarray(speed))
