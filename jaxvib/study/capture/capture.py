@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.draw.capture import threshold_chart
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -98,6 +97,8 @@ class Capture(Result):
 
     def plot(self) -> Figure:
         """The share of starts captured over the initial speed, and the threshold. **Returns** a matplotlib figure."""
+        from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
+
         return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold))
 
 
@@ -138,9 +139,9 @@ def capture(
     """From which initial speeds the balls of a torus come to turn with the rotor, and the least such speed.
 
     Each speed is tried from `starts` positions of the loads along the ring, and each run taken to its end: a run without
-    progress may still be captured late, so that none is cut short. With a `resolution` the stretch between the threshold and the
-    next lower speed is tried again, finer and finer. Above the threshold of the speeds tried first nothing is looked at again:
-    an island of failures narrower than their distance stays unseen.
+    progress may still be captured late, so that none is cut short. With a `resolution` the stretch between the threshold and
+    the next lower speed is tried again, finer and finer. Above the threshold of the speeds tried first nothing is looked at
+    again: an island of failures narrower than their distance stays unseen.
 
     **Arguments**
 
