@@ -13,6 +13,7 @@ from jaxvib.machine.rotor import planar_rotor, rotor
 
 # Loads
 from jaxvib.machine.loads import Loads, balls, pendulums, rollers
+from jaxvib.machine.torus import torus_balls
 
 # Drives
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, InductionMotor, Motor, RunUp, SpinUp
@@ -21,6 +22,7 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, IdealDrive, Indu
 from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 
 # Scenes, and their files
@@ -29,7 +31,7 @@ from jaxvib.machine.scene import Scene
 
 # The equations
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.equations.forces import energy, foundation_force, power
+from jaxvib.equations.forces import energy, foundation_force, normal_force, power
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state
 
@@ -75,6 +77,9 @@ from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swing
 
+# Capture in a torus
+from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
+
 # Results
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
@@ -102,6 +107,7 @@ __all__ = [
     "balls",
     "rollers",
     "pendulums",
+    "torus_balls",
     # Drives
     "Drive",
     "IdealDrive",
@@ -115,6 +121,7 @@ __all__ = [
     "Effect",
     "Gravity",
     "DryFriction",
+    "RollingFriction",
     "StaticImbalance",
     "MomentImbalance",
     "CubicSupport",
@@ -134,6 +141,7 @@ __all__ = [
     "energy",
     "power",
     "foundation_force",
+    "normal_force",
     # Jams of light loads
     "jam_modes",
     "JamModes",
@@ -195,6 +203,10 @@ __all__ = [
     "identify",
     "Identified",
     "IdentifyStatus",
+    # Capture in a torus
+    "capture",
+    "Capture",
+    "CaptureStatus",
     # Results
     "Result",
     "load",

@@ -25,6 +25,7 @@ from jaxvib.steady.orbits.diagram import SpecialPoint
 from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tiers, TierValues
+from jaxvib.study.capture.capture import _judged
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
 from optimize.synthesize import Outcome, Synthesis
@@ -105,6 +106,7 @@ RESULTS = {
     "Identified": cached(identified),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
+    "Capture": lambda: _judged(np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), 150),
     "Tiers": tiers,
     "HarmonicConvergence": lambda: HarmonicConvergence(
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])

@@ -105,6 +105,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
+    "capture": "capture",
     "cost": "cost",
     "identify": "identify",
     "whirl": "whirl",

@@ -118,5 +118,5 @@ def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Arr
     """Torque of dry friction on light loads that turn at `omega`, N m, all together: a carrier that hardly moves adds nothing
     to their radial load, and their weight, on the average of a turn, neither."""
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
-    found = (effect.friction(loads, phi, rate, speed, 0.0) for effect in effects)
+    found = (effect.friction(loads, phi, rate, speed, {}) for effect in effects)
     return sum((jnp.sum(friction.torque({})) for friction in found if friction is not None), jnp.zeros_like(omega))

@@ -121,7 +121,7 @@ class Dynamics(eqx.Module):
         if any(each.normal is not None for each in friction):
             # The sign of a reaction that depends on the accelerations: that of the motion without its friction.
             at_loads = self._at_loads(accelerations([each for each in friction if each.normal is None])[0])
-            friction = [each if each.normal is None else _signed(each, at_loads) for each in friction]
+            friction = [each if each.normal is None else each.signed(at_loads) for each in friction]
         a, carrier, part, spin = accelerations(friction)
         at_loads = self._at_loads(a)
         change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
@@ -140,30 +140,34 @@ class Dynamics(eqx.Module):
     def _friction(self, state: State, speed: Array) -> list[Friction]:
         g = total_gravity(self.effects)
         found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
-        return [_signed(each, {}) if each.normal is None else each for each in found if each is not None]
+        return [each.signed({}) if each.normal is None else each for each in found if each is not None]
 
     def _eliminate(self, kinematics: _Kinematics, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
         loads, axes = self.loads, self.axes
         columns, curvature = kinematics
         torque = loads.resistance(state.angle, state.rate, speed)
         drag, force = torque[0], list(torque)
+        spin = loads.spin_force(state.angle, state.rate, speed)
+        if spin is not None:
+            force = [f + s for f, s in zip(force, spin, strict=True)]
         for effect in self.effects:
             for extra in (effect.load_force(loads, state.angle), effect.load_resistance(loads, state.angle, state.rate)):
                 if extra is not None:
                     force = [f + e for f, e in zip(force, extra, strict=True)]
-        pull = None
+        pulls: list[dict[int, Array]] = [{} for _ in force]
         for each in friction:
-            rub = each.lever * each.reaction
-            drag, force[0] = drag + rub, force[0] + rub
-            if each.normal is not None:
-                pull = {axis: each.lever * each.normal[axis] + (0.0 if pull is None else pull[axis]) for axis in axes}
+            rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
+            drag = drag + rubs[0]
+            for i, (rub, lever) in enumerate(zip(rubs, (each.lever, *each.others), strict=True)):
+                force[i] = force[i] + rub
+                if each.normal is not None:
+                    pulls[i] = {axis: lever * each.normal[axis] + pulls[i].get(axis, 0.0) for axis in axes}
         m = loads.mass
         inertia = loads.inertia_factor() * m
         solve = small_inverse([[inertia * _dot(a, b) for b in columns] for a in columns])
         free = solve(tuple(f - inertia * _dot(column, curvature) for f, column in zip(force, columns, strict=True)))
         rows = {axis: [m * column[axis] for column in columns] for axis in axes}
-        if pull is not None:
-            rows = {axis: [row[0] - pull[axis], *row[1:]] for axis, row in rows.items()}
+        rows = {axis: [r - p[axis] if p else r for r, p in zip(row, pulls, strict=True)] for axis, row in rows.items()}
         answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
         across = {axis: [column[axis] for column in columns] for axis in axes}
         # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
@@ -174,7 +178,7 @@ class Dynamics(eqx.Module):
         weight = [[moments[i, k, first + second] for k, second in onto] for i, first in onto]
         push = {i: m * (_dot(across[i], free) + curvature[i]) for i in axes}
         reaction = [self._total(push[i], *arms[1:2] * n) for i, n in onto]
-        return _Eliminated(free, answers, weight, reaction, drag, pull)
+        return _Eliminated(free, answers, weight, reaction, drag, pulls[0] or None)
 
     def _with_rotor(
         self, part: _Eliminated, throw: tuple[list[Array], list[Array]] | None, speed: Array
@@ -300,18 +304,9 @@ def vector_field(scene: Scene) -> Dynamics:
         supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
         loads=scene.loads,
         drive=scene.drive,
-        effects=effects,
+        effects=tuple(effect.prepared(scene.loads) for effect in effects),
         axes=carrier.axes,
     )
-
-
-def _signed(friction: Friction, a: dict[int, Array]) -> Friction:
-    """A friction whose reaction is known to be positive or negative, so that it is linear in the accelerations."""
-    reaction = friction.reaction
-    if friction.normal is not None:
-        reaction = reaction + sum(friction.normal[axis] * x for axis, x in a.items())
-    sign = jnp.where(reaction < 0.0, -1.0, 1.0)
-    return Friction(friction.lever * sign, friction.reaction, friction.normal)
 
 
 def _kinematics(loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> _Kinematics:

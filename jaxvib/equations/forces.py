@@ -7,10 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 
-__all__ = ["energy", "foundation_force", "power"]
+__all__ = ["energy", "foundation_force", "normal_force", "power"]
 
 
 def foundation_force(scene: Scene, state: State) -> Array:
@@ -86,7 +87,8 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     for effect in scene.effects:
         friction = effect.friction(loads, state.angle, state.rate, speed, g)
         if friction is not None:
-            taken = (taken[0] + friction.torque(at_load), *taken[1:])
+            rubbing = friction.forces(at_load)
+            taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
         resistance = effect.load_resistance(loads, state.angle, state.rate)
         if resistance is not None:
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
@@ -101,6 +103,33 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     motor = scene.drive.torque_and_inertia(speed)
     torque = braking + _throw_rate(scene, turn) @ acceleration if motor is None else motor[0]
     return speed * torque, sum(lost[1:], lost[0])
+
+
+def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
+    """The force N with which each load presses on its track, (count,) N; negative where the track would have to pull.
+
+        N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.pressing`
+
+    The equations keep a load on its track all the same; friction with the normal force is then none. `t` s, where the rotor
+    is; n the direction in which the load presses.
+
+    **Raises** `InputError` for loads of which nothing says how they press.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> state = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.array([20.0]),))
+    >>> float(jv.normal_force(scene, 0.0, state)[0])      # m R phi'^2
+    20.0
+
+    Source: Strautmanis et al. 2018, equation (10), with the acceleration of the rotor.
+    """
+    pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
+    if pressing is None:
+        problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.pressing)"
+        raise InputError("loads.kind", problem)
+    acceleration = vector_field(scene)(jnp.asarray(t, state.displacement.dtype), state).velocity
+    return pressing.at(scene.machine.carrier().point_rates(acceleration))
 
 
 def _throw_rate(scene: Scene, turn: Array) -> Array:

@@ -17,11 +17,14 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, 
 from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import TEMPLATE as TORUS
+from jaxvib.machine.torus import torus_balls
 
 __all__ = [
     "TEMPLATES",
@@ -44,7 +47,7 @@ _MACHINES = {
     "planar_rotor": planar_rotor,
     "rotor": rotor,
 }
-_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums}
+_LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums, "torus_ball": torus_balls}
 _DRIVES = {
     "constant_speed": ConstantSpeed,
     "spin_up": SpinUp,
@@ -57,6 +60,7 @@ _EFFECTS = {
     "static_imbalance": StaticImbalance,
     "moment_imbalance": MomentImbalance,
     "dry_friction": DryFriction,
+    "rolling_friction": RollingFriction,
     "cubic_support": CubicSupport,
     "stop": Stop,
     "load_contact": LoadContact,
@@ -389,5 +393,6 @@ stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number where al
 # stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of what the supports make
 """
     + _ROTOR,
+    "torus": TORUS,
 }
-"""A commented scene file for every kind of machine."""
+"""A commented scene file for every kind of machine, and for a rotor whose balls run in a torus."""

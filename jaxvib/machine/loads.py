@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import abc
 import math
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,21 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
-__all__ = ["CircularLoads", "Loads", "balls", "pendulums", "rollers"]
+__all__ = ["CircularLoads", "Loads", "Pressing", "balls", "pendulums", "require_side_by_side", "rollers"]
+
+
+class Pressing(NamedTuple):
+    """The force N = `reaction` + `normal` . a with which each load presses on its track, a the acceleration of its carrier.
+
+    `reaction` (count,) N; `normal` (across, up) in kg, (count,) each.
+    """
+
+    reaction: Array
+    normal: tuple[Array, Array]
+
+    def at(self, a: Mapping[int, Array]) -> Array:
+        """N (count,) where the loads' carriers have the acceleration `a`, by axis."""
+        return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
 
 
 class Loads(eqx.Module):
@@ -31,6 +46,9 @@ class Loads(eqx.Module):
 
     circular: ClassVar[bool] = False
     """Whether the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
+
+    one_sided: ClassVar[bool] = False
+    """Whether the track holds a load by pressing alone: where N (`pressing`) is negative the load would leave it."""
 
     @property
     def has_bearing(self) -> bool:
@@ -52,6 +70,18 @@ class Loads(eqx.Module):
     @abc.abstractmethod
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
         """Generalised force of the viscous resistance against the rotor that turns at `speed`, N m."""
+
+    def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
+        """Generalised force of a rolling load's own rotation besides kappa, N m; it does no work. None where there is none."""
+        return None
+
+    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing | None:
+        """How hard the loads press on their track under gravity `g` (by axis, m/s^2 upward); None where nothing says it."""
+        return None
+
+    def own_frequency(self, speed: Array) -> Array | None:
+        """The frequency of the loads' own motions that a step must resolve beside the rotor's `speed`, rad/s; or None."""
+        return None
 
 
 class CircularLoads(Loads):
@@ -109,6 +139,12 @@ class CircularLoads(Loads):
         (rate_phi,) = rate
         return (self.drag * self.radius**2 * (speed - rate_phi),)
 
+    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing:
+        """N = m (R phi'^2 - n . (a + g)), n the load's direction: away from the axis."""
+        (phi,), (turn,), m = u, rate, self.mass
+        normal = (jnp.cos(phi), jnp.sin(phi))
+        return Pressing(m * (self.radius * turn**2 - g.get(1, 0.0) * normal[1]), (-m * normal[0], -m * normal[1]))
+
     def offsets(self) -> Array:
         """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
         if self.own_radius is None:
@@ -159,13 +195,15 @@ def _fit(loads: CircularLoads, r: Array) -> None:
     if not loads.alike:
         raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
     if not traced(r) and not traced(loads.radius):
-        most = float(loads.radius) * (1.0 if loads.count == 1 else math.sin(math.pi / loads.count))
-        if not float(r) < most:
-            raise InputError(
-                "loads.own_radius",
-                f"is {float(r):.6g} m; {loads.count} side by side on a circle of {float(loads.radius):.6g} m have room "
-                f"below {most:.6g} m",
-            )
+        require_side_by_side(loads.count, float(loads.radius), float(r))
+
+
+def require_side_by_side(count: int, radius: float, own_radius: float) -> None:
+    """**Raises** `InputError` where so many loads of an own radius have no room side by side on a circle of `radius`, m."""
+    most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
+    if not own_radius < most:
+        problem = f"{count} side by side on a circle of {radius:.6g} m have room below {most:.6g} m"
+        raise InputError("loads.own_radius", f"is {own_radius:.6g} m; {problem}")
 
 
 def balls(

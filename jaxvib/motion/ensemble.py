@@ -44,6 +44,8 @@ _Ends: TypeAlias = tuple[State, Array, Array, Array, Array]
 _PARTS = 4
 """Into so many parts a run is cut; over the last one mean speeds are taken."""
 
+Equations = Callable[[Scene], Callable[[Array, State], State]]
+
 _LANES = 64
 """Runs that advance together on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
 
@@ -107,6 +109,7 @@ def ensemble(
     stepsize_controller: EqualSteps | None = None,
     estimate: bool = True,
     lanes: int = _LANES,
+    equations: Equations = vector_field,
 ) -> Ensemble:
     """Integrates many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
@@ -127,6 +130,8 @@ def ensemble(
       radian of what moves fastest
     - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
     - `lanes`: how many runs advance together
+    - `equations`: a function that gives a scene's equations of motion, a module that is called as `vector_field`'s; another one
+      where a printed model is to be compared with the scene's own
 
     **Returns** `Ensemble`. Derivatives go through it in forward mode.
 
@@ -168,7 +173,7 @@ def ensemble(
     # A run of one step in each part has no coarser one beside it.
     compared = estimate and coarse < each
     counts = np.asarray([each, coarse] if compared else [each], end.dtype)
-    last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs)
+    last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs, equations)
     # What a method of order 3 would leave of the difference; this one is of order 8.
     radians = made[0].drive.speed * end
     share = (coarse / each) ** 3
@@ -206,7 +211,14 @@ def _fastest(scenes: Scene) -> Array:
 
 @cached
 def _all(
-    parts: list[Array], end: Array, counts: np.ndarray, shared: tuple[bool, ...], rest: Hashable, lanes: int, runs: int
+    parts: list[Array],
+    end: Array,
+    counts: np.ndarray,
+    shared: tuple[bool, ...],
+    rest: Hashable,
+    lanes: int,
+    runs: int,
+    equations: Equations,
 ) -> _Ends:
     """All runs in chunks over all devices, (runs, ...); see `_run`."""
     devices = jax.devices()
@@ -224,7 +236,7 @@ def _all(
     def one(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         mine, ours = iter(own), iter(common)
         scene, state = jax.tree.unflatten(rest, [next(ours) if same else next(mine) for same in shared])
-        return _run(scene, state, end, counts)
+        return _run(scene, state, end, counts, equations)
 
     def on_device(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         chunk = jax.vmap(one, in_axes=(0, None, None, None))
@@ -239,14 +251,14 @@ def _all(
     return jax.tree.map(lambda leaf: leaf.reshape(padded, *leaf.shape[2:])[:runs], found)
 
 
-def _run(scene: Scene, state: State, end: Array, counts: Array) -> _Ends:
+def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations) -> _Ends:
     """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
 
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
     there, whether it stayed finite, the steps it took.
     """
     single, together = wrap_angles(scene, state.displacement.dtype)
-    motion = PackedSystem(vector_field(scene), state, wrapped=single, together=together)
+    motion = PackedSystem(equations(scene), state, wrapped=single, together=together)
     length = end / _PARTS
 
     def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:

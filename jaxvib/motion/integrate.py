@@ -85,10 +85,16 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 @cached
 def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
-    """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count."""
+    """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count.
+
+    Among the greatest is the loads' own frequency, where they have one.
+    """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = natural_frequencies(scene), scene.drive.speed
-    return jnp.maximum(speed, jnp.max(frequencies)), jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
+    own = scene.loads.own_frequency(speed)
+    fastest = jnp.maximum(speed, jnp.max(frequencies))
+    fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
+    return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
+from jaxvib.equations.forces import normal_force
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -29,6 +31,15 @@ __all__ = ["Run", "RunStatus"]
 
 
 _named = cached(regime)
+
+
+@eqx.filter_jit
+def _detached(scene: Scene, kept: Trajectory) -> Array:
+    if not scene.loads.one_sided:
+        return jnp.full((scene.loads.count,), jnp.nan, kept.time.dtype)
+    force = jax.vmap(lambda t, state: normal_force(scene, t, state))(kept.time, kept.state)
+    first = jnp.min(jnp.where(force < 0.0, kept.time[:, None], jnp.inf), axis=0)
+    return jnp.where(jnp.isfinite(first), first, jnp.nan)
 
 
 class RunStatus(eqx.Enumeration):
@@ -86,13 +97,31 @@ class Run(AbstractMeasured, Result):
                 f"  {self.extent(self.scene)}",
                 f"  {self.regime.summary()}",
                 *(glued if self.together else []),
+                *self._detachment(),
             ]
         )
+
+    def _detachment(self) -> list[str]:
+        times = np.asarray(self.detached)
+        if not np.any(np.isfinite(times)):
+            return []
+        left = ", ".join(f"{j + 1} at {t:.6g} s" for j, t in enumerate(times) if np.isfinite(t))
+        return [f"  detached: loads do not press on their track (load {left}), and were kept on it all the same"]
 
     @property
     def regime(self) -> Regime:
         """What kind of motion the run has come to, see `Regime`."""
         return _named(self.scene, self.window)
+
+    @property
+    def detached(self) -> Array:
+        """When each load first did not press on a track that holds it by pressing alone, (count,) s, as far as states are kept.
+
+        NaN for a load that pressed throughout, and for loads that are held from both sides. The equations go on as if the load
+        stayed on its track, so that what comes after it is no motion of a real one.
+        """
+        kept = self.window if self.trajectory is None else self.trajectory
+        return _detached(self.scene, kept)
 
     def plot(self) -> Figure:
         """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.

@@ -241,7 +241,10 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
         if float(found.error) <= accuracy:
             return found
         # Smaller steps only add to what rounding alone makes of the error.
-        if tolerance <= floor or float(estimated_error(0.0, 0.0, scene, latest.steps, _radians(scene, latest))) > accuracy:
+        if (
+            tolerance <= floor
+            or float(estimated_error(jnp.zeros(()), 0.0, scene, latest.steps, _radians(scene, latest))) > accuracy
+        ):
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2

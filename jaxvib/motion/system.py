@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import diffrax
@@ -13,7 +14,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.equations.dynamics import Dynamics, State
+from jaxvib.equations.dynamics import State
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
@@ -52,7 +53,7 @@ class PackedSystem(eqx.Module):
     wrapped: bool = eqx.field(static=True)
     together: bool = eqx.field(static=True)
 
-    def __init__(self, field: Dynamics, state: State, *, wrapped: bool = False, together: bool = False):
+    def __init__(self, field: Callable[[Array, State], State], state: State, *, wrapped: bool = False, together: bool = False):
         self.wrapped, self.together = wrapped, together
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)

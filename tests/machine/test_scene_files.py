@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import BALLS, ROTOR, TWO_MASS, loads, machines
@@ -38,7 +39,15 @@ def test_one_platform_one_load_and_no_links_survive_the_file():
     same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
 
 
-@pytest.mark.parametrize("kind", TEMPLATES)
+def test_template_of_a_torus_holds_what_it_calls_for():
+    s = jv.scene_from_toml(TEMPLATES["torus"])
+    assert (s.machine.kind, s.loads.kind, s.loads.count) == ("planar_rotor", "torus_ball", 2)
+    assert [e.kind for e in s.effects] == ["gravity", "static_imbalance", "rolling_friction"] and s.effects[0].along == "axis"
+    s = uneven(eqx.tree_at(lambda s: s.loads.drag, s, jnp.asarray(0.3)))
+    same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in TEMPLATES if kind != "torus"])
 def test_template_loads_and_jams(kind):
     s = jv.scene_from_toml(TEMPLATES[kind])
     assert s.machine.kind == kind

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,29 +12,49 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.machine.loads import Loads
+from jaxvib.machine.loads import Loads, Pressing
 from jaxvib.units import Number, number
 
 __all__ = ["Effect", "Friction", "Gravity", "Imbalance", "MomentImbalance", "StaticImbalance", "total_gravity"]
 
 
+_AXES = {"up": 1, "axis": 2}
+"""Directions of gravity by the coordinate of a load's position."""
+
+
 class Friction(NamedTuple):
-    """A friction torque `lever` |reaction + normal . a| on each load, a the acceleration of the point that carries it.
+    """A friction torque `lever` |N| on each load, N = reaction + normal . a, a the acceleration of the point that carries it.
 
     `lever` (count,) m, signed as the torque on the load; `reaction` (count,) N; `normal` two (count,) arrays (across, up) in
-    kg, or None where the reaction does not depend on accelerations.
+    kg, or None where the reaction does not depend on accelerations; `others` the levers of a load's further coordinates, where
+    friction acts on them; `one_sided` whether there is none where N is negative.
     """
 
     lever: Array
     reaction: Array
     normal: tuple[Array, Array] | None
+    others: tuple[Array, ...] = ()
+    one_sided: bool = False
 
     def torque(self, a: Mapping[int, Array]) -> Array:
         """The torque on each load where the points that carry them have the acceleration `a`, by axis, m/s^2; {} for none."""
-        reaction = self.reaction
-        if self.normal is not None:
-            reaction = reaction + sum(self.normal[axis] * x for axis, x in a.items())
-        return self.lever * jnp.abs(reaction)
+        return self.forces(a)[0]
+
+    def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
+        """The same and the generalised forces on a load's further coordinates that friction acts on."""
+        reaction = self._reaction(a)
+        size = jnp.maximum(reaction, 0.0) if self.one_sided else jnp.abs(reaction)
+        return tuple(lever * size for lever in (self.lever, *self.others))
+
+    def signed(self, a: Mapping[int, Array]) -> Friction:
+        """The friction linear in the accelerations, its reaction taken to have the sign that it has at `a`."""
+        sign = jnp.where(self._reaction(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
+        return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
+
+    def _reaction(self, a: Mapping[int, Array]) -> Array:
+        if self.normal is None:
+            return self.reaction
+        return Pressing(self.reaction, self.normal).at(a)
 
 
 class Imbalance(NamedTuple):
@@ -44,9 +64,13 @@ class Imbalance(NamedTuple):
     moment: tuple[Array, Array]
 
 
-def total_gravity(effects: Iterable[Effect]) -> Array | float:
-    """The acceleration of gravity of a scene with these `effects`, m/s^2, 0 where none brings any."""
-    return sum((effect.gravity for effect in effects if effect.gravity is not None), 0.0)
+def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
+    """The acceleration of gravity of a scene with these `effects`, m/s^2, by the axis it pulls against; see `Effect`."""
+    total: dict[int, Array] = {}
+    for effect in effects:
+        for axis, g in effect.gravity.items():
+            total[axis] = total[axis] + g if axis in total else g
+    return total
 
 
 class Effect(eqx.Module):
@@ -77,15 +101,20 @@ class Effect(eqx.Module):
     """Whether loads act on each other by it, so that their order and their distances count."""
 
     @property
-    def gravity(self) -> Array | None:
-        """The acceleration of gravity, m/s^2, that the effect brings into the scene; None where it brings none."""
-        return None
+    def gravity(self) -> dict[int, Array]:
+        """The acceleration of gravity that the effect brings into the scene, m/s^2, by the axis of a load's position (0 across,
+        1 up, 2 along the rotor's axis) that it pulls against; {} where it brings none."""
+        return {}
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
 
     def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
         """**Raises** `InputError` where loads cannot start from the coordinates `u`, (..., count) each and known."""
+
+    def prepared(self, loads: Loads) -> Effect:
+        """The effect for these loads, with all computed that does not change in time; the equations of motion hold this one."""
+        return self
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array | None:
         """Potential energy of the loads, J, an entry a load or a pair of them; None where the effect has none."""
@@ -96,9 +125,9 @@ class Effect(eqx.Module):
         return None
 
     def friction(
-        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float
+        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
     ) -> Friction | None:
-        """Friction of each load against the rotor that turns at `speed` under gravity `g`, see `Friction`; or None."""
+        """Friction of each load against the rotor that turns at `speed` under gravity `g`, by axis; see `Friction`. Or None."""
         return None
 
     def imbalance(self, angle: Array) -> Imbalance | None:
@@ -149,9 +178,11 @@ class Gravity(Effect):
 
     Platforms are counted from static equilibrium, loads' weight included, so that gravity adds nothing there.
 
-    **Arguments**: `g` m/s^2.
+    **Arguments**: `g` m/s^2; `along` "up", in the plane in which the rotor turns, or "axis", along a vertical rotor's axis, for
+    loads that move along it: V = m g p_axis(u).
 
-    **Raises** `InputError` for a wrong unit or a negative value.
+    **Raises** `InputError` for a wrong unit, a negative value or another direction, and, by the scene, for loads that do not
+    move along the axis where gravity does.
 
     >>> import jaxvib as jv
     >>> float(jv.Gravity().g)
@@ -162,20 +193,30 @@ class Gravity(Effect):
     smooth = True
 
     g: Array
+    along: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
-    def __init__(self, g: Number = 9.81):
+    def __init__(self, g: Number = 9.81, along: Literal["up", "axis"] = "up"):
         self.g = number(g, "m/s^2", "effects.gravity.g", low=0.0)
+        if along not in _AXES:
+            raise InputError("effects.gravity.along", f"is {along!r}; allowed: {', '.join(_AXES)}")
+        self.along = along
         self.kind = "gravity"
 
     @property
-    def gravity(self) -> Array:
-        """g."""
-        return self.g
+    def gravity(self) -> dict[int, Array]:
+        """g, against the direction it is given for."""
+        return {_AXES[self.along]: self.g}
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """Loads that move in gravity's direction."""
+        if len(jax.eval_shape(loads.position, *loads.rest())) <= _AXES[self.along]:
+            problem = f"goes with loads that move along the rotor's axis, which {loads.kind!r} do not; leave gravity out"
+            raise InputError("effects.gravity.along", f"is {self.along!r}; it {problem}")
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
-        """m g p_up(u)."""
-        return loads.mass * self.g * loads.position(*u)[1]
+        """m g p_up(u), or p_axis(u)."""
+        return loads.mass * self.g * loads.position(*u)[_AXES[self.along]]
 
 
 class StaticImbalance(Effect):

@@ -12,29 +12,40 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import CircularLoads, Loads
-from jaxvib.units import Number, number
+from jaxvib.units import Number, number, traced
 
-__all__ = ["LoadContact"]
+__all__ = ["LoadContact", "damping_ratio"]
 
 
 class LoadContact(Effect):
-    """Neighbours on one track press against each other where they would overlap.
+    """Loads that have a size press against each other where they would overlap.
 
-        force between centres = max(0, k (2 r - s) - c s'),    s = 2 R sin((phi_{j+1} - phi_j) / 2)
+        force between centres = max(0, k (2 r - s) - c s'),    s the distance of the centres
 
-    r is the loads' `own_radius`. Loads on one track never pass each other: load j+1 follows load j, and load 1 follows the last
-    one a turn later, so that N pairs are all there are. A state to start from has its angles in this order, less than a turn
-    apart; the named ones lay loads that are together side by side.
+    r is the loads' `own_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
+    follows load j, and load 1 follows the last one a turn later, so that N pairs are all there are. A state to start from has
+    its angles in this order, less than a turn apart; the named ones lay loads that are together side by side. Loads with
+    several coordinates meet in any pair, s = |p(u_i) - p(u_j)|.
 
-    **Arguments**: `stiffness` k N/m; `damping` c N s/m.
+    Two loads that meet on a track that does not give way part with the share e of the speed with which they met,
 
-    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without an own radius.
+        e = exp(-(pi - 2 beta) tan beta),    sin beta = zeta = c / (2 sqrt(k mu)),    mu = kappa m / (2 (1 - (r/R)^2)),
+
+    in cosh gamma = zeta > 1: e = exp(-2 gamma coth gamma), and lose the share 1 - e^2 of the energy of their relative motion.
+    What they were rolling with is counted in, friction between the loads is not. A contact lasts about pi sqrt(mu/k), which
+    steps must resolve: equal steps need ten for each.
+
+    **Arguments**: `stiffness` k N/m; `damping` c N s/m, or in its place `restitution` e, above 0, up to 1.
+
+    **Raises** `InputError` for values that are not allowed, for damping beside a restitution, and, by the scene, for loads
+    without an own radius, or with a restitution for loads that differ.
 
     >>> import jaxvib as jv
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)
     1000000.0
 
-    Source: asked for by Strautmanis et al. 2018; a linear spring and damper between the centres.
+    Source: asked for by Strautmanis et al. 2018; a linear spring and damper between the centres, let go where they would pull
+    (Schwager and Poeschel 2007).
     """
 
     averages_out = True
@@ -42,22 +53,35 @@ class LoadContact(Effect):
 
     stiffness: Array
     damping: Array
+    restitution: Array | None
     kind: str = eqx.field(static=True)
 
-    def __init__(self, stiffness: Number, damping: Number = 0.0):
+    def __init__(self, stiffness: Number, damping: Number = 0.0, restitution: Number | None = None):
         self.stiffness = number(stiffness, "N/m", "effects.load_contact.stiffness", low=0.0, open_low=True)
         self.damping = number(damping, "N s/m", "effects.load_contact.damping", low=0.0)
+        self.restitution = None
+        if restitution is not None:
+            field = "effects.load_contact.restitution"
+            self.restitution = number(restitution, "", field, low=0.0, open_low=True)
+            if not traced(self.restitution) and self.restitution > 1.0:
+                raise InputError(field, f"is {float(self.restitution):g}; it must be at most 1, where nothing is lost")
+            if traced(self.damping) or self.damping != 0.0:
+                raise InputError(field, "goes without damping, which it stands for; leave one of them out")
         self.kind = "load_contact"
 
     def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads on one circle that have a size."""
-        if not isinstance(loads, CircularLoads) or loads.own_radius is None:
+        """Loads on one track that have a size."""
+        if getattr(loads, "own_radius", None) is None:
             raise InputError("effects.load_contact", "needs loads that have a size: give balls or rollers their own_radius")
+        if self.restitution is not None and jnp.ndim(loads.mass) > 0:
+            raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
         if machine.structure().stations is not None:
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
-        """In the order of the track, less than a turn from the first to the last."""
+        """On a circle, in the order of the track, less than a turn from the first to the last."""
+        if not loads.circular:
+            return
         phi = np.asarray(u[0])
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
         if np.any(wrong):
@@ -65,20 +89,90 @@ class LoadContact(Effect):
             problem = "loads in contact never pass each other: each angle must be above the one before, all within one turn"
             raise InputError("start.angle", f"is {which} rad; {problem} (add 2 pi where a load is a turn behind, or sort them)")
 
+    def prepared(self, loads: Loads) -> LoadContact:
+        """The same with the damping that the restitution stands for."""
+        if self.restitution is None:
+            return self
+        return eqx.tree_at(
+            lambda c: (c.damping, c.restitution), self, (self._damping(loads), None), is_leaf=lambda leaf: leaf is None
+        )
+
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
-        """k (2 r - s)^2 / 2 of each pair that overlaps."""
-        return 0.5 * self.stiffness * jnp.maximum(-_clearance(loads, u[0]), 0.0) ** 2
+        """k (2 r - s)^2 / 2 of the pairs that overlap, an entry a load."""
+        parts = [0.5 * self.stiffness * share * jnp.maximum(-gap, 0.0) ** 2 for share, gap in _clearances(loads, u)]
+        return sum(parts[1:], parts[0])
 
     def load_resistance(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> tuple[Array, ...]:
         """-c s' of each pair that overlaps; a contact that would pull lets go."""
-        clearance, back = jax.vjp(lambda phi: _clearance(loads, phi), u[0])
-        _, parting = jax.jvp(lambda phi: _clearance(loads, phi), (u[0],), (rate[0],))
-        force = jnp.where(clearance < 0.0, jnp.maximum(-self.damping * parting, self.stiffness * clearance), 0.0)
-        return back(force)
+        damping = self._damping(loads)
+
+        def gaps(*v: Array) -> tuple[Array, ...]:
+            return tuple(gap for _, gap in _clearances(loads, v))
+
+        clearances, back = jax.vjp(gaps, *u)
+        _, partings = jax.jvp(gaps, u, rate)
+        shares = [share for share, _ in _clearances(loads, u)]
+        return back(
+            tuple(
+                share * jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
+                for share, gap, parting in zip(shares, clearances, partings, strict=True)
+            )
+        )
+
+    def _damping(self, loads: Loads) -> Array:
+        """c, as it is given or as the restitution asks for."""
+        if self.restitution is None:
+            return self.damping
+        across, up, *_ = loads.position(*loads.rest())
+        arm = jnp.hypot(across[0], up[0])
+        own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+        reduced = 0.5 * loads.inertia_factor() * loads.mass / (1.0 - (own / arm) ** 2)
+        return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * reduced)
 
 
-def _clearance(loads: Loads, phi: Array) -> Array:
-    """Distance between each load and the next, surface to surface, negative where they overlap."""
-    assert isinstance(loads, CircularLoads) and loads.own_radius is not None
-    ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
-    return 2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * loads.own_radius
+def damping_ratio(restitution: Array) -> Array:
+    """zeta = c / (2 sqrt(k mu)) of a spring and damper that never pull, after whose contact the share `restitution` is left.
+
+    >>> import jax.numpy as jnp
+    >>> [round(float(damping_ratio(jnp.asarray(e))), 6) for e in (0.9, 0.5, 0.1)]
+    [0.034265, 0.255276, 1.243188]
+    """
+    wanted = -jnp.log(restitution)
+    # Newton's method from a fit that is right at both ends and good to 2 % between them.
+    ratio = jnp.where(wanted < 2.0, wanted / jnp.sqrt(jnp.pi**2 + wanted * (wanted - 4.93)), jnp.cosh(0.5 * (wanted - 2.0)))
+    for _ in range(_NEWTON):
+        loss, slope = jax.jvp(_loss, (ratio,), (jnp.ones_like(ratio),))
+        ratio = ratio + (wanted - loss) / slope
+    return ratio
+
+
+_NEWTON = 5
+
+
+def _loss(ratio: Array) -> Array:
+    """-log e: (pi - 2 beta) tan beta, sin beta = zeta; 2 gamma coth gamma, cosh gamma = zeta."""
+    near = ratio - 1.0
+    middle = jnp.abs(near) < 1e-3
+    under, over = jnp.where(ratio < 0.999, ratio, 0.5), jnp.where(ratio > 1.001, ratio, 2.0)
+    below = 2.0 * jnp.arccos(under) * under / jnp.sqrt(1.0 - under**2)
+    above = 2.0 * jnp.arccosh(over) * over / jnp.sqrt(over**2 - 1.0)
+    series = 2.0 + near * (4.0 / 3.0 - near * (4.0 / 15.0 - near * 16.0 / 105.0))
+    return jnp.where(middle, series, jnp.where(near < 0.0, below, above))
+
+
+def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[tuple[float, Array]]:
+    """Distances (count,) surface to surface between each load and the one so many further, negative where they overlap, for
+    every such number; and the share of each entry: 1/2 where every pair is there twice."""
+    own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(loads, CircularLoads):
+        (phi,) = u
+        ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
+        return [(1.0, 2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own)]
+    n, place = loads.count, loads.position(*u)
+    found = []
+    for k in range(1, n // 2 + 1):
+        square = sum((jnp.concatenate([x[k:], x[:k]]) - x) ** 2 for x in place)
+        same = square == 0.0
+        distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
+        found.append((0.5 if 2 * k == n else 1.0, distance - 2.0 * own))
+    return found or [(1.0, jnp.ones_like(u[0]))]

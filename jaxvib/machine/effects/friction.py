@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -102,15 +103,16 @@ class DryFriction(Effect):
                 f"is that of a bearing, and a {loads.kind} rolls without one (property has_bearing); give pendulums, or drag",
             )
 
-    def friction(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Array | float) -> Friction:
+    def friction(
+        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
+    ) -> Friction:
         """mu2 d/2 and N."""
         assert isinstance(loads, CircularLoads)
-        phi, turn = u[0], rate[0]
+        turn = rate[0]
         lever = dry_lever(self.coefficient, self.diameter, speed - turn, self.width)
         m, r = loads.mass, loads.radius
         if self.reaction == "steady":
             return Friction(lever, m * r * speed**2 * jnp.ones_like(turn), None)
         if self.reaction == "run_up":
             return Friction(lever, m * r * (turn**2 - 2.0 * speed * (speed - turn)), None)
-        across, up = jnp.cos(phi), jnp.sin(phi)
-        return Friction(lever, m * (r * turn**2 - g * up), (-m * across, -m * up))
+        return Friction(lever, *loads.pressing(u, rate, g))

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State
@@ -65,7 +64,7 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     return xp.max(xp.stack(jax.tree.leaves(jax.tree.map(apart, a, b, scale))))
 
 
-def estimated_error(difference: Array, share: ArrayLike, scene: Scene, steps: ArrayLike, radians: ArrayLike) -> Array:
+def estimated_error(difference: Array, share: Array | float, scene: Scene, steps: Array, radians: Array) -> Array:
     """The error of a run, from its `difference` to one with larger steps.
 
         difference x share + 2 eps (steps + radians)

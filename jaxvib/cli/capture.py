@@ -1,0 +1,64 @@
+"""jaxvib capture."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import click
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.study.capture.capture import thrown_state
+
+
+@app.command("capture")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--from", "low", type=float, default=-1.0, show_default=True, help="Least initial speed, relative to the rotor.")
+@click.option("--to", "high", type=float, default=0.0, show_default=True, help="Greatest initial speed.")
+@click.option("--speeds", type=click.IntRange(min=2), default=32, show_default=True, help="How many speeds are tried.")
+@click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Perturbed starts at each speed.")
+@click.option("--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Turns of the rotor in each run.")
+@click.option("--resolution", type=float, help="Look for the threshold as finely as this.")
+@shared
+def capture(
+    scene: Path,
+    low: float,
+    high: float,
+    speeds: int,
+    starts: int,
+    turns: int,
+    resolution: float | None,
+    output: Output,
+) -> None:
+    """From which initial speeds the balls in a torus of SCENE come to turn with the rotor; --out adds pictures."""
+    if not -1.0 <= low < high <= 0.0:
+        raise jv.InputError("--from", f"is {low:g} with --to {high:g}; speeds go up from -1 at least to 0 at most")
+    loaded = jv.load_scene(scene)
+    found = jv.capture(loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution)
+    picture, paths = output.file("capture.png"), output.file("paths.png")
+    if picture is not None and paths is not None:
+        from jaxvib.draw.capture import torus_paths
+
+        found.plot().savefig(picture)
+        # One run just above the threshold, or from the highest speed where none was found.
+        speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
+        until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
+        run = jv.simulate(loaded, until, start=thrown_state(loaded, speed), estimate=False)
+        kept = run.trajectory
+        assert kept is not None
+        around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]
+        rate = np.asarray(kept.state.azimuth_rate) / np.asarray(kept.rotor_speed)[:, None] - 1.0
+        torus_paths(around, np.asarray(kept.state.angle[1]), rate, np.asarray(kept.time)).savefig(paths)
+
+    def text() -> str:
+        rows = [
+            [f"{v:.5f}", f"{f:.3f}", f"{e:.3f}"]
+            for v, f, e in zip(found.speed, found.fraction, found.standard_error, strict=True)
+        ]
+        head = ["initial speed, in the rotor's", "share captured", "standard error"]
+        return table("starts captured", head, rows) + "\n" + found.summary()
+
+    document = {**found.as_dict(), "fraction": found.fraction.tolist(), "standard_error": found.standard_error.tolist()}
+    output.done(document, text, "capture")

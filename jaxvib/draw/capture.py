@@ -1,0 +1,60 @@
+"""Captures of balls: their paths on the unrolled torus, and shares of captured starts."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxvib.draw.style import COLORS, panels
+
+__all__ = ["threshold_chart", "torus_paths"]
+
+
+def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float) -> Figure:
+    """The share of captured starts over the initial speed, with its standard error, and the threshold.
+
+    >>> import numpy as np
+    >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
+    1
+    """
+    figure, (axis,) = panels(1, size=(7.0, 3.4))
+    axis.fill_between(
+        speed, np.clip(fraction - error, 0.0, 1.0), np.clip(fraction + error, 0.0, 1.0), color=COLORS[0], alpha=0.2, lw=0.0
+    )
+    axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0])
+    if np.isfinite(threshold):
+        axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
+        axis.legend()
+    axis.set_xlabel("initial speed relative to the rotor, in the rotor's speed")
+    axis.set_ylabel("share of starts captured")
+    axis.set_ylim(-0.05, 1.05)
+    return figure
+
+
+def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray) -> Figure:
+    """Paths of balls on the unrolled torus, and their speeds.
+
+    **Arguments** (T times, N balls): `around` (T, N) rad, the angle relative to the rotor; `across` (T, N) rad, in the tube's
+    cross-section, 0 the bottom, pi/2 the outer equator; `rate` (T, N), relative to the rotor, in its speed; `time` (T,) s.
+
+    >>> import numpy as np
+    >>> len(torus_paths(*np.zeros((3, 4, 2)), np.arange(4.0)).axes)
+    2
+    """
+    figure, (paths, speeds) = panels(2, size=(7.0, 3.4))
+    for j in range(around.shape[1]):
+        colour = COLORS[j % len(COLORS)]
+        wrapped = np.mod(around[:, j] + np.pi, 2.0 * np.pi) - np.pi
+        # No line across the picture where a ball leaves it on one side and comes back on the other.
+        broken = np.where(np.abs(np.diff(wrapped, prepend=wrapped[:1])) > np.pi, np.nan, wrapped)
+        paths.plot(np.degrees(broken), np.degrees(across[:, j]), color=colour, lw=0.6, label=f"ball {j + 1}")
+        paths.plot(np.degrees(wrapped[-1:]), np.degrees(across[-1:, j]), "o", color=colour)
+        speeds.plot(time, rate[:, j], color=colour, lw=0.8)
+    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8)
+    paths.set_xlim(-180.0, 180.0)
+    paths.set_xlabel("around the axis, relative to the rotor, degrees")
+    paths.set_ylabel("in the tube, degrees")
+    paths.legend()
+    speeds.set_xlabel("time, s")
+    speeds.set_ylabel("speed relative to the rotor")
+    return figure

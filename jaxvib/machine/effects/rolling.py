@@ -1,0 +1,103 @@
+"""Resistance to rolling of loads that press on their track."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.effects.base import Effect, Friction
+from jaxvib.machine.effects.friction import sliding_sign
+from jaxvib.machine.loads import Loads
+from jaxvib.units import Number, number
+
+__all__ = ["RollingFriction"]
+
+Direction = Literal["along", "each"]
+
+
+class RollingFriction(Effect):
+    """Resistance to rolling, Coulomb's: a moment k N at the contact against the rolling of a load on the rotor's wall.
+
+        Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
+
+    J = dp/du, so that v is the velocity of the load's centre along the wall, seen from the rotor that turns at w; N is the
+    force with which the load presses on its track, found together with the accelerations (`Loads.pressing`); r the load's own
+    radius. A load that does not press has no friction. A load that would have to stick under the share s < 1 of what friction
+    can hold creeps at width artanh(s), which goes to zero with the width.
+
+    **Arguments**: `coefficient` k, m (about 2e-5 to 4e-5 for steel balls on steel), 0 for none; `direction` "along" the
+    rolling, or "each": for each coordinate of the load by itself, d_i = tanh(v_i/width), as the paper prints, so that the
+    motion around the axis does not spare the one across it; `width` m/s, over which the sign is smoothed.
+
+    The sign of N is that of the motion without this friction.
+
+    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without an own radius.
+
+    >>> import jaxvib as jv
+    >>> jv.RollingFriction("0.04 mm").direction
+    'along'
+
+    Source: Strautmanis et al. 2018, equations (6)-(10), with the normal force and the levers derived again.
+    """
+
+    # By itself: it goes with the normal force, which takes the acceleration along the load's direction, and both turn over.
+    half_turn_symmetric = True
+
+    coefficient: Array
+    direction: str = eqx.field(static=True)
+    width: Array
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, coefficient: Number, direction: Direction = "along", width: Number = 0.01):
+        field = "effects.rolling_friction"
+        self.coefficient = number(coefficient, "m", f"{field}.coefficient", low=0.0)
+        self.width = number(width, "m/s", f"{field}.width", low=0.0, open_low=True)
+        if direction not in get_args(Direction):
+            raise InputError(f"{field}.direction", f"is {direction!r}; allowed: {', '.join(get_args(Direction))}")
+        self.direction = direction
+        self.kind = "rolling_friction"
+
+    def check(self, machine: Machine, loads: Loads) -> None:
+        """Loads that roll and press on a track."""
+        if getattr(loads, "own_radius", None) is None:
+            problem = f"needs loads that roll, with an own_radius; {loads.kind!r} have none here"
+            raise InputError("effects.rolling_friction", problem)
+
+    def friction(
+        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
+    ) -> Friction:
+        """-(k/r) J^T d and N."""
+        pressing = loads.pressing(u, rate, g)
+        assert pressing is not None
+        slip = (rate[0] - speed, *rate[1:])
+        scale = self.coefficient / loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+        if self.direction == "each":
+            levers = [self._lever(loads, u, i, x) for i, x in enumerate(slip)]
+        else:
+            v = jax.jvp(loads.position, u, slip)[1]
+            speed_ = _length(v)
+            # tanh(x)/x, also where nothing moves.
+            moving = speed_ > 1e-6 * self.width
+            share = jnp.where(moving, sliding_sign(speed_, self.width) / jnp.where(moving, speed_, 1.0), 1.0 / self.width)
+            levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))
+        first, *others = (-scale * lever for lever in levers)
+        return Friction(first, pressing.reaction, pressing.normal, tuple(others), loads.one_sided)
+
+    def _lever(self, loads: Loads, u: tuple[Array, ...], i: int, slip: Array) -> Array:
+        """|dp/du_i| tanh(|dp/du_i| slip / width)."""
+        direction = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
+        size = _length(jax.jvp(loads.position, u, direction)[1])
+        return size * sliding_sign(size * slip, self.width)
+
+
+def _length(v: tuple[Array, ...]) -> Array:
+    square = sum(x**2 for x in v)
+    zero = square == 0.0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))

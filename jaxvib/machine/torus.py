@@ -1,0 +1,183 @@
+"""Balls in a torus: loads that run around the rotor's axis and up and down the wall of their tube."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.loads import Loads, Pressing, require_side_by_side
+from jaxvib.units import Number, number, numbers, traced
+from jaxvib.units import count as whole
+
+__all__ = ["TEMPLATE", "TorusBalls", "torus_balls"]
+
+_ROLLING = 0.4
+"""kappa - 1 of a solid ball: its moment of inertia is 2/5 m r^2."""
+
+
+class TorusBalls(Loads):
+    """Balls that roll on the inner wall of a tube bent to a ring, u = (f, a).
+
+        p = (B cos f, B sin f, -rho cos a),    B = R + rho sin a,    rho = R_1 - r
+
+    f is the angle about the rotor's axis, a that in the tube's cross-section: 0 where the axial coordinate is least, the bottom
+    of a tube that lies level, pi/2 at the outer equator. With n the direction from the tube's middle to the ball, v = B f' and
+    kappa = 7/5
+
+        kappa m (B f'' + 2 rho cos a a' f') = (2/5) m w rho cos a a' + F_f
+        kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a
+        N = m (B f'^2 sin a + rho a'^2 - n . (port's acceleration + gravity upward))
+
+    w is the rotor's speed. A ball that rolls without slipping and does not twist about its point of contact turns with the wall
+    and rolls on it; its own rotation then adds the inertia kappa - 1 and the terms with w, which do no work: by them the
+    rolling counts with B f' (f' - w) and not with B f'^2, and a ball that rests on a tube at rest, or turns with it, presses
+    up its wall with the centrifugal force of its mass alone. The wall's acceleration, where w changes, is left out, as the
+    gyroscopic matrix of a rotor leaves it out. On the equator the ball is one of a plane track of radius R + rho.
+
+    **Attributes** (scalar, or (count,) for `mass` and `drag`): `mass` m kg; `radius` R m of the tube's middle line; `tube` R_1
+    m, the radius of its cross-section; `own_radius` r m of a ball; `drag` b_W N s/m, viscous resistance of a ball against the
+    wall it rolls on; `count` N; `kind` "torus_ball".
+
+    Source: Strautmanis et al. 2018; the ball's own rotation is derived here from Newton's and Euler's equations.
+    """
+
+    one_sided = True
+
+    mass: Array
+    radius: Array
+    tube: Array
+    own_radius: Array
+    drag: Array
+    count: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+
+    @property
+    def gap(self) -> Array:
+        """rho = R_1 - r, m: the radius of the circle in the cross-section on which the ball's centre runs."""
+        return self.tube - self.own_radius
+
+    def _arm(self, a: Array) -> Array:
+        return self.radius + self.gap * jnp.sin(a)
+
+    def position(self, *u: Array) -> tuple[Array, Array, Array]:
+        """(B cos f, B sin f, -rho cos a)."""
+        f, a = u
+        return self._arm(a) * jnp.cos(f), self._arm(a) * jnp.sin(f), -self.gap * jnp.cos(a)
+
+    def rest(self) -> tuple[Array, Array]:
+        """At the outer equator, f = -pi/2: where a balancer works, and at the bottom of a torus that stands upright."""
+        quarter = jnp.full((self.count,), 0.5 * jnp.pi, dtype=jnp.result_type(self.radius))
+        return -quarter, quarter
+
+    def inertia_factor(self) -> Array:
+        """7/5."""
+        return jnp.asarray(1.0 + _ROLLING, dtype=self.mass.dtype)
+
+    def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
+        """- b_W (B^2 (f' - w), rho^2 a')."""
+        return self.drag * self._arm(u[1]) ** 2 * (speed - rate[0]), -self.drag * self.gap**2 * rate[1]
+
+    def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, Array]:
+        """(2/5) m w B rho cos a (a', -f')."""
+        turn = _ROLLING * self.mass * speed * self._arm(u[1]) * self.gap * jnp.cos(u[1])
+        return turn * rate[1], -turn * rate[0]
+
+    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing:
+        """N, against the tube's wall."""
+        (f, a), m = u, self.mass
+        normal = (jnp.sin(a) * jnp.cos(f), jnp.sin(a) * jnp.sin(f), -jnp.cos(a))
+        held = self._arm(a) * rate[0] ** 2 * jnp.sin(a) + self.gap * rate[1] ** 2
+        return Pressing(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
+
+    def own_frequency(self, speed: Array) -> Array:
+        """w sqrt((R + rho) / (kappa rho)): of small motions about the outer equator of balls that turn with the rotor."""
+        return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
+
+
+def torus_balls(
+    *,
+    count: int,
+    mass: Number | Sequence[Number],
+    radius: Number,
+    tube: Number,
+    own_radius: Number,
+    drag: Number | Sequence[Number] = 0.0,
+) -> TorusBalls:
+    """Balls that roll in a tube bent to a ring around the rotor's axis, kappa = 7/5.
+
+    Their first coordinate is the angle about the axis, their second the angle in the tube's cross-section, see `TorusBalls`.
+    Dry friction is the effect `RollingFriction`, gravity along a vertical axis `Gravity(along="axis")`.
+
+    **Arguments**: `count` N; `mass` kg of each, one number or N; `radius` R m of the tube's middle line; `tube` m, radius of
+    its cross-section; `own_radius` r m of a ball, less than `tube`: what is left is the gap in which the ball's angle in the
+    cross-section moves; `drag` N s/m, viscous resistance against the wall, at the ball's centre, one number or N (0).
+
+    **Returns** `TorusBalls`. **Raises** `InputError` for wrong units, values that are not positive, a ball that fills its tube
+    or more, a tube wider than its ring, balls that have no room side by side on the outer equator.
+
+    >>> import jaxvib as jv
+    >>> loads = jv.torus_balls(count=2, mass="64 g", radius="200 mm", tube="15 mm", own_radius="12.5 mm")
+    >>> round(float(loads.gap), 6)
+    0.0025
+
+    Source: Strautmanis et al. 2018.
+    """
+    n = whole(count, "loads.count")
+    large, wide, own = (
+        number(value, "m", f"loads.{name}", low=0.0, open_low=True)
+        for name, value in (("radius", radius), ("tube", tube), ("own_radius", own_radius))
+    )
+    if not any(map(traced, (large, wide, own))):
+        _require_room(n, float(large), float(wide), float(own))
+    return TorusBalls(
+        mass=numbers(mass, "kg", "loads.mass", n, low=0.0, open_low=True, shared=True),
+        radius=large,
+        tube=wide,
+        own_radius=own,
+        drag=numbers(drag, "N s/m", "loads.drag", n, low=0.0, shared=True),
+        count=n,
+        kind="torus_ball",
+    )
+
+
+def _require_room(count: int, radius: float, tube: float, own_radius: float) -> None:
+    if not tube < radius:
+        raise InputError("loads.tube", f"is {tube:.6g} m; it must be less than the ring's radius, {radius:.6g} m")
+    if not own_radius < tube:
+        problem = "leaves no gap" if own_radius == tube else "is larger than the tube"
+        hint = "give a smaller one, or for balls that only run around the axis balls(...)"
+        raise InputError("loads.own_radius", f"is {own_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
+    require_side_by_side(count, radius + tube - own_radius, own_radius)
+
+
+TEMPLATE = """# A vertical rotor on one support, with balls in a torus that are to balance it.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "planar_rotor"
+mass = 6.87                 # kg, the torus included, balls not counted
+stiffness = "1372 N/m"      # of the support, alike in both directions
+damping = 98.0              # N s/m
+
+[loads]
+kind = "torus_ball"         # ball, roller, pendulum, torus_ball
+count = 2
+mass = "64 g"               # of one ball
+radius = "200 mm"           # of the tube's middle line
+tube = "15 mm"              # radius of the tube's cross-section
+own_radius = "12.5 mm"      # of a ball; what is left of the tube is the gap in which it rolls up and down
+# drag = 0.0                # N s/m, viscous resistance against the wall
+
+[drive]
+kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
+speed = "140 rad/s"
+
+[effects]                   # only what the scene calls for
+gravity = { along = "axis" }                   # the axis is vertical
+static_imbalance = { moment = "6.87 g m" }     # of the rotor: its mass times its eccentricity
+rolling_friction = { coefficient = "0.04 mm" } # the lever k of the normal force; width = 0.01 m/s smooths its sign
+"""
+"""A commented scene file."""

@@ -1,0 +1,275 @@
+"""Which initial speeds of the balls bring them to the rotor's speed: success fractions and the threshold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.ensemble import Equations, ensemble
+from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.run import Run
+from jaxvib.motion.steps import EqualSteps
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.units import Number, count, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
+
+_CAUGHT = 3e-3
+"""A load whose mean speed differs from the rotor's by less turns with it, as in `regime`."""
+
+_PER_RADIAN = 1.0
+"""Steps for each radian of what moves fastest, balls up and down their tube: errors far below those of chance."""
+
+_SCAN = 32
+"""Initial speeds that are tried side by side where a threshold is looked for."""
+
+
+class CaptureStatus(eqx.Enumeration):
+    """What is known of a threshold; the members are the sentences a user reads."""
+
+    found = "from the threshold up every start was captured"
+    all_captured = "every start was captured: the threshold lies below the speeds that were tried"
+    none_captured = "not every start at the highest speed was captured: the threshold lies above the speeds that were tried"
+
+
+class Capture(Result):
+    """Success from initial speeds of the loads relative to the rotor.
+
+    **Attributes** (S speeds, each tried from `starts` perturbed positions): `speed` (S,) ascending, (psi')/w, -1 for loads at
+    rest in space, 0 for loads that turn with the rotor; `captured` (S, starts) whether all loads turned with the rotor at
+    the end; `finite` (S, starts) whether the motion stayed so; `threshold`, the least speed from which on all starts were
+    captured, halfway to the next lower speed that was tried, and `uncertainty`, half the distance to that speed or to the
+    highest speed at which half of the starts fail, whichever is more, NaN where there is no threshold; `turns` of the rotor
+    that each run took; `status` a `CaptureStatus`.
+
+    Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` says how often.
+    """
+
+    speed: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
+    captured: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
+    finite: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
+    threshold: Array = eqx.field(metadata=in_unit(""))
+    uncertainty: Array = eqx.field(metadata=in_unit(""))
+    turns: Array = eqx.field(metadata=in_unit(""))
+    status: CaptureStatus
+
+    @property
+    def fraction(self) -> np.ndarray:
+        """The share of starts captured at each speed, (S,)."""
+        return np.mean(self.captured, axis=1)
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """Of the fraction, (S,), by Agresti and Coull: also where all starts, or none, were captured it is not 0."""
+        n = self.captured.shape[1]
+        share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
+        return np.sqrt(share * (1.0 - share) / (n + 4.0))
+
+    @property
+    def islands(self) -> int:
+        """How often, going up the speeds, captures give way to failures again: 0 where there is one clean threshold."""
+        all_of_them = np.all(self.captured, axis=1)
+        return int(np.sum(np.any(self.captured, axis=1)[:-1] & ~all_of_them[1:]))
+
+    def summary(self) -> str:
+        """The threshold with its uncertainty, and what stands below it, for a person to read."""
+        n = self.captured.shape[1]
+        head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
+        if np.isnan(self.threshold):
+            return head
+        below = self.fraction[self.speed < float(self.threshold)]
+        where = f"threshold {float(self.threshold):.4f} +- {float(self.uncertainty):.1e} of the rotor's speed"
+        lone = f"; below it {100.0 * np.mean(below):.3g} % are captured all the same" if np.any(below > 0.0) else ""
+        return f"{head}\n  {where}{lone}"
+
+    def plot(self) -> Figure:
+        """The share of starts captured over the initial speed, and the threshold. **Returns** a matplotlib figure."""
+        from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
+
+        return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold))
+
+
+def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
+    """The carrier at rest, the loads side by side at the bottom of the tube, all at the same speed relative to the rotor.
+
+    **Arguments**: `speed` psi'/w, -1 for loads at rest in space; `shift` rad, one number or (count,), by which the loads lie
+    further along the ring. They lie 2 atan(r/R) apart, as the paper has it.
+
+    **Returns** `State`.
+
+    >>> from jaxvib.study.capture.published_torus import published_torus
+    >>> state = thrown_state(published_torus(2.5), -0.5)
+    >>> [round(float(x), 4) for x in (state.angle[0][1], state.rate[0][0])]
+    [0.1248, 70.0]
+    """
+    loads = scene.loads
+    # Not by arctan: of 64 lanes and more it comes out wrong with vectors of 512 bits (jaxlib 0.10).
+    beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
+    zero = jnp.zeros((loads.count,))
+    still = jnp.zeros(scene.machine.structure().mass.shape[:1])
+    turn = scene.drive.speed * (1.0 + jnp.asarray(speed))
+    return State(still, still, (jnp.arange(loads.count) * beside + shift, zero), (turn + zero, zero))
+
+
+def capture(
+    scene: Scene,
+    speeds: Sequence[float] | np.ndarray | None = None,
+    *,
+    turns: int = 2000,
+    starts: int = 1,
+    spread: Number = 1e-3,
+    seed: int = 0,
+    resolution: float | None = None,
+    stepsize_controller: EqualSteps | None = None,
+    equations: Equations = vector_field,
+) -> Capture:
+    """From which initial speeds the balls of a torus come to turn with the rotor, and the least such speed.
+
+    Each speed is tried from `starts` positions of the loads along the ring, and each run taken to its end: a run without
+    progress may still be captured late, so that none is cut short. With a `resolution` the stretch between the threshold and
+    the next lower speed is tried again, finer and finer. Above the threshold of the speeds tried first nothing is looked at
+    again: an island of failures narrower than their distance stays unseen.
+
+    **Arguments**
+
+    - `speeds`: initial speeds relative to the rotor's, ascending, from -1 (at rest in space) to 0; 32 of them by default
+    - `turns` of the rotor that each run takes; a capture that needs more counts as a failure
+    - `starts` a speed; all but the first are moved along the ring, each load by itself, by up to `spread` rad, by `seed`
+    - `resolution`: how finely the threshold is looked for, relative to the rotor's speed
+    - `stepsize_controller`: `EqualSteps(n)` for the whole run; the default is a step for each radian of the fastest motion
+    - `equations`: as `ensemble`; `jaxvib.study.capture.published_torus.printed_torus` for the paper's printed ones
+
+    **Returns** `Capture`. **Raises** `InputError` for loads that are none of a torus, a motor, and numbers not allowed.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.study.capture.published_torus import published_torus
+    >>> found = jv.capture(published_torus(5.4), [-1.0, -0.2], turns=60)
+    >>> found.fraction.tolist(), found.status_name
+    ([0.0, 1.0], 'found')
+
+    Source: Strautmanis et al. 2018, section 3, where each speed has one start.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if len(scene.loads.rest()) != 2 or getattr(scene.loads, "own_radius", None) is None:
+        raise InputError("loads.kind", f"is {scene.loads.kind!r}; capture asks for balls in a torus: torus_balls(...)")
+    if not scene.drive.constant:
+        raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
+    if resolution is not None and not 0.0 < resolution < 1.0:
+        raise InputError("resolution", f"is {resolution!r}; it must be between 0 and 1, such as 1e-3")
+    tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
+    allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
+    if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
+        raise InputError("speeds", f"is {speeds!r}; ascending numbers from -1 to 0 are needed")
+    end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
+    width = float(number(spread, "rad", "spread", low=0.0))
+    shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
+    shifts[0] = 0.0
+    if stepsize_controller is None:
+        fastest = float(fastest_and_slowest(scene)[0])
+        stepsize_controller = EqualSteps(max(16, math.ceil(_PER_RADIAN * end * fastest)))
+
+    def outcomes(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
+        shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
+        values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
+        ran = ensemble(_thrown, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
+        slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
+        shape, finite = (which.size, starts), np.asarray(ran.finite)
+        return (np.all(slip < _CAUGHT, axis=1) & finite).reshape(shape), finite.reshape(shape)
+
+    captured, finite = outcomes(tried)
+    while resolution is not None:
+        least = _least(captured)
+        if least in (0, tried.size) or tried[least] - tried[least - 1] <= resolution:
+            break
+        finer = np.linspace(tried[least - 1], tried[least], max(4, _SCAN // starts) + 2)[1:-1]
+        more, stayed = outcomes(finer)
+        order = np.argsort(np.concatenate([tried, finer]))
+        tried = np.concatenate([tried, finer])[order]
+        captured, finite = (np.concatenate(pair)[order] for pair in ((captured, more), (finite, stayed)))
+    return _judged(tried, captured, finite, turns)
+
+
+def _thrown(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
+    scene, speed, shift = value
+    return scene, thrown_state(scene, speed, shift)
+
+
+def _least(captured: np.ndarray) -> int:
+    """The index of the least speed from which on all starts are captured; the number of speeds where there is none."""
+    failing = np.flatnonzero(~np.all(captured, axis=1))
+    return 0 if failing.size == 0 else int(failing[-1]) + 1
+
+
+def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, turns: int) -> Capture:
+    least = _least(captured)
+    threshold, uncertainty, status = math.nan, math.nan, CaptureStatus.found
+    if least == 0:
+        status = CaptureStatus.all_captured
+    elif least == speed.size:
+        status = CaptureStatus.none_captured
+    else:
+        threshold = 0.5 * (speed[least - 1] + speed[least])
+        half = np.flatnonzero(np.mean(captured[:least], axis=1) <= 0.5)
+        below = speed[half[-1]] if half.size else speed[0]
+        uncertainty = max(0.5 * (speed[least] - speed[least - 1]), 0.5 * (threshold - below))
+    return Capture(
+        speed=speed,
+        captured=captured,
+        finite=finite,
+        threshold=jnp.asarray(threshold),
+        uncertainty=jnp.asarray(uncertainty),
+        turns=jnp.asarray(turns),
+        status=status,
+    )
+
+
+def capture_time(run: Run, within: float = 0.05) -> Array:
+    """When the last load came to within a share of the rotor's speed for good, s.
+
+    The last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
+    rotor's, linear between the states that were kept. Derivatives go through it, forward and reverse; they hold as long as the
+    same passage of the same load is the last one: where another takes its place the time jumps, and no derivative says so.
+
+    **Returns** a scalar; 0 where all loads were there from the beginning, infinite where one is not there at the end.
+    **Raises** `InputError` for a run that kept its window only.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.study.capture.capture import capture_time, thrown_state
+    >>> from jaxvib.study.capture.published_torus import published_torus
+    >>> scene = published_torus(5.4)
+    >>> run = jv.simulate(scene, 1.0, start=thrown_state(scene, -0.1), samples=2000, estimate=False)
+    >>> bool(0.0 < capture_time(run) < 1.0)
+    True
+    """
+    if run.trajectory is None:
+        raise InputError("run", "kept its window only; run simulate with save='all'")
+    times, speed = run.trajectory.time, run.trajectory.rotor_speed[:, None]
+    excess = jnp.abs(run.trajectory.state.azimuth_rate - speed) - within * jnp.abs(speed)
+
+    def last(excess: Array) -> Array:
+        away = excess > 0.0
+        k = jnp.max(jnp.where(away, jnp.arange(times.size), -1))
+        i = jnp.clip(k, 0, times.size - 2)
+        drop = excess[i] - excess[i + 1]
+        crossing = times[i] + (times[i + 1] - times[i]) * excess[i] / jnp.where(drop > 0.0, drop, 1.0)
+        return jnp.where(k < 0, 0.0, jnp.where(k == times.size - 1, jnp.inf, crossing))
+
+    each = jnp.stack([last(excess[:, j]) for j in range(excess.shape[1])])
+    return jnp.max(each)

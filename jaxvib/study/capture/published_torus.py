@@ -1,0 +1,184 @@
+"""The published toroidal balancer: its data, its tables, and its equations as printed."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.dynamics import State
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.effects.base import Gravity, StaticImbalance
+from jaxvib.machine.effects.rolling import RollingFriction
+from jaxvib.machine.rotor import PlanarRotor, planar_rotor
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import TorusBalls, torus_balls
+from jaxvib.units import Number, number
+
+__all__ = ["TABLES", "PrintedTorus", "PublishedRow", "printed_torus", "published_torus"]
+
+_SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
+
+_SIGN_WIDTH = 0.1
+"""Over so much of a relative speed, in the rotor's, the printed model's signs are smoothed."""
+
+
+class PublishedRow(NamedTuple):
+    """A row of the paper's tables: `damping` n, `stiffness` p, `friction` k m, and over `gap` the least initial `speed`."""
+
+    damping: float
+    stiffness: float
+    friction: float
+    gap: tuple[float, ...]
+    speed: tuple[float, ...]
+
+
+TABLES = (
+    PublishedRow(
+        0.1,
+        0.005,
+        2e-5,
+        (0.5, 1.1, 1.9, 2.7, 3.5, 4.3, 5.1, 5.7),
+        (-0.857, -0.804, -0.776, -0.881, -0.880, -0.878, -0.881, -0.880),
+    ),
+    PublishedRow(
+        0.1,
+        0.005,
+        4e-5,
+        (0.5, 1.1, 1.9, 2.7, 3.5, 4.3, 5.1, 5.4),
+        (-0.874, -0.876, -0.873, -0.890, -0.892, -0.900, -0.901, -1.0),
+    ),
+    PublishedRow(
+        0.145,
+        0.005,
+        2e-5,
+        (0.5, 1.1, 1.9, 2.7, 3.5, 4.3, 5.1, 5.7),
+        (-0.861, -0.846, -0.824, -0.879, -0.884, -0.882, -0.881, -0.880),
+    ),
+    PublishedRow(
+        0.145, 0.005, 4e-5, (0.5, 1.1, 1.9, 2.7, 3.5, 4.3, 4.9), (-0.880, -0.862, -0.850, -0.891, -0.913, -0.912, -1.0)
+    ),
+    PublishedRow(
+        0.1,
+        0.003,
+        4e-5,
+        (0.5, 1.1, 1.7, 2.3, 2.9, 3.5, 3.9, 4.6),
+        (-0.888, -0.868, -0.892, -0.929, -0.927, -0.912, -0.920, -1.0),
+    ),
+    PublishedRow(
+        0.1,
+        0.010,
+        4e-5,
+        (0.5, 1.1, 1.9, 2.7, 3.5, 4.3, 5.1, 5.4),
+        (-0.388, -0.428, -0.565, -0.639, -0.701, -0.750, -0.868, -0.977),
+    ),
+)
+"""Tables 1 and 2 of the paper: four rows, and two."""
+
+
+def published_torus(
+    gap: float,
+    *,
+    damping: float = 0.1,
+    stiffness: float = 0.01,
+    friction: float = 4e-5,
+    mass: Number = 7.0,
+    width: Number = 0.1,
+) -> Scene:
+    """The paper's vertical rotor with two balls in a torus.
+
+    **Arguments**: `gap` (R_1 - r)/e, above 0 and below 15; `damping` n = b/(M w); `stiffness` p = c/(M w^2); `friction` k m;
+    `mass` M kg of everything, balls included, which is not printed: 7.0 kg fits the tables; `width` m/s of `RollingFriction`.
+
+    **Returns** `Scene`, with this package's own equations; `printed_torus` gives the paper's for it.
+    **Raises** `InputError` for a gap, or a mass, that leaves no ball or no rotor.
+
+    >>> scene = published_torus(2.5)
+    >>> round(float(scene.loads.own_radius), 6), round(float(scene.machine.mass), 4)
+    (0.0125, 6.8722)
+
+    Source: Strautmanis et al. 2018, sections 2 and 3.
+    """
+    own = _TUBE - gap * _ECCENTRICITY
+    if not 0.0 < own < _TUBE:
+        raise InputError("gap", f"is {gap:g}; it must be between 0 and {_TUBE / _ECCENTRICITY:g}, where a ball has room")
+    ball = _DENSITY * 4.0 / 3.0 * math.pi * own**3
+    whole = number(mass, "kg", "mass", low=2.0 * ball, open_low=True)
+    body = whole - 2.0 * ball
+    return Scene(
+        planar_rotor(mass=body, stiffness=stiffness * whole * _SPEED**2, damping=damping * whole * _SPEED),
+        torus_balls(count=2, mass=ball, radius=_RADIUS, tube=_TUBE, own_radius=own),
+        ConstantSpeed(_SPEED),
+        (
+            Gravity(0.5005 * _ECCENTRICITY * _SPEED**2, along="axis"),
+            StaticImbalance(body * _ECCENTRICITY),
+            RollingFriction(friction, width=width),
+        ),
+    )
+
+
+class PrintedTorus(eqx.Module):
+    """The paper's equations (1)-(10), as far as they can be read, for a scene of `published_torus`.
+
+        kappa B psi'' = x'' s - y'' c - 2 rho cos a a' f' - (k/r) N (R + R_1 sin a) B/R^2 sign(psi')
+        kappa rho a'' = B f'^2 cos a - g sin a - cos a (x'' c + y'' s) - e w^2 M_r/M cos a (sin psi - cos psi)
+                        - (k/r) N R_1/rho sign(a'),            N = g cos a + R f'^2 sin a + rho a'^2
+
+    f = w t + psi. Against what the same paper's drawing asks for: the rotor's unbalance comes into the last equation with the
+    sine of psi in place of its cosine, friction up the tube has the lever R_1 in place of the gap, N (per mass) lacks the
+    acceleration of the rotor, a ball's rolling adds inertia to second derivatives alone, and each coordinate has a friction of
+    its own. For comparison with the paper's tables only.
+    """
+
+    machine: PlanarRotor
+    loads: TorusBalls
+    speed: Array
+    gravity: Array
+    imbalance: Array
+    friction: Array
+
+    def __call__(self, t: Array, state: State) -> State:
+        """The time derivative of `state` at time `t`."""
+        loads, w = self.loads, self.speed
+        m, r, gap, kappa = loads.mass, loads.radius, loads.gap, loads.inertia_factor()
+        (f, a), (turn, climb) = state.angle, state.rate
+        c, s, across, up = jnp.cos(f), jnp.sin(f), jnp.cos(a), jnp.sin(a)
+        cos, sin = jnp.cos(w * t), jnp.sin(w * t)
+        arm = r + gap * up
+        whole = self.machine.mass + loads.count * m
+        pressed = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0) * self.friction / loads.own_radius
+        width = _SIGN_WIDTH * w
+        slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / width)
+        stop = pressed * loads.tube / gap**2 * jnp.tanh(climb / width)
+        lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin
+        wrong = self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
+        free_turn = (-2.0 * gap * across * climb * turn / arm - slow) / kappa
+        free_climb = ((arm * turn**2 * across - self.gravity * up) / gap - wrong - stop) / kappa
+        # whole q'' = pull + sum of what the balls' own accelerations add, which hold q'' again
+        pull_x = m * (arm * turn**2 * c + 2.0 * gap * across * climb * turn * s + gap * up * climb**2 * c)
+        pull_y = m * (arm * turn**2 * s - 2.0 * gap * across * climb * turn * c + gap * up * climb**2 * s)
+        pull_x = jnp.sum(pull_x + m * (arm * s * free_turn - gap * across * c * free_climb))
+        pull_y = jnp.sum(pull_y - m * (arm * c * free_turn + gap * across * s * free_climb))
+        (x, y), (vx, vy) = state.displacement, state.velocity
+        pull_x = pull_x - self.machine.stiffness * x - self.machine.damping * vx + self.imbalance * w**2 * cos
+        pull_y = pull_y - self.machine.stiffness * y - self.machine.damping * vy + self.imbalance * w**2 * sin
+        xx = whole - jnp.sum(m / kappa * (s**2 + (across * c) ** 2))
+        xy = jnp.sum(m / kappa * (1.0 - across**2) * s * c)
+        yy = whole - jnp.sum(m / kappa * (c**2 + (across * s) ** 2))
+        det = xx * yy - xy**2
+        ax, ay = (yy * pull_x - xy * pull_y) / det, (xx * pull_y - xy * pull_x) / det
+        turned = free_turn + (ax * s - ay * c) / (kappa * arm)
+        climbed = free_climb - across * (ax * c + ay * s) / (kappa * gap)
+        return State(state.velocity, jnp.stack([ax, ay]), state.rate, (turned, climbed))
+
+
+def printed_torus(scene: Scene) -> PrintedTorus:
+    """The paper's equations for a scene of `published_torus`, see `PrintedTorus`; what `ensemble` takes as its `equations`."""
+    gravity, imbalance, rolling = scene.effects
+    assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
+    machine, loads = cast(PlanarRotor, scene.machine), cast(TorusBalls, scene.loads)
+    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient)

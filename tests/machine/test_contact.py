@@ -1,0 +1,90 @@
+"""Balls that meet: the energy that restitution leaves, and that they do not pass through each other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from torus import OWN, RADIUS, balls
+
+import jaxvib as jv
+from jaxvib.machine.effects.contact import damping_ratio
+
+HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
+
+
+def plane(restitution, stiffness=1e5):
+    loads = jv.balls(count=2, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
+    return jv.Scene(HEAVY, loads, jv.ConstantSpeed(1.0), (jv.LoadContact(stiffness, restitution=restitution),))
+
+
+def on_equator(restitution, count=2):
+    return jv.Scene(HEAVY, balls(count), jv.ConstantSpeed(1e-9), (jv.LoadContact(1e5, restitution=restitution),))
+
+
+def after(s, rates, until, spacing=0.2):
+    """Speeds of the loads at the end, and the least distance that two of them come to, in their diameters."""
+    angle = jnp.arange(len(rates)) * spacing
+    others = s.loads.rest()[1:]
+    zero = jnp.zeros(2)
+    start = jv.State(zero, zero, (angle, *others), (jnp.asarray(rates), *(jnp.zeros_like(x) for x in others)))
+    run = jv.simulate(s, until, start=start, samples=800, stepsize_controller=jv.EqualSteps(8000), estimate=False)
+    place = np.stack(jax.vmap(s.loads.position)(*run.trajectory.state.angle))
+    n = len(rates)
+    apart = [np.linalg.norm(place[:, :, i] - place[:, :, j], axis=0).min() for i in range(n) for j in range(i)]
+    return np.asarray(run.trajectory.state.rate[0]), min(apart) / (2.0 * float(s.loads.own_radius))
+
+
+@pytest.mark.parametrize("make", [plane, on_equator])
+@pytest.mark.parametrize("restitution", [1.0, 0.6, 0.2])
+def test_balls_part_with_the_share_of_their_speed_that_restitution_says(make, restitution):
+    rates, least = after(make(restitution), [2.0, -1.0], 0.1)
+    # The force of the damper begins with a jump, within a step: up to 1 % of the speed.
+    np.testing.assert_allclose(rates[-1, 1] - rates[-1, 0], 3.0 * restitution, rtol=0.02, atol=2e-3)
+    np.testing.assert_allclose(np.sum(rates[-1]), 1.0, rtol=1e-9)  # and keep their common one
+    assert 0.9 < least < 1.0
+
+
+def test_three_balls_in_a_torus_meet_in_any_pair_and_do_not_pass():
+    rates, least = after(on_equator(0.8, count=3), [3.0, 0.0, -2.0], 0.4)
+    assert 0.9 < least < 1.0
+    assert rates[-1, 0] < rates[-1, 1] < rates[-1, 2]
+    energy = np.sum(rates**2, axis=1)
+    assert energy[-1] < 0.9 * energy[0]
+
+
+def test_the_damping_of_a_restitution_is_that_of_the_oscillator_let_go_when_it_would_pull():
+    """Against the contact integrated as such: x'' + 2 zeta x' + x = 0 until the force is none."""
+    for restitution in (0.9, 0.5, 0.2, 0.05):
+        zeta = float(damping_ratio(jnp.asarray(restitution)))
+        x, v, h = 0.0, 1.0, 1e-4
+
+        def force(x, v, zeta=zeta):
+            return -x - 2.0 * zeta * v
+
+        while True:  # by Runge and Kutta's method
+            k1, l1 = v, force(x, v)
+            k2, l2 = v + h / 2 * l1, force(x + h / 2 * k1, v + h / 2 * l1)
+            k3, l3 = v + h / 2 * l2, force(x + h / 2 * k2, v + h / 2 * l2)
+            k4, l4 = v + h * l3, force(x + h * k3, v + h * l3)
+            x, v = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), v + h / 6 * (l1 + 2 * l2 + 2 * l3 + l4)
+            if v < 0.0 and force(x, v) >= 0.0:
+                break
+        np.testing.assert_allclose(-v, restitution, rtol=1e-3)
+    slope, step = jax.grad(damping_ratio)(0.4), 1e-6
+    np.testing.assert_allclose(slope, (damping_ratio(0.4 + step) - damping_ratio(0.4 - step)) / (2.0 * step), rtol=1e-7)
+
+
+def test_a_restitution_survives_the_file_and_wrong_ones_are_named():
+    s = plane(0.7)
+    again = jv.scene_from_toml(jv.scene_to_toml(s))
+    assert float(again.effects[0].restitution) == 0.7 and RADIUS > OWN
+    for arguments, says in (
+        (dict(restitution=1.2), "restitution is 1.2; it must be at most 1"),
+        (dict(restitution=0.0), "restitution is 0; it must be greater than 0"),
+        (dict(restitution=0.5, damping=3.0), "goes without damping, which it stands for"),
+    ):
+        with pytest.raises(jv.InputError, match=says):
+            jv.LoadContact(1e5, **arguments)
+    uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, own_radius=0.0125)
+    with pytest.raises(jv.InputError, match="is for loads of one mass"):
+        jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))

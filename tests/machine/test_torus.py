@@ -1,0 +1,159 @@
+"""Balls in a torus: their equations against other derivations, friction, limits, and what is said about wrong numbers."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from torus import MASS, OWN, SPEED, balls, lagrangian_accelerations, published, rolling_ball_accelerations, scene, some_state
+
+import jaxvib as jv
+
+evaluate = jax.jit(lambda s, t, state: jv.vector_field(s)(t, state))
+
+
+@pytest.mark.parametrize("direction", ["none", "along", "each"])
+def test_equations_are_lagranges(direction):
+    effects = published(direction=direction) if direction != "none" else ()
+    s = scene(effects, drag=0.3)
+    friction, gravity = ((4e-5, direction, 0.01), 9.81) if effects else (0.0, 0.0)
+    expected = jax.jit(lambda t, state: lagrangian_accelerations(s, t, state, friction, gravity))
+    for seed in range(4):
+        state, t = some_state(seed), jnp.asarray(0.3)
+        field, right = evaluate(s, t, state), expected(t, state)
+        for found, part in ((field.velocity, right[:2]), (field.rate[0], right[2:4]), (field.rate[1], right[4:])):
+            np.testing.assert_allclose(found, part, rtol=1e-12, atol=1e-12 * float(jnp.max(jnp.abs(part))))
+
+
+def test_a_balls_own_rotation_is_that_of_newton_and_euler():
+    """Against the ball's three-dimensional motion, on a rotor so heavy that it does not move aside."""
+    machine = jv.planar_rotor(mass=1e15, stiffness=0.0, damping=0.0)
+    s = jv.Scene(machine, balls(1), jv.ConstantSpeed(SPEED), (jv.Gravity(along="axis"),))
+    expected = jax.jit(functools.partial(rolling_ball_accelerations, 0.0025, OWN, SPEED, 9.81))
+    for seed in range(4):
+        state = some_state(seed, count=1)
+        state = jv.State(jnp.zeros(2), jnp.zeros(2), state.angle, state.rate)
+        field = evaluate(s, jnp.asarray(0.0), state)
+        (f, a), rates = (x[0] for x in state.angle), tuple(x[0] for x in state.rate)
+        turned, pressed = expected(f, a, rates)
+        np.testing.assert_allclose([field.rate[0][0], field.rate[1][0]], turned, rtol=1e-11)
+        np.testing.assert_allclose(jv.normal_force(s, 0.0, state)[0], pressed, rtol=1e-11)
+
+
+@pytest.mark.parametrize("direction", ["along", "each"])
+def test_power_balances_the_energy(direction):
+    s = scene(published(1e-4, direction), drag=0.2)
+
+    @jax.jit
+    def growth(t, state):
+        change = jv.vector_field(s)(t, state)
+        rate = jax.jvp(lambda t, y: jv.energy(s, y, t), (t, state), (jnp.ones_like(t), change))[1]
+        return rate, *jv.power(s, t, state)
+
+    for seed in range(3):
+        rate, supplied, lost = growth(jnp.asarray(0.7), some_state(seed))
+        assert float(lost) > 0.0
+        np.testing.assert_allclose(rate, supplied - lost, rtol=1e-10, atol=1e-9 * float(lost))
+
+
+def test_energy_only_falls_with_friction_and_no_drive():
+    """The rotor stands still: nothing puts energy in, friction and the damper take it out."""
+    s = scene((jv.Gravity(along="axis"), jv.RollingFriction(4e-5)), speed=1e-9)
+    start = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.asarray([0.0, 1.0]), jnp.zeros(2)), (jnp.full(2, 60.0), jnp.ones(2)))
+    run = jv.simulate(s, 1.0, start=start, samples=400, stepsize_controller=jv.EqualSteps(4000), estimate=False)
+    held = np.asarray(jax.vmap(lambda state: jv.energy(s, state))(run.trajectory.state))
+    assert np.all(np.diff(held) < 0.0) and held[-1] < 0.97 * held[0]
+    bare = jv.Scene(jv.planar_rotor(mass=6.87, stiffness=1372.0, damping=0.0), s.loads, s.drive, s.effects[:1])
+    run = jv.simulate(bare, 1.0, start=start, samples=400, stepsize_controller=jv.EqualSteps(4000), estimate=False)
+    held = np.asarray(jax.vmap(lambda state: jv.energy(bare, state))(run.trajectory.state))
+    np.testing.assert_allclose(held, held[0], rtol=1e-9)
+
+
+def test_a_ball_on_the_outer_equator_is_one_of_the_plane_track():
+    friction = (jv.StaticImbalance(6.87e-3), jv.RollingFriction(4e-5))
+    torus = scene(friction, drag=0.3)
+    plane = jv.balls(count=2, mass=MASS, radius=torus.loads.radius + torus.loads.gap, drag=0.3, own_radius=OWN)
+    plane = jv.Scene(torus.machine, plane, torus.drive, friction)
+    state, quarter = some_state(), jnp.full(2, 0.5 * jnp.pi)
+    there = jv.State(state.displacement, state.velocity, (state.angle[0], quarter), (state.rate[0], jnp.zeros(2)))
+    flat = jv.State(state.displacement, state.velocity, state.angle[:1], state.rate[:1])
+    found, expected = (evaluate(s, jnp.asarray(0.2), y) for s, y in ((torus, there), (plane, flat)))
+    np.testing.assert_allclose(found.velocity, expected.velocity, rtol=1e-12)
+    np.testing.assert_allclose(found.rate[0], expected.rate[0], rtol=1e-12)
+    np.testing.assert_allclose(found.rate[1], 0.0, atol=1e-9)
+    forces = [jv.normal_force(s, 0.2, y) for s, y in ((torus, there), (plane, flat))]
+    np.testing.assert_allclose(*forces, rtol=1e-12)
+
+
+def test_a_run_says_when_balls_leave_their_wall():
+    s = scene((jv.Gravity(along="axis"), jv.RollingFriction(4e-5)))
+    inner = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.asarray([0.0, 3.0]), jnp.asarray([0.0, -1.0])), (jnp.full(2, 130.0),) * 2)
+    run = jv.simulate(s, 0.02, start=inner, samples=50, estimate=False)
+    assert np.isfinite(run.detached[1]) and float(jv.normal_force(s, 0.0, inner)[1]) < 0.0
+    assert "detached: loads do not press" in run.summary()
+    on = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.asarray([0.0, 3.0]), jnp.ones(2)), (jnp.full(2, 130.0), jnp.zeros(2)))
+    run = jv.simulate(s, 0.02, start=on, samples=50, estimate=False)
+    assert np.all(np.isnan(run.detached)) and "detached" not in run.summary()
+    # Without pressing there is no friction, and the rest of the motion is that without it.
+    bare = jv.Scene(s.machine, s.loads, s.drive, s.effects[:1])
+    with_, without = (evaluate(each, jnp.asarray(0.0), inner) for each in (s, bare))
+    np.testing.assert_allclose(with_.rate[1][1], without.rate[1][1], rtol=1e-3)
+
+
+def test_small_motions_about_the_equator_have_the_frequency_that_steps_resolve():
+    s = jv.Scene(jv.planar_rotor(mass=1e15, stiffness=0.0, damping=0.0), balls(1), jv.ConstantSpeed(SPEED))
+    a = jnp.asarray([0.5 * jnp.pi + 1e-5])
+    turning = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1), a), (jnp.full(1, SPEED), jnp.zeros(1)))
+    stiffness = -evaluate(s, jnp.asarray(0.0), turning).rate[1][0] / 1e-5
+    np.testing.assert_allclose(jnp.sqrt(stiffness), s.loads.own_frequency(s.drive.speed), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (lambda: balls(own_radius=0.02), "loads.own_radius is 0.02 m, which is larger than the tube of 0.015 m"),
+        (lambda: balls(own_radius=0.015), r"which leaves no gap of 0.015 m radius.*balls\(\.\.\.\)"),
+        (lambda: balls(tube=0.25), "loads.tube is 0.25 m; it must be less than the ring's radius"),
+        (lambda: balls(51), "loads.own_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m have room below"),
+        (lambda: balls(mass=0.0), "loads.mass is 0 kg; it must be greater than 0"),
+        (lambda: balls(radius="3 kg"), "loads.radius is '3 kg', which is not in m"),
+        (lambda: jv.RollingFriction(-1e-5), "effects.rolling_friction.coefficient is -1e-05 m; it must be at least 0"),
+        (lambda: jv.RollingFriction(1e-5, "both"), "rolling_friction.direction is 'both'; allowed: along, each"),
+        (lambda: jv.RollingFriction(1e-5, width=0.0), "rolling_friction.width is 0 m/s; it must be greater than 0"),
+        (lambda: jv.Gravity(along="down"), "effects.gravity.along is 'down'; allowed: up, axis"),
+        (
+            lambda: jv.Scene(
+                scene().machine,
+                jv.pendulums(count=1, mass=1.0, radius=0.1, drag=0.0),
+                scene().drive,
+                (jv.RollingFriction(1e-5),),
+            ),
+            "rolling_friction needs loads that roll, with an own_radius",
+        ),
+        (
+            lambda: jv.Scene(
+                scene().machine,
+                jv.balls(count=1, mass=1.0, radius=0.1, drag=0.0),
+                scene().drive,
+                (jv.Gravity(along="axis"),),
+            ),
+            "effects.gravity.along is 'axis'; it goes with loads that move along the rotor's axis",
+        ),
+    ],
+)
+def test_wrong_numbers_are_named(build, says):
+    with pytest.raises(jv.InputError, match=says):
+        build()
+
+
+def test_without_friction_and_with_a_coefficient_of_zero_is_the_same():
+    state = some_state()
+    zero, bare = (
+        evaluate(scene(effects), jnp.asarray(0.0), state)
+        for effects in ((jv.Gravity(along="axis"), jv.RollingFriction(0.0)), (jv.Gravity(along="axis"),))
+    )
+    np.testing.assert_allclose(zero.rate[1], bare.rate[1], rtol=1e-13)
+    assert np.all(np.isfinite(zero.rate[0]))
+    slope = jax.grad(lambda k: jv.vector_field(scene((jv.RollingFriction(k),)))(0.0, state).rate[0][0])(0.0)
+    assert np.isfinite(slope) and float(slope) != 0.0

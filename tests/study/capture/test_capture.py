@@ -1,0 +1,160 @@
+"""Captures of balls in a torus: success from an initial speed, thresholds, the printed model, derivatives of the outcome."""
+
+import json
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.cli.app import run as command
+from jaxvib.equations.dynamics import State
+from jaxvib.study.capture.capture import capture_time, thrown_state
+from jaxvib.study.capture.published_torus import TABLES, printed_torus, published_torus
+
+
+def test_a_threshold_is_bracketed_ever_finer():
+    scene = published_torus(3.5)
+    coarse = jv.capture(scene, np.linspace(-1.0, -0.1, 4), turns=150)
+    fine = jv.capture(scene, np.linspace(-1.0, -0.1, 4), turns=150, resolution=0.02)
+    assert coarse.status_name == fine.status_name == "found"
+    assert float(fine.uncertainty) < 0.02 < float(coarse.uncertainty)
+    assert abs(float(fine.threshold) - float(coarse.threshold)) <= float(coarse.uncertainty)
+    assert np.all(np.diff(fine.speed) > 0.0) and np.all(fine.finite)
+    assert np.all(fine.captured[fine.speed > float(fine.threshold)])
+    assert "threshold" in fine.summary()
+    # A run of its own says the same on both sides.
+    for speed, caught in ((float(fine.threshold) + 0.15, True), (float(fine.threshold) - 0.15, False)):
+        until = 150.0 * 2.0 * np.pi / float(scene.drive.speed)
+        run = jv.simulate(scene, until, start=thrown_state(scene, speed), save="window", estimate=False)
+        assert bool(np.all(np.abs(run.load_speed / scene.drive.speed - 1.0) < 3e-3)) == caught
+
+
+def test_fractions_are_of_perturbed_starts_and_say_their_error():
+    scene = published_torus(3.5)
+    found = jv.capture(scene, [-1.0, -0.6, -0.1], turns=150, starts=6, spread=0.3)
+    assert found.captured.shape == (3, 6) and found.fraction[0] == 0.0 and found.fraction[2] == 1.0
+    assert np.all(found.standard_error > 0.0)
+    again = jv.capture(scene, [-1.0, -0.6, -0.1], turns=150, starts=6, spread=0.3)
+    np.testing.assert_array_equal(again.captured, found.captured)
+
+
+def test_the_printed_model_is_its_equations_solved_together():
+    """Against the printed equations with x'', y'' and the balls' accelerations as unknowns of one linear system."""
+    scene = published_torus(2.5)
+    e, w = 1e-3, 140.0
+    mb = float(scene.loads.mass) / 7.0
+    n, p, kb, g, e2, e1, eb = 0.1, 0.01, 4e-5 / 12.5e-3, 0.5005, 200.0, 15.0, 2.5
+    rng = np.random.default_rng(0)
+    x, v, psi, a, dpsi, da = (rng.normal(size=2) * size for size in (1.0, 1.0, 2.0, 2.0, 0.4, 0.4))
+    turn = 0.7
+
+    def residual(unknown):
+        ax, ay = unknown[:2]
+        total = [ax + n * v[0] + p * x[0] - (1 - 2 * mb) * np.cos(turn), ay + n * v[1] + p * x[1] - (1 - 2 * mb) * np.sin(turn)]
+        balls = []
+        for i in range(2):
+            f, u, ddpsi, dda = turn + psi[i], 1.0 + dpsi[i], unknown[2 + i], unknown[4 + i]
+            c, s, ca, sa, arm = np.cos(f), np.sin(f), np.cos(a[i]), np.sin(a[i]), e2 + eb * np.sin(a[i])
+            total[0] -= mb * (arm * u**2 * c + 2 * eb * ca * da[i] * u * s + eb * sa * da[i] ** 2 * c)
+            total[1] -= mb * (arm * u**2 * s - 2 * eb * ca * da[i] * u * c + eb * sa * da[i] ** 2 * s)
+            total[0] -= mb * (arm * s * ddpsi - eb * ca * c * dda)
+            total[1] += mb * (arm * c * ddpsi + eb * ca * s * dda)
+            pressed = max(g * ca + e2 * u**2 * sa + eb * da[i] ** 2, 0.0)
+            slow = arm / e2**2 * (e2 + e1 * sa) * kb * pressed * np.tanh(dpsi[i] / 0.1)
+            stop = e1 / eb * kb * pressed * np.tanh(da[i] / 0.1)
+            wrong = (1 - 2 * mb) * ca * (np.sin(psi[i]) - np.cos(psi[i]))
+            balls.append(1.4 * arm * ddpsi - (ax * s - ay * c - 2 * eb * ca * da[i] * u - slow))
+            balls.append(1.4 * eb * dda - (arm * u**2 * ca - g * sa - ca * (ax * c + ay * s) - wrong - stop))
+        return np.asarray(total + balls)
+
+    matrix = np.stack([residual(unit) - residual(np.zeros(6)) for unit in np.eye(6)], axis=1)
+    expected = np.linalg.solve(matrix, -residual(np.zeros(6)))
+    given = ((x * e, v * e * w), ((turn + psi, a), ((1.0 + dpsi) * w, da * w)))
+    (place, velocity), (angle, rate) = jax.tree.map(jnp.asarray, given)
+    field = printed_torus(scene)(jnp.asarray(turn / w), State(place, velocity, angle, rate))
+    np.testing.assert_allclose(field.velocity / (e * w**2), expected[:2], rtol=1e-10)
+    np.testing.assert_allclose(field.rate[0] / w**2, expected[2:4], rtol=1e-9, atol=1e-13)
+    np.testing.assert_allclose(field.rate[1] / w**2, expected[4:], rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_the_printed_model_gives_the_papers_row_of_p_0010():
+    row = TABLES[-1]
+    for gap, paper in zip(row.gap[1:6], row.speed[1:6], strict=True):
+        found = jv.capture(published_torus(gap), np.linspace(-1.0, -0.25, 31), resolution=5e-3, equations=printed_torus)
+        assert abs(float(found.threshold) - paper) < 0.05
+
+
+AT, STEPS = jnp.asarray([1.0, 1.0, 1.0, -0.2]), (1e-4, 1e-5, 1e-5, 1e-5)
+
+
+def outcome(factors, adjoint=None):
+    """Capture time and what is left of the imbalance, over factors on friction, drag and mass, and the initial speed."""
+    base = eqx.tree_at(lambda s: s.loads.drag, published_torus(3.5), jnp.asarray(0.5))
+
+    def pick(s):
+        return [s.effects[2].coefficient, s.loads.drag, s.loads.mass]
+
+    scene = eqx.tree_at(pick, base, [factor * value for factor, value in zip(factors[:3], pick(base), strict=True)])
+    steps = dict(stepsize_controller=jv.EqualSteps(1500), estimate=False, adjoint=adjoint)
+    run = jv.simulate(scene, 1.0, start=thrown_state(scene, factors[3]), samples=2000, **steps)
+    return jnp.stack([capture_time(run), jv.regime(scene, run.window).unbalance])
+
+
+def test_forward_derivatives_of_capture_time_and_of_what_is_left_of_the_imbalance():
+    evaluate = jax.jit(outcome)
+    assert 0.01 < float(evaluate(AT)[0]) < 1.0
+    forward = np.asarray(jax.jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
+    for k, step in enumerate(STEPS):
+        by = jnp.zeros(4).at[k].set(step)
+        difference = (np.asarray(evaluate(AT + by)) - np.asarray(evaluate(AT - by))) / (2.0 * step)
+        # Noise of the run, 1e-11 of either outcome, over the step: 1e-6; the difference's own error is the step's square.
+        np.testing.assert_allclose(forward[:, k], difference, rtol=1e-4, atol=1e-5 * np.max(np.abs(forward)))
+
+
+@pytest.mark.slow
+def test_reverse_derivatives_are_the_forward_ones():
+    forward = jax.jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(outcome))(AT), forward, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda s: jv.capture(s, [-0.2, -0.5]), "speeds is .* ascending numbers from -1 to 0 are needed"),
+        (lambda s: jv.capture(s, [-1.5]), "ascending numbers from -1 to 0"),
+        (lambda s: jv.capture(s, resolution=2.0), "resolution is 2.0; it must be between 0 and 1"),
+        (lambda s: jv.capture(s, turns=0), "turns is 0; it must be a whole number, at least 1"),
+        (
+            lambda s: jv.capture(jv.Scene(s.machine, jv.balls(count=1, mass=0.1, radius=0.1, drag=0.1), s.drive)),
+            "loads.kind is 'ball'; capture asks for balls in a torus",
+        ),
+        (
+            lambda s: jv.capture(jv.Scene(s.machine, s.loads, jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1))),
+            "drive.kind is 'dc_motor'; capture is asked for at a given speed",
+        ),
+        (lambda s: published_torus(16.0), "gap is 16; it must be between 0 and 15"),
+        (
+            lambda s: capture_time(jv.simulate(s, 0.1, start=thrown_state(s, -0.1), save="window", estimate=False)),
+            "run kept its window only",
+        ),
+    ],
+)
+def test_what_cannot_be_asked_is_said(ask, says):
+    with pytest.raises(jv.InputError, match=says):
+        ask(published_torus(2.5))
+
+
+def test_the_command_prints_shares_and_writes_pictures(tmp_path, capsys):
+    jv.save_scene(published_torus(3.5), tmp_path / "torus.toml")
+    words = ["--from", "-1", "--to", "-0.1", "--speeds", "4", "--turns", "150", "--json", "--out", str(tmp_path / "o")]
+    assert command(["capture", str(tmp_path / "torus.toml"), *words]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["status"] == "found" and len(document["fraction"]) == 4
+    assert -1.0 < document["threshold"] < -0.1
+    assert all((tmp_path / "o" / name).stat().st_size > 10_000 for name in ("capture.png", "paths.png"))
+    assert command(["capture", str(tmp_path / "torus.toml"), "--from", "0", "--to", "-1"]) == 2
