@@ -175,12 +175,11 @@ def ensemble(
     counts = np.asarray([each, coarse] if compared else [each], end.dtype)
     last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs, equations)
     # What a method of order 3 would leave of the difference; this one is of order 8.
-    radians = made[0].drive.speed * end
     share = (coarse / each) ** 3
     unknown = np.inf if estimate else np.nan
     error = jnp.asarray(np.full(runs, unknown, end.dtype))
     if compared:
-        error = estimated_error(apart, share, made[0], taken, radians)
+        error = estimated_error(apart, share, made[0])
     found = Ensemble(last, load_speed, error, finite, taken[0], jnp.asarray(jnp.nan, end.dtype))
     if not known:
         return found
