@@ -8,8 +8,11 @@ import jax
 import matplotlib
 import pytest
 
+from jaxvib.runtime import startup
 from jaxvib.runtime.cpu import prepare_cpu
 
+# Tests change parts of the package, which the key of a stored program does not know: every program is traced anew.
+startup.start = lambda: None
 # Each worker is a process of its own.
 prepare_cpu()
 jax.config.update("jax_enable_x64", True)
