@@ -1,6 +1,7 @@
 """Averaged runs against time integration of the full equations, and what they can do."""
 
 import functools
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -194,7 +195,7 @@ MOTOR = jv.DCMotor(60.0, stall_torque=1.0, inertia=0.01)
 
 
 class Wind(jv.Effect):
-    kind: str = "wind"
+    kind: ClassVar[str] = "wind"
 
     def load_potential(self, loads, u):
         return u[0]
