@@ -122,6 +122,7 @@ def told(setting: float, found: float, error: float) -> str:
 def as_first_written(task: str, **given: Any) -> list[list[Any]]:
     """Rows [name, seconds, error, compile] of `first_written.py`, in a process of its own without any flags."""
     clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "EQX_ON_ERROR")}
+    clean["JAXVIB_AUTOMATIC"] = "off"
     done = subprocess.run(
         [sys.executable, "-m", "parts.first_written"],
         cwd=Path(__file__).parents[1],
