@@ -33,10 +33,8 @@ __all__ = ["Run", "RunStatus"]
 _named = cached(regime)
 
 
-@eqx.filter_jit
+@cached
 def _detached(scene: Scene, kept: Trajectory) -> Array:
-    if not scene.loads.one_sided:
-        return jnp.full((scene.loads.count,), jnp.nan, kept.time.dtype)
     force = jax.vmap(lambda t, state: normal_force(scene, t, state))(kept.time, kept.state)
     first = jnp.min(jnp.where(force < 0.0, kept.time[:, None], jnp.inf), axis=0)
     return jnp.where(jnp.isfinite(first), first, jnp.nan)
@@ -120,8 +118,9 @@ class Run(AbstractMeasured, Result):
         NaN for a load that pressed throughout, and for loads that are held from both sides. The equations go on as if the load
         stayed on its track, so that what comes after it is no motion of a real one.
         """
-        kept = self.window if self.trajectory is None else self.trajectory
-        return _detached(self.scene, kept)
+        if not self.scene.loads.one_sided:
+            return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
+        return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
 
     def plot(self) -> Figure:
         """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.

@@ -19,9 +19,7 @@ def start() -> None:
     """Does what `prepare_cpu()` and `use_cache()` do, unless they were called or the environment has JAXVIB_AUTOMATIC=off.
 
     It is called when the first public name of jaxvib is asked for, errors and those two apart. Where JAX has begun to compute
-    already, so that XLA's options come too late, a warning says what that costs.
-
-    **Returns** why programs are not cached, empty where they are or need not be.
+    already, so that XLA's options come too late, a warning says what that costs; one too where programs cannot be cached.
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
         return
@@ -31,11 +29,11 @@ def start() -> None:
                 "JAX began to compute before jaxvib was used: time integration takes up to 50 times as long in this process, "
                 "and compiling 1.5 times. Call jaxvib.prepare_cpu() before any array is made, or silence this by "
                 "JAXVIB_AUTOMATIC=off in the environment",
-                stacklevel=4,
+                stacklevel=3,
             )
         else:
             prepare_cpu()
     try:
         use_cache(only_if_unset=True)
     except InputError as error:
-        warnings.warn(f"programs are not cached: {error}", stacklevel=4)
+        warnings.warn(f"programs are not cached: {error}", stacklevel=3)

@@ -176,7 +176,7 @@ def swing(
     friction = number(dry, "", "dry", low=0.0) if dry is not None else None
     if friction is not None:
         _diameter(pendulum)
-    run = eqx.filter_jit(swing_states)(
+    run = swing_states(
         pendulum,
         times,
         number(angle, "rad", "angle"),

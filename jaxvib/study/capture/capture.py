@@ -13,6 +13,7 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.integrate import fastest_and_slowest
@@ -116,7 +117,6 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     [0.1248, 70.0]
     """
     loads = scene.loads
-    # Not by arctan: of 64 lanes and more it comes out wrong with vectors of 512 bits (jaxlib 0.10).
     beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
@@ -163,8 +163,7 @@ def capture(
 
     Source: Strautmanis et al. 2018, section 3, where each speed has one start.
     """
-    if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    scene = checked(scene)
     if len(scene.loads.rest()) != 2 or getattr(scene.loads, "own_radius", None) is None:
         raise InputError("loads.kind", f"is {scene.loads.kind!r}; capture asks for balls in a torus: torus_balls(...)")
     if not scene.drive.constant:
