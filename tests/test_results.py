@@ -118,6 +118,23 @@ RESULTS = {
     "Synthesis": synthesis,
 }
 
+SEVERAL_PANELS = [
+    "Run",
+    "Envelope",
+    "JamModes",
+    "Jam",
+    "Branches",
+    "ExactBranches",
+    "Orbit",
+    "CriterionMap",
+    "BalancedStates",
+    "Swing",
+    "Identified",
+    "RunUps",
+    "Capture",
+    "Cost",
+]
+
 
 @pytest.fixture(scope="module", params=list(RESULTS))
 def result(request):
@@ -145,8 +162,9 @@ def test_speaks(result):
 
 
 def test_a_figure_of_one_panel_goes_onto_given_axes(result):
-    if "ax" not in inspect.signature(result.plot).parameters:
-        pytest.skip("its figure has several panels")
+    if type(result).__name__ in SEVERAL_PANELS:
+        assert "ax" not in inspect.signature(result.plot).parameters
+        return
     axes = Figure().subplots(1, 2)
     assert result.plot(ax=axes[1]) is axes[1].figure
     assert axes[1].has_data() and not axes[0].has_data() and len(axes[0].figure.axes) == 2

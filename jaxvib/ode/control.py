@@ -33,8 +33,8 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
     over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = 0.9 / e^(1/8) h. The exponents
     are products of square roots, which cost less than a power. h_next / h lies between 0.2 and 5. A step whose error is not a
     number is rejected with e = infinity; where no shorter step advances the time in its dtype, the run ends with
-    `diffrax.RESULTS.dt_min_reached`, with more than `max_steps` steps with `diffrax.RESULTS.max_steps_reached`: a limit that is a number
-    of the program, so that another one needs no other program.
+    `diffrax.RESULTS.dt_min_reached`, with more than `max_steps` steps with `diffrax.RESULTS.max_steps_reached`: a limit that is
+    a number of the program, so that another one needs no other program.
 
     **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state, of what counts as 1 in each
     of its numbers (in its unit) and of which share of |y| is added to it. `relative` is 0 for angles: they grow without end,

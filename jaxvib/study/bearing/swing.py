@@ -19,6 +19,7 @@ from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
 if TYPE_CHECKING:
@@ -205,6 +206,7 @@ def controller_to(tolerance: float) -> diffrax.AbstractStepSizeController:
     return diffrax.PIDController(rtol=tolerance, atol=tolerance, pcoeff=0.2, icoeff=0.4)
 
 
+@cached
 def swing_states(
     pendulum: BearingPendulum,
     times: Array,
