@@ -34,7 +34,6 @@ from parts.loads import apart  # noqa: E402
 from parts.loads import scene as balls  # noqa: E402
 
 from jaxvib.motion import system  # noqa: E402
-from jaxvib.motion.analysis import measure  # noqa: E402
 from jaxvib.motion.system import PackedSystem  # noqa: E402
 from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
 from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
@@ -130,13 +129,13 @@ def tangents(quick: bool) -> None:
 def samples(quick: bool) -> None:
     s = balls(3)
     count = 512 if quick else 4096
-    print(f"\nfirst and second derivatives of {count} states, 10 numbers")
+    print(f"\nrates of {count} states, 10 numbers")
     times = jnp.linspace(0.0, 0.1, count)
     states = jax.tree.map(lambda leaf: jax.vmap(lambda t: leaf + t)(times), apart(s))
     field = jv.vector_field(s)
 
     def call() -> Callable[[], Any]:
-        compiled = jax.jit(scalarize.scalarized_vmap(measure._derivatives))
+        compiled = jax.jit(scalarize.scalarized_vmap(lambda moment, field: field(*moment)))
         return lambda: compiled((times, states), field)
 
     base = row("as it is", call())

@@ -307,7 +307,7 @@ def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcom
 def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
     of: Pair = between(run.scene, objective.of)
     force = float(run.foundation_force)
-    whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.scene, run.window, *of))
+    whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.window, *of))
     return Outcome(
         parameters=space.parameters(run.scene),
         exists=True,

@@ -3,80 +3,107 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-__all__ = ["extremum_value", "locate_extrema"]
+__all__ = ["NODES", "extremum_value", "locate_extrema"]
+
+NODES = 4
+"""Samples beside each other through whose values and slopes a polynomial goes."""
 
 
-def locate_extrema(x: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-    """Where the quintics through evenly spaced samples are least and greatest, over their first half, their second and all.
+def _hermite() -> np.ndarray:
+    """The matrix that makes the coefficients, lowest power first, of values and slopes at the nodes 0, 1, 2, 3."""
+    nodes, powers = np.arange(NODES)[:, None], np.arange(2 * NODES)[None, :]
+    return np.linalg.inv(np.concatenate([1.0 * nodes**powers, powers * 1.0 * nodes ** np.maximum(powers - 1, 0)]))
 
-    x, v, a (n,) are samples and their first two derivatives, in units of the sampling step. **Returns** values there, the
-    sample before each place, and at which share of the step after it the place is; (2, 3) each.
+
+_COEFFICIENTS = _hermite()
+
+
+def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Where an evenly sampled motion is least and greatest, over its first half, its second and all of it.
+
+    Between two samples it is the polynomial p of degree 7 through values and slopes of four samples, those two in their
+    middle (at the ends the outermost four), whose error there is
+
+        |x - p| <= 0.32 / 8! max |d^8 x/ds^8|        (at the ends 0.88 / 8!)
+
+    with s the time in steps: 4e-9 of the amplitude for 16 samples a period, and 256 times less for twice as many.
+
+    **Arguments**: x, v (n,), n >= 4: samples, and their slopes times the sampling step. **Returns** values there, the first of
+    the four samples, and where the place is from it, in steps, from 0 to 3; (2, 3) each.
     """
-    begin, end = ([part[cut] for part in (x, v, a)] for cut in (slice(-1), slice(1, None)))
-    quintic = _quintic(begin, end)
-    slope = _derived(quintic)
-    bend = _derived(slope)
-    turns = begin[1] * end[1] < 0.0
-    share = jnp.clip(-begin[1] / jnp.where(turns, end[1] - begin[1], 1.0), 0.0, 1.0)
-    for _ in range(4):
-        curved = _at(bend, share)
-        share = jnp.clip(share - _at(slope, share) / jnp.where(turns & (curved != 0.0), curved, 1.0), 0.0, 1.0)
-    inner = jnp.where(turns, _at(quintic, share), x[:-1])
     n, half = len(x), len(x) // 2
+    first = np.clip(np.arange(n - 1) - 1, 0, n - NODES)
+    before = jnp.asarray(np.arange(n - 1) - first, x.dtype)
+    polynomial = _polynomial(jnp.stack([x[first + k] for k in range(NODES)]), jnp.stack([v[first + k] for k in range(NODES)]))
+    slope = _derived(polynomial)
+    bend = _derived(slope)
+    turns = v[:-1] * v[1:] < 0.0
 
-    def greatest(sign: float, first: int, stop: int) -> tuple[Array, Array, Array]:
+    def nearer(_: int, share: Array) -> Array:
+        """A step of Newton's method for the place where the slope is 0."""
+        curved = _at(bend, before + share)
+        change = _at(slope, before + share) / jnp.where(turns & (curved != 0.0), curved, 1.0)
+        return jnp.clip(share - change, 0.0, 1.0)
+
+    share = jax.lax.fori_loop(0, 4, nearer, jnp.clip(-v[:-1] / jnp.where(turns, v[1:] - v[:-1], 1.0), 0.0, 1.0))
+    inner = jnp.where(turns, _at(polynomial, before + share), x[:-1])
+    steps = jnp.arange(n - 1)
+
+    def greatest(sign: Array, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        """Over the samples from `start` to before `stop`; of several the first."""
         inside = sign * inner > sign * x[:-1]
-        reached = jnp.where(inside, sign * inner, sign * x[:-1])[first : stop - 1]
+        reached = jnp.where(inside, sign * inner, sign * x[:-1])
+        reached = jnp.where((steps >= start) & (steps < stop - 1), reached, -jnp.inf)
         top, last = jnp.max(reached), sign * x[stop - 1]
+        k = jnp.where(last > top, stop - 2, jnp.min(jnp.where(reached == top, steps, stop - 2)))
+        place = before[k] + jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
         value = jnp.maximum(top, last)
-        k = first + jnp.min(jnp.where(reached == top, jnp.arange(stop - 1 - first), stop - 2 - first))
-        place = jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
         place = jnp.where(jnp.isnan(value), jnp.nan, place)  # what is made of it later is not a number either
-        return value, jnp.where(last > top, stop - 2, k), place
+        return value, jnp.asarray(first)[k], place
 
-    found = []
-    for sign in (-1.0, 1.0):
-        parts = [greatest(sign, *stretch) for stretch in ((0, half), (half, n), (half - 1, half + 1))]
-        value, k, place = (jnp.stack(column) for column in zip(*parts, strict=True))
-        best = jnp.argmax(value)
-        found.append([jnp.concatenate([row[:2], row[best][None]]) for row in (sign * value, k, place)])
-    values, k, places = (jnp.stack(pair) for pair in zip(*found, strict=True))
-    return values, k, places
-
-
-def extremum_value(begin: Sequence[Array], end: Sequence[Array], share: Array) -> Array:
-    """The quintic's value at an extremum, which stays one: where it is inside the step it moves with what it is made of."""
-    quintic = _quintic(begin, end)
-    slope = _derived(quintic)
-    curved = _at(_derived(slope), share)
-    inside = (share > 0.0) & (share < 1.0) & (curved != 0.0)
-    move = jnp.where(inside, _at(slope, share), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
-    return _at(quintic, share - move + jax.lax.stop_gradient(move))
+    half_ways = jax.vmap(greatest, in_axes=(None, 0, 0))
+    signs = jnp.asarray([-1.0, 1.0], x.dtype)
+    value, k, place = jax.vmap(half_ways, in_axes=(0, None, None))(
+        signs, jnp.asarray([0, half, half - 1]), jnp.asarray([half, n, half + 1])
+    )
+    best = jnp.argmax(value, axis=1)[:, None]
+    value, k, place = (
+        jnp.concatenate([row[:, :2], jnp.take_along_axis(row, best, 1)], axis=1) for row in (value * signs[:, None], k, place)
+    )
+    return value, k, place
 
 
-def _quintic(begin: Sequence[Array], end: Sequence[Array]) -> list[Array]:
-    """Coefficients, of the lowest power first, of the Hermite interpolant through values and two derivatives at 0 and 1."""
-    (x0, v0, a0), (x1, v1, a1) = begin, end
-    d, e, f = x1 - x0 - v0 - a0 / 2.0, v1 - v0 - a0, a1 - a0
-    return [
-        x0,
-        v0,
-        a0 / 2.0,
-        10.0 * d - 4.0 * e + f / 2.0,
-        -15.0 * d + 7.0 * e - f,
-        6.0 * d - 3.0 * e + f / 2.0,
-    ]
+def extremum_value(x: Array, v: Array, place: Array) -> Array:
+    """The value at an extremum, which stays one: where it lies between samples it moves with what it is made of.
+
+    x, v (4,) are four samples and their slopes as in `locate_extrema`, `place` counts from the first, in steps.
+    """
+    polynomial = _polynomial(x, v)
+    slope = _derived(polynomial)
+    curved = _at(_derived(slope), place)
+    inside = (place != jnp.round(place)) & (curved != 0.0)
+    move = jnp.where(inside, _at(slope, place), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
+    return _at(polynomial, place - move + jax.lax.stop_gradient(move))
 
 
-def _derived(polynomial: list[Array]) -> list[Array]:
-    return [float(k) * c for k, c in enumerate(polynomial)][1:]
+def _polynomial(x: Array, v: Array) -> Array:
+    """Coefficients (8, ...) of the polynomial through values and slopes (4, ...) at 0, 1, 2, 3."""
+    # From the first sample on: what all have in common does not round.
+    changes = jnp.concatenate([x - x[:1], v])
+    found = jnp.tensordot(jnp.asarray(_COEFFICIENTS, x.dtype), changes, 1, precision="highest")
+    return jnp.concatenate([found[:1] + x[:1], found[1:]])
 
 
-def _at(polynomial: list[Array], s: Array) -> Array:
-    return functools.reduce(lambda value, c: value * s + c, reversed(polynomial))
+def _derived(polynomial: Array) -> Array:
+    powers = jnp.arange(1, len(polynomial), dtype=polynomial.dtype)
+    return polynomial[1:] * powers.reshape(-1, *(1,) * (polynomial.ndim - 1))
+
+
+def _at(polynomial: Array, s: Array) -> Array:
+    return functools.reduce(lambda value, c: value * s + c, [polynomial[k] for k in range(len(polynomial) - 1, -1, -1)])

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.extrema import extremum_value, locate_extrema
+from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
@@ -88,8 +88,8 @@ def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
 def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured:
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
-    Extrema and whole turns are found on interpolants that use the derivatives the equations of motion give, not on the
-    samples. `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
+    Extrema and whole turns are found on interpolants that use the rates the equations of motion give, not on the samples.
+    `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
     `jax.tree_util.Partial`, and no plain function.
     """
     early, late, whole = _spans(scene, field, times, states)
@@ -126,19 +126,19 @@ def _spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
 
 @_spans.def_jvp
 def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    _, samples, shares = jax.lax.stop_gradient(_extrema(*primals))
+    _, samples, places = _extrema(*jax.lax.stop_gradient(primals))
     outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
 
     def spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
-        def extremum(output: Array, k: Array, share: Array) -> Array:
-            def sample(j: Array) -> list[Array]:
+        def extremum(output: Array, k: Array, place: Array) -> Array:
+            def sample(j: Array) -> tuple[Array, Array]:
                 state = jax.tree.map(lambda leaf: leaf[j], states)
-                found = _outputs(scene, _step(times), state, *_derivatives((times[j], state), field))
-                return [part[output] for part in found]
+                value, slope = _outputs(scene, _step(times), state, field(times[j], state))
+                return value[output], slope[output]
 
-            return extremum_value(sample(k), sample(k + 1), share)
+            return extremum_value(*jax.vmap(sample)(k + jnp.arange(NODES)), place)
 
-        low, high = jax.vmap(jax.vmap(jax.vmap(extremum)))(outputs, samples, shares)
+        low, high = jax.vmap(jax.vmap(jax.vmap(extremum)))(outputs, samples, places)
         return (high - low) / 2.0
 
     return eqx.filter_jvp(spans, primals, tangents)
@@ -146,35 +146,19 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 def _extrema(scene: Scene, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Least and greatest values of each output, and their places, see `locate_extrema`; (2, 3, outputs) each."""
-    first, second = scalarized_vmap(_derivatives)((times, states), field)
-    samples = jax.vmap(lambda *y: _outputs(scene, _step(times), *y))(states, first, second)
-    return jax.vmap(locate_extrema, in_axes=1, out_axes=-1)(*samples)
+    rates = scalarized_vmap(_rates)((times, states), field)
+    values, slopes = jax.vmap(lambda *y: _outputs(scene, _step(times), *y))(states, rates)
+    return jax.vmap(locate_extrema, in_axes=1, out_axes=-1)(values, slopes)
 
 
-def _derivatives(moment: tuple[Array, State], field: Field) -> tuple[State, State]:
-    """First and second time derivative of a state at a time: y' = f(t, y), and y'' = df/dt + (df/dy) y'."""
-    rates = field(*moment)
-    return rates, jax.jvp(field, moment, (jnp.ones_like(moment[0]), rates))[1]
+def _rates(moment: tuple[Array, State], field: Field) -> State:
+    return field(*moment)
 
 
-def _outputs(scene: Scene, step: Array, state: State, first: State, second: State) -> tuple[Array, Array, Array]:
-    """Displacements and foundation forces with their first two derivatives, in units of the step.
-
-    Both follow from the state's own two derivatives: the equations of motion are not differentiated again.
-    """
-
-    def force(state: State) -> Array:
-        return foundation_force(scene, state)
-
-    def slope(state: State, rates: State) -> Array:
-        return jax.jvp(force, (state,), (rates,))[1]
-
-    changing, curved = jax.jvp(slope, (state, first), (first, second))
-    return (
-        jnp.concatenate([state.displacement, force(state)]),
-        jnp.concatenate([first.displacement, changing]) * step,
-        jnp.concatenate([first.velocity, curved]) * step**2,
-    )
+def _outputs(scene: Scene, step: Array, state: State, rates: State) -> tuple[Array, Array]:
+    """Displacements and foundation forces, and how they change in a sampling step."""
+    force, change = jax.jvp(lambda s: foundation_force(scene, s), (state,), (rates,))
+    return jnp.concatenate([state.displacement, force]), jnp.concatenate([rates.displacement, change]) * step
 
 
 def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:
@@ -202,12 +186,8 @@ def _away_from_zero(x: Array) -> Array:
     return jnp.where(jnp.abs(x) < tiny, tiny, x)
 
 
-def relative_amplitude(scene: Scene, stretch: Trajectory, i: int, j: int) -> Array:
+def relative_amplitude(stretch: Trajectory, i: int, j: int) -> Array:
     """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
-    acceleration = jax.vmap(vector_field(scene))(stretch.time, stretch.state).velocity
-    x, v, a = (
-        values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity, acceleration)
-    )
-    step = _step(stretch.time)
-    (low, high), _, _ = locate_extrema(x, v * step, a * step**2)
+    x, v = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity))
+    (low, high), _, _ = locate_extrema(x, v * _step(stretch.time))
     return (high - low)[2] / 2.0

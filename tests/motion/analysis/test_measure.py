@@ -30,8 +30,8 @@ def test_measure_reads_a_known_motion():
 
     measured = measure(s, jax.tree_util.Partial(field), t, states)
     force = np.abs(np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * a * np.exp(1j * c)))
-    np.testing.assert_allclose(measured.amplitude, a, rtol=1e-6)
-    np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-6)
+    np.testing.assert_allclose(measured.amplitude, a, rtol=1e-12)
+    np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-12)
     np.testing.assert_allclose(measured.omega, w, rtol=1e-9)
     np.testing.assert_allclose(measured.load_speed, w, rtol=1e-9)
     assert bool(measured.settled)
@@ -69,10 +69,10 @@ def test_derivatives_of_an_amplitude_move_its_extrema_along():
 
     p = 0.12
     value, slope, curvature = exactly(p)
-    np.testing.assert_allclose(amplitude(p), value, rtol=1e-7)
+    np.testing.assert_allclose(amplitude(p), value, rtol=1e-12)
     for way in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(way(amplitude))(p), slope, rtol=1e-5)
-        np.testing.assert_allclose(jax.jit(jax.jacfwd(way(amplitude)))(p), curvature, rtol=1e-3)
+        np.testing.assert_allclose(jax.jit(way(amplitude))(p), slope, rtol=1e-11)
+        np.testing.assert_allclose(jax.jit(jax.jacfwd(way(amplitude)))(p), curvature, rtol=1e-9)
 
 
 def test_a_growing_motion_is_not_settled():

@@ -1,0 +1,50 @@
+"""Extrema of samples, against those of the motion that they were taken from."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvib.numerics.extrema import extremum_value, locate_extrema
+
+
+def samples(per_turn, count, first=0.37):
+    s = first + 2.0 * np.pi / per_turn * np.arange(count)
+    return jnp.cos(s), -jnp.sin(s) * 2.0 * np.pi / per_turn
+
+
+@pytest.mark.parametrize(("per_turn", "error"), [(16, 4e-9), (32, 4e-9 / 256), (64, 4e-9 / 256**2)])
+def test_the_extrema_of_a_cosine_are_found_to_the_error_that_is_promised(per_turn, error):
+    x, v = samples(per_turn, 4 * per_turn)
+    (low, high), _, _ = locate_extrema(x, v)
+    np.testing.assert_allclose(np.abs([low, high]), 1.0, rtol=0.0, atol=error + 1e-15)
+    if per_turn == 16:
+        assert np.max(np.abs(np.abs([low, high]) - 1.0)) > error / 100.0  # no better than it can be: the bound says something
+
+
+def test_each_half_has_its_own_and_the_whole_the_better_of_both():
+    s = 0.1 * np.arange(200)
+    growing, slope = (1.0 + s) * np.sin(s), (np.sin(s) + (1.0 + s) * np.cos(s)) * 0.1
+    (low, high), first, place = locate_extrema(jnp.asarray(growing), jnp.asarray(slope))
+    fine = np.linspace(0.0, s[-1], 2_000_001)
+    exact = (1.0 + fine) * np.sin(fine)
+    half = fine <= s[99]
+    for k, stretch in enumerate((half, ~half, slice(None))):
+        np.testing.assert_allclose([low[k], high[k]], [exact[stretch].min(), exact[stretch].max()], rtol=1e-9)
+    np.testing.assert_array_equal(high[2], jnp.max(high[:2]))
+    assert np.all((place >= 0.0) & (place <= 3.0)) and np.all((first >= 0) & (first <= 196))
+    x, v = (jnp.asarray(y[np.asarray(first)[..., None] + np.arange(4)]) for y in (growing, slope))
+    np.testing.assert_allclose(jax.vmap(jax.vmap(extremum_value))(x, v, place), [low, high], rtol=1e-13)
+
+
+def test_at_the_ends_the_outermost_samples_count():
+    x = jnp.asarray([0.0, 1.0, 2.0, 3.0])
+    (low, high), first, place = locate_extrema(x, jnp.ones(4))
+    np.testing.assert_array_equal([low[2], high[2]], [0.0, 3.0])
+    np.testing.assert_array_equal(np.asarray(first[:, 2] + place[:, 2]), [0.0, 3.0])
+
+
+def test_samples_that_are_no_numbers_have_no_place():
+    x, v = samples(16, 64)
+    values, _, places = locate_extrema(x.at[40].set(jnp.nan), v)
+    assert np.all(np.isfinite(values[:, 0])) and np.all(np.isnan(values[:, 1:])) and np.all(np.isnan(places[:, 1:]))
