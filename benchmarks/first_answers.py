@@ -4,7 +4,8 @@
 
 Every question is asked from plain Python, without `jit`, in processes of its own; times are seconds beyond importing JAX,
 Equinox and diffrax (what jaxvib itself imports counts), building the scene counted, the second call in milliseconds (the best
-of 5). Scene: the two-mass machine of the antiphase paper with three balls.
+of 5). Scene: the two-mass machine of the antiphase paper with three balls. Commands are timed from their start to their end,
+Python's and JAX's own start counted, on the files of `examples/antiphase`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
+from pathlib import Path
 
 from parts.common import machine_line
 
@@ -66,6 +69,15 @@ QUESTIONS = {
     ),
 }
 
+EXAMPLE = Path(__file__).parent.parent / "examples" / "antiphase"
+
+COMMANDS = {
+    "jaxvib modes": "modes machine.toml",
+    "jaxvib criterion": "criterion machine.toml",
+    "jaxvib simulate, 5 s": "simulate machine.toml --until 5s --start jam --mode 3",
+    "jaxvib optimize": "optimize design.toml",
+}
+
 MEASURE = """
 jax.block_until_ready(jax.tree.leaves(call()))
 first = time.perf_counter() - begun
@@ -80,30 +92,43 @@ print("TIMES", first, min(again))
 
 def asked(name: str, cache: str) -> tuple[float, float]:
     """Seconds of the first and of a later call in a process of its own."""
-    code = PRELUDE + QUESTIONS[name] + MEASURE
-    clean = {
-        key: value for key, value in os.environ.items() if key not in ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
-    }
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=clean | {"XDG_CACHE_HOME": cache}, capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise SystemExit(f"{name}: {done.stderr}")
-    first, again = next(line for line in done.stdout.splitlines() if line.startswith("TIMES")).split()[1:]
+    printed = process([sys.executable, "-c", PRELUDE + QUESTIONS[name] + MEASURE], cache)
+    first, again = next(line for line in printed.splitlines() if line.startswith("TIMES")).split()[1:]
     return float(first), float(again)
+
+
+def commanded(name: str, cache: str) -> float:
+    """Seconds that a command takes."""
+    begun = time.perf_counter()
+    process([sys.executable, "-c", "from jaxvib.cli import main; main()", *COMMANDS[name].split()], cache)
+    return time.perf_counter() - begun
+
+
+def process(command: list[str], cache: str) -> str:
+    """What a process prints that starts in the example's folder with this cache. **Raises** `SystemExit` where it fails."""
+    ours = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
+    clean = {key: value for key, value in os.environ.items() if key not in ours} | {"XDG_CACHE_HOME": cache}
+    done = subprocess.run(command, env=clean, cwd=EXAMPLE, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)[-200:]}: {done.stderr}")
+    return done.stdout
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", choices=list(QUESTIONS), default=list(QUESTIONS))
+    parser.add_argument("--only", nargs="*", choices=[*QUESTIONS, *COMMANDS], default=[*QUESTIONS, *COMMANDS])
     options = parser.parse_args()
     print(machine_line())
     print(f"{'question':32s} {'empty cache, s':>15s} {'warm cache, s':>15s} {'again, ms':>12s}")
     for name in options.only:
         with tempfile.TemporaryDirectory() as cache:
-            empty, _ = asked(name, cache)
-            warm, again = asked(name, cache)
-        print(f"{name:32s} {empty:15.1f} {warm:15.1f} {1e3 * again:12.2f}", flush=True)
+            if name in QUESTIONS:
+                empty, _ = asked(name, cache)
+                warm, again = asked(name, cache)
+                print(f"{name:32s} {empty:15.1f} {warm:15.1f} {1e3 * again:12.2f}", flush=True)
+            else:
+                empty, warm = (commanded(name, cache) for _ in range(2))
+                print(f"{name:32s} {empty:15.1f} {warm:15.1f}", flush=True)
 
 
 if __name__ == "__main__":
