@@ -113,7 +113,50 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
         program = jax.make_jaxpr(run)(*shapes)
     except NotScalarizable:
         return None
+    program = _without_repeats(program)
     return program if len(program.jaxpr.eqns) <= _MAX_OPERATIONS else None
+
+
+def _without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program, each operation on the same numbers done once, and none whose result nobody reads.
+
+    Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
+    """
+    first: dict[Var, Var] = {}
+    done: dict[tuple[object, ...], JaxprEqn] = {}
+    kept: list[JaxprEqn] = []
+
+    def name(atom: Var | Literal) -> object:
+        return ("constant", atom.val.tobytes(), str(atom.aval)) if isinstance(atom, Literal) else id(atom)
+
+    for equation in program.jaxpr.eqns:
+        inputs = [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in equation.invars]
+        names = [name(atom) for atom in inputs]
+        if equation.primitive in _commutative():
+            names.sort(key=str)
+        # Parameters that are programs themselves are the same only where they are one object.
+        params = tuple((k, v if isinstance(v, (str, bool, int, type(None))) else repr(v)) for k, v in equation.params.items())
+        key = (equation.primitive, *names, params)
+        inner = any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
+        if key in done and not inner and not equation.effects:
+            first.update(zip(equation.outvars, done[key].outvars, strict=True))
+            continue
+        done[key] = equation
+        kept.append(equation.replace(invars=inputs))
+    ends = [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in program.jaxpr.outvars]
+    read = {atom for atom in ends if isinstance(atom, Var)}
+    live: list[JaxprEqn] = []
+    for equation in reversed(kept):
+        if equation.effects or any(atom in read for atom in equation.outvars):
+            live.append(equation)
+            read.update(atom for atom in equation.invars if isinstance(atom, Var))
+    return program.replace(jaxpr=program.jaxpr.replace(eqns=live[::-1], outvars=ends))
+
+
+@functools.cache
+def _commutative() -> set[Primitive]:
+    """The operations that give the same for their arguments in either order."""
+    return {primitive_of(operation, np.float32(1.0), np.float32(2.0)) for operation in (lax.add, lax.mul)}
 
 
 def scalars_of(tree: PyTree[Array]) -> list[Array]:

@@ -184,3 +184,17 @@ def test_without_readable_programs_everything_stays_on_arrays(monkeypatch):
     x = jnp.arange(3.0)
     assert scalarized_program(jnp.sin, x) is None
     np.testing.assert_array_equal(scalarized_vmap(lambda y, shared: jnp.sin(y) * shared)(x, 2.0), 2.0 * jnp.sin(x))
+
+
+def test_each_operation_is_done_once_and_none_for_nothing():
+    def wasteful(x):
+        unread = jnp.tanh(x) ** 3
+        del unread
+        return (x[0] * x[1] + 2.0) / (x[1] * x[0] + 2.0) + (x[0] - x[1]) * (x[1] - x[0])
+
+    program = scalarized_program(wasteful, jnp.ones(2))
+    names = [equation.primitive.name for equation in program.jaxpr.eqns]
+    # Differences are not the same in either order; products are.
+    assert sorted(names) == ["add", "add", "div", "mul", "mul", "sub", "sub"]
+    x = np.array([0.3, -0.7])
+    np.testing.assert_allclose(jax.core.eval_jaxpr(program.jaxpr, program.consts, *x), [wasteful(jnp.asarray(x))], rtol=1e-15)
