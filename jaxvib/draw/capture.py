@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["threshold_chart", "torus_paths"]
+__all__ = ["tables_chart", "threshold_chart", "torus_paths"]
 
 
 def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float) -> Figure:
@@ -57,4 +59,29 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     paths.legend()
     speeds.set_xlabel("time, s")
     speeds.set_ylabel("speed relative to the rotor")
+    return figure
+
+
+def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]]) -> Figure:
+    """Least initial speeds over the gap.
+
+    **Arguments**: `rows`, a panel for each: its title, the gaps, by name the speeds; "paper" as points alone.
+
+    >>> import numpy as np
+    >>> len(tables_chart([("p = 0.01", np.arange(2.0), {"paper": np.zeros(2), "derived": np.ones(2)})]).axes)
+    1
+    """
+    columns = 2 if len(rows) > 1 else 1
+    figure, axes = panels(-(-len(rows) // columns), columns, size=(5.0, 3.0))
+    for axis in axes[len(rows) :]:
+        axis.set_visible(False)
+    for axis, (title, gap, speeds) in zip(axes, rows, strict=False):
+        for k, (name, speed) in enumerate(speeds.items()):
+            shape = dict(ls="", marker="o", color="black") if name == "paper" else dict(marker=".", color=COLORS[k - 1])
+            axis.plot(gap, speed, label=name, **shape)
+        axis.set_title(title)
+        axis.set_xlabel("gap, in eccentricities")
+        axis.set_ylabel("least initial speed")
+        axis.set_ylim(-1.03, 0.0)
+    axes[0].legend()
     return figure

@@ -1,14 +1,17 @@
 """Balls in a torus: their equations against other derivations, friction, limits, and what is said about wrong numbers."""
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from torus import MASS, OWN, SPEED, balls, lagrangian_accelerations, published, rolling_ball_accelerations, scene, some_state
 
 import jaxvib as jv
+from jaxvib.machine.torus import TorusBalls
 
 evaluate = jax.jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
@@ -157,3 +160,84 @@ def test_without_friction_and_with_a_coefficient_of_zero_is_the_same():
     assert np.all(np.isfinite(zero.rate[0]))
     slope = jax.grad(lambda k: jv.vector_field(scene((jv.RollingFriction(k),)))(0.0, state).rate[0][0])(0.0)
     assert np.isfinite(slope) and float(slope) != 0.0
+
+
+def mujoco_torus(s, step=1e-5):
+    """A sprung rotor in MuJoCo's words, and on it masses on two hinges: about the axis, and about the tube's middle line."""
+    m, loads = s.machine, s.loads
+    bodies = "".join(
+        f"""<body><joint name="f{j}" type="hinge" axis="0 0 1"/><inertial pos="0 0 0" mass="1e-14" diaginertia="1e-14 1e-14 1e-14"/>
+        <body pos="{loads.radius:.17g} 0 0"><joint name="a{j}" type="hinge" axis="0 -1 0"/>
+        <inertial pos="0 0 {-loads.gap:.17g}" mass="{loads.mass:.17g}" diaginertia="1e-14 1e-14 1e-14"/></body></body>"""
+        for j in range(2)
+    )
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="{step}" integrator="RK4" gravity="0 0 -9.81"/><compiler autolimits="false"/>
+        <worldbody><body><joint name="x" type="slide" axis="1 0 0" stiffness="{m.stiffness:.17g}" damping="{m.damping:.17g}"/>
+        <joint name="y" type="slide" axis="0 1 0" stiffness="{m.stiffness:.17g}" damping="{m.damping:.17g}"/>
+        <inertial pos="0 0 0" mass="{m.mass:.17g}" diaginertia="1 1 1"/>{bodies}</body></worldbody></mujoco>"""
+    )
+
+
+class Sliding(TorusBalls):
+    """Balls that slide without friction and do not turn: all that MuJoCo's hinges can say."""
+
+    def inertia_factor(self):
+        return jnp.asarray(1.0)
+
+    def spin_force(self, u, rate, speed):
+        return None
+
+
+def wide_scene(kind=TorusBalls):
+    """A wide tube and heavy balls, so that everything acts on everything."""
+    loads = jv.torus_balls(count=2, mass=0.5, radius=0.3, tube=0.15, own_radius=0.05)
+    loads = kind(**{field.name: getattr(loads, field.name) for field in dataclasses.fields(loads)})
+    machine = jv.planar_rotor(mass=4.0, stiffness=6e3, damping=20.0)
+    return jv.Scene(machine, loads, jv.ConstantSpeed(30.0), (jv.Gravity(along="axis"),))
+
+
+def test_balls_that_slide_move_as_in_mujoco():
+    s, n, step = wide_scene(Sliding), 20000, 1e-5
+    model = mujoco_torus(s, step)
+    data = mujoco.MjData(model)
+    # MuJoCo's order: x, y, then f and a of each ball.
+    data.qpos[:] = [2e-3, -1e-3, 0.2, 0.4, 2.9, -1.1]
+    data.qvel[:] = [0.1, 0.0, 25.0, 3.0, 31.0, -8.0]
+    f, a = np.array([2, 4]), np.array([3, 5])
+    state = jv.State(*(jnp.asarray(x[:2]) for x in (data.qpos, data.qvel)), *((x[f], x[a]) for x in (data.qpos, data.qvel)))
+    state = jax.tree.map(jnp.array, state)
+    mujoco.mj_step(model, data, nstep=n)
+    run = jv.simulate(s, step * n, start=state, stepsize_controller=jv.Tolerance(1e-11), samples=2, estimate=False)
+    end = jax.tree.map(lambda leaf: leaf[-1], run.trajectory.state)
+    np.testing.assert_allclose(end.displacement, data.qpos[:2], atol=1e-8)
+    np.testing.assert_allclose(end.angle, [data.qpos[f], data.qpos[a]], atol=1e-6)
+    np.testing.assert_allclose(end.rate, [data.qvel[f], data.qvel[a]], atol=1e-4)
+    assert np.ptp(run.trajectory.state.angle[1]) > 1.0
+
+
+def test_balls_that_roll_add_to_mujocos_equations_what_their_own_rotation_asks_for():
+    """MuJoCo's mass matrix and forces of the masses, and of a rolling ball (2/5) m (B^2 f' (f' - w) + rho^2 a'^2)/2."""
+    s = wide_scene()
+    model = mujoco_torus(s)
+    data, loads, w = mujoco.MjData(model), s.loads, float(s.drive.speed)
+    extra, radius, gap = 0.4 * float(loads.mass), float(loads.radius), float(loads.gap)
+    for seed in range(3):
+        state = some_state(seed)
+        (f, a), (df, da) = np.asarray(state.angle), np.asarray(state.rate)
+        for place, carried, pair in ((data.qpos, state.displacement, (f, a)), (data.qvel, state.velocity, (df, da))):
+            place[:] = [*carried, *np.stack(pair, axis=1).ravel()]
+        mujoco.mj_forward(model, data)
+        mass = np.zeros((6, 6))
+        for k, unit in enumerate(np.eye(6)):
+            mujoco.mj_mulM(model, data, mass[k], unit)
+        force = data.qfrc_passive - data.qfrc_bias
+        arm, bend = radius + gap * np.sin(a), gap * np.cos(a)
+        mass += np.diag([0.0, 0.0, *extra * np.stack([arm**2, np.full(2, gap**2)], axis=1).ravel()])
+        turn = -2.0 * extra * arm * bend * da * df + extra * arm * bend * w * da
+        climb = extra * arm * bend * df * (df - w)
+        force[2:] += np.stack([turn, climb], axis=1).ravel()
+        expected = np.linalg.solve(mass, force)
+        found = evaluate(s, jnp.asarray(0.0), state)
+        np.testing.assert_allclose(found.velocity, expected[:2], rtol=1e-9)
+        np.testing.assert_allclose(np.stack(found.rate, axis=1).ravel(), expected[2:], rtol=1e-9, atol=1e-6)

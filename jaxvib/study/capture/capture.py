@@ -26,12 +26,12 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
+__all__ = ["CAUGHT", "PER_RADIAN", "Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
 
-_CAUGHT = 3e-3
+CAUGHT = 3e-3
 """A load whose mean speed differs from the rotor's by less turns with it, as in `regime`."""
 
-_PER_RADIAN = 1.0
+PER_RADIAN = 1.0
 """Steps for each radian of what moves fastest, balls up and down their tube: errors far below those of chance."""
 
 _SCAN = 32
@@ -180,7 +180,7 @@ def capture(
     shifts[0] = 0.0
     if stepsize_controller is None:
         fastest = float(fastest_and_slowest(scene)[0])
-        stepsize_controller = EqualSteps(max(16, math.ceil(_PER_RADIAN * end * fastest)))
+        stepsize_controller = EqualSteps(max(16, math.ceil(PER_RADIAN * end * fastest)))
 
     def outcomes(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
@@ -189,7 +189,7 @@ def capture(
         ran = ensemble(_thrown, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
         shape, finite = (which.size, starts), np.asarray(ran.finite)
-        return (np.all(slip < _CAUGHT, axis=1) & finite).reshape(shape), finite.reshape(shape)
+        return (np.all(slip < CAUGHT, axis=1) & finite).reshape(shape), finite.reshape(shape)
 
     captured, finite = outcomes(tried)
     while resolution is not None:

@@ -19,11 +19,11 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TorusBalls, torus_balls
 from jaxvib.units import Number, number
 
-__all__ = ["TABLES", "PrintedTorus", "PublishedRow", "printed_torus", "published_torus"]
+__all__ = ["TABLES", "PrintedTorus", "PublishedRow", "letter_torus", "printed_torus", "published_scene", "published_torus"]
 
 _SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
 
-_SIGN_WIDTH = 0.1
+_SIGN_WIDTH = 0.02
 """Over so much of a relative speed, in the rotor's, the printed model's signs are smoothed."""
 
 
@@ -108,6 +108,20 @@ def published_torus(
         raise InputError("gap", f"is {gap:g}; it must be between 0 and {_TUBE / _ECCENTRICITY:g}, where a ball has room")
     ball = _DENSITY * 4.0 / 3.0 * math.pi * own**3
     whole = number(mass, "kg", "mass", low=2.0 * ball, open_low=True)
+    return published_scene(gap, damping, stiffness, friction, whole, width)
+
+
+def published_scene(
+    gap: float | Array,
+    damping: float | Array,
+    stiffness: float | Array,
+    friction: float | Array,
+    whole: float | Array = 7.0,
+    width: Number = 0.1,
+) -> Scene:
+    """`published_torus` of numbers that nobody checks, so that JAX may transform them."""
+    own = _TUBE - gap * _ECCENTRICITY
+    ball = _DENSITY * 4.0 / 3.0 * math.pi * own**3
     body = whole - 2.0 * ball
     return Scene(
         planar_rotor(mass=body, stiffness=stiffness * whole * _SPEED**2, damping=damping * whole * _SPEED),
@@ -126,12 +140,16 @@ class PrintedTorus(eqx.Module):
 
         kappa B psi'' = x'' s - y'' c - 2 rho cos a a' f' - (k/r) N (R + R_1 sin a) B/R^2 sign(psi')
         kappa rho a'' = B f'^2 cos a - g sin a - cos a (x'' c + y'' s) - e w^2 M_r/M cos a (sin psi - cos psi)
-                        - (k/r) N R_1/rho sign(a'),            N = g cos a + R f'^2 sin a + rho a'^2
+                        - (k/r) N L/rho sign(a'),              N = g cos a + R f'^2 sin a + rho a'^2
 
     f = w t + psi. Against what the same paper's drawing asks for: the rotor's unbalance comes into the last equation with the
-    sine of psi in place of its cosine, friction up the tube has the lever R_1 in place of the gap, N (per mass) lacks the
-    acceleration of the rotor, a ball's rolling adds inertia to second derivatives alone, and each coordinate has a friction of
-    its own. For comparison with the paper's tables only.
+    sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling adds inertia to second
+    derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the tube is printed as R_1;
+    with it the smallest gap of the tables has no threshold, with the gap rho in its place the row p = 0.010 comes out within
+    0.05 (`jaxvib.study.capture.tables`): so that R_1 is a misprint of the paper, not of its program. For comparison with the
+    paper's tables only.
+
+    **Attributes**: the scene's parts, and `lever` L m.
     """
 
     machine: PlanarRotor
@@ -140,6 +158,7 @@ class PrintedTorus(eqx.Module):
     gravity: Array
     imbalance: Array
     friction: Array
+    lever: Array
 
     def __call__(self, t: Array, state: State) -> State:
         """The time derivative of `state` at time `t`."""
@@ -153,7 +172,7 @@ class PrintedTorus(eqx.Module):
         pressed = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0) * self.friction / loads.own_radius
         width = _SIGN_WIDTH * w
         slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / width)
-        stop = pressed * loads.tube / gap**2 * jnp.tanh(climb / width)
+        stop = pressed * self.lever / gap**2 * jnp.tanh(climb / width)
         lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin
         wrong = self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
         free_turn = (-2.0 * gap * across * climb * turn / arm - slow) / kappa
@@ -177,8 +196,17 @@ class PrintedTorus(eqx.Module):
 
 
 def printed_torus(scene: Scene) -> PrintedTorus:
-    """The paper's equations for a scene of `published_torus`, see `PrintedTorus`; what `ensemble` takes as its `equations`."""
+    """The paper's equations for a scene of `published_torus`, see `PrintedTorus`; what `ensemble` takes as its `equations`.
+
+    The friction up the tube has the gap as its lever, as the tables ask for; `letter_torus` has R_1, as printed.
+    """
     gravity, imbalance, rolling = scene.effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
     machine, loads = cast(PlanarRotor, scene.machine), cast(TorusBalls, scene.loads)
-    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient)
+    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.gap)
+
+
+def letter_torus(scene: Scene) -> PrintedTorus:
+    """As `printed_torus`, to the letter: the friction up the tube has the lever R_1."""
+    printed = printed_torus(scene)
+    return eqx.tree_at(lambda p: p.lever, printed, printed.loads.tube)
