@@ -26,6 +26,7 @@ from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tiers, TierValues
 from jaxvib.study.capture.capture import _judged
+from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
 from optimize.synthesize import Outcome, Synthesis
@@ -106,7 +107,19 @@ RESULTS = {
     "Identified": cached(identified),
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
-    "Capture": lambda: _judged(np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), 150),
+    "Capture": lambda: _judged(
+        np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150
+    ),
+    "TorusTables": lambda: TorusTables(
+        *np.array([[0.1, 0.1], [0.005, 0.01], [4e-5, 4e-5], [2.7, 2.7], [-0.89, -0.639]]),
+        ("derived", "printed"),
+        *np.array([[[-0.9, -0.6], [-0.8, np.nan]], [[-0.7, -0.6], [-0.6, np.nan]], [[0.5, 1.0], [1.0, 0.0]]]),
+        np.array([-1.0, -0.1]),
+        np.ones((2, 2, 2), bool),
+        resolution=np.asarray(0.02),
+        starts=np.asarray(4),
+        turns=np.asarray(2000),
+    ),
     "Tiers": tiers,
     "HarmonicConvergence": lambda: HarmonicConvergence(
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])

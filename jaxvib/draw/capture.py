@@ -77,8 +77,10 @@ def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]
         axis.set_visible(False)
     for axis, (title, gap, speeds) in zip(axes, rows, strict=False):
         for k, (name, speed) in enumerate(speeds.items()):
-            shape = dict(ls="", marker="o", color="black") if name == "paper" else dict(marker=".", color=COLORS[k - 1])
-            axis.plot(gap, speed, label=name, **shape)
+            if name == "paper":
+                axis.plot(gap, speed, "o", color="black", label=name)
+            else:
+                axis.plot(gap, speed, marker=".", color=COLORS[(k - 1) % len(COLORS)], label=name)
         axis.set_title(title)
         axis.set_xlabel("gap, in eccentricities")
         axis.set_ylabel("least initial speed")

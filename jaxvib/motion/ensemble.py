@@ -19,6 +19,7 @@ from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
-_Ends: TypeAlias = tuple[State, Array, Array, Array, Array]
+_Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """What `_run` returns, of one run or of many."""
 
 _PARTS = 4
@@ -54,6 +55,7 @@ class EnsembleStatus(eqx.Enumeration):
     """How a run of an ensemble ended; the members are the sentences a user reads."""
 
     done = "the run reached its end"
+    detached = "the run reached its end, but on the way a load did not press on its track and was kept on it all the same"
     not_finite = "the motion grew beyond all bounds"
 
 
@@ -64,21 +66,28 @@ class Ensemble(Result):
     with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
     `error` (B,) estimated, as that of a `Run` but for the end state alone, each run's displacements relative to its own
     largest: NaN where no estimate was asked for or the motion did not stay finite, infinite where 4 steps or fewer leave no
-    larger ones to compare with; `finite` (B,) whether the motion stayed so; `steps` each run took; `seconds` all of it took,
-    compiling included where a program was new, NaN under a JAX transformation.
+    larger ones to compare with; `finite` (B,) whether the motion stayed so; `detached` (B, count) whether a load's track, which
+    holds it by pressing alone, would have had to pull it at any stage of any step; `steps` each run took; `seconds` all of it
+    took, compiling included where a program was new, NaN under a JAX transformation.
     """
 
     state: State = eqx.field(metadata=part("run", fields=STATE))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
     finite: Array = eqx.field(metadata=in_unit("", "run"))
+    detached: Array = eqx.field(metadata=in_unit("", "run", "load"))
     steps: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
 
     @property
     def status(self) -> EnsembleStatus:
         """How each run ended, an `EnsembleStatus` for each."""
-        return jax.vmap(lambda ok: EnsembleStatus.where(ok, EnsembleStatus.done, EnsembleStatus.not_finite))(self.finite)
+
+        def one(finite: Array, detached: Array) -> EnsembleStatus:
+            ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
+            return EnsembleStatus.where(finite, ended, EnsembleStatus.not_finite)
+
+        return jax.vmap(one)(self.finite, self.detached)
 
     def summary(self) -> str:
         """How the runs ended, at which speeds of their loads, with which errors, for a person to read."""
@@ -173,14 +182,14 @@ def ensemble(
     # A run of one step in each part has no coarser one beside it.
     compared = estimate and coarse < each
     counts = np.asarray([each, coarse] if compared else [each], end.dtype)
-    last, load_speed, apart, finite, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs, equations)
+    last, load_speed, apart, finite, detached, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs, equations)
     # What a method of order 3 would leave of the difference; this one is of order 8.
     share = (coarse / each) ** 3
     unknown = np.inf if estimate else np.nan
     error = jnp.asarray(np.full(runs, unknown, end.dtype))
     if compared:
         error = estimated_error(apart, share, made[0])
-    found = Ensemble(last, load_speed, error, finite, taken[0], jnp.asarray(jnp.nan, end.dtype))
+    found = Ensemble(last, load_speed, error, finite, detached, taken[0], jnp.asarray(jnp.nan, end.dtype))
     if not known:
         return found
     jax.block_until_ready(found)
@@ -254,10 +263,13 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
 
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
-    there, whether it stayed finite, the steps it took.
+    there, whether it stayed finite, which loads did not press on their track, the steps it took.
     """
     single, together = wrap_angles(scene, state.displacement.dtype)
-    motion = PackedSystem(equations(scene), state, wrapped=single, together=together)
+    watched = scene.loads.one_sided
+    field = _Watching(equations(scene), scene) if watched else equations(scene)
+    state = _watched(state, jnp.zeros_like(state.azimuth)) if watched else state
+    motion = PackedSystem(field, state, wrapped=single, together=together)
     length = end / _PARTS
 
     def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:
@@ -288,7 +300,40 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
     angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).azimuth
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
+    detached = last.missing != 0.0 if isinstance(last, _Watched) else jnp.zeros(last.azimuth.shape, dtype=bool)
+    last, other = (_plain(state) for state in (last, other))
     finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
     # A run whose coarser one did not stay finite has an error that nobody knows.
     apart = jnp.where(finite & ~is_finite(other), jnp.inf, apart)
-    return last, (angle[1] - angle[0]) / length, apart, finite, taken[0]
+    return last, (angle[1] - angle[0]) / length, apart, finite, detached, taken[0]
+
+
+class _Watched(State):
+    """A state, and for each load what its track would have had to pull it with so far, summed over time, (count,) N s.
+
+    It is exactly 0 where N was nowhere negative, whatever the weights of the method's stages.
+    """
+
+    missing: Array = eqx.field(kw_only=True)
+
+
+class _Watching(eqx.Module):
+    """The equations of motion, and beside them missing' = max(-N, 0)."""
+
+    equations: Callable[[Array, State], State]
+    scene: Scene
+
+    def __call__(self, t: Array, state: State) -> State:
+        scene, change = self.scene, self.equations(t, _plain(state))
+        pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
+        assert pressing is not None
+        force = pressing.at(scene.machine.carrier().point_rates(change.velocity))
+        return _watched(change, jnp.maximum(-force, 0.0))
+
+
+def _watched(state: State, missing: Array) -> _Watched:
+    return _Watched(state.displacement, state.velocity, state.angle, state.rate, state.rotor, missing=missing)
+
+
+def _plain(state: State) -> State:
+    return State(state.displacement, state.velocity, state.angle, state.rate, state.rotor)

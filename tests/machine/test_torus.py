@@ -12,6 +12,7 @@ from torus import MASS, OWN, SPEED, balls, lagrangian_accelerations, published, 
 
 import jaxvib as jv
 from jaxvib.machine.torus import TorusBalls
+from jaxvib.results.status import status_names
 
 evaluate = jax.jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
@@ -104,6 +105,20 @@ def test_a_run_says_when_balls_leave_their_wall():
     np.testing.assert_allclose(with_.rate[1][1], without.rate[1][1], rtol=1e-3)
 
 
+def test_an_ensemble_names_the_runs_in_which_balls_leave_their_wall():
+    s = scene((jv.Gravity(along="axis"), jv.RollingFriction(4e-5)))
+
+    def make(a):
+        place = (jnp.asarray([0.0, 3.0]), jnp.stack([jnp.zeros_like(a), a]))
+        return s, jv.State(jnp.zeros(2), jnp.zeros(2), place, (jnp.full(2, 130.0), jnp.zeros(2)))
+
+    steps = jv.EqualSteps(64)
+    many = jv.ensemble(make, jnp.asarray([-1.0, 1.0, jnp.nan]), 0.02, stepsize_controller=steps, estimate=False)
+    np.testing.assert_array_equal(many.detached[:2], [[False, True], [False, False]])
+    assert [str(name) for name in status_names(many.status)] == ["detached", "done", "not_finite"]
+    assert "kept on it all the same" in many.summary()
+
+
 def test_small_motions_about_the_equator_have_the_frequency_that_steps_resolve():
     s = jv.Scene(jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0), balls(1), jv.ConstantSpeed(SPEED))
     a = jnp.asarray([0.5 * jnp.pi + 1e-5])
@@ -166,7 +181,8 @@ def mujoco_torus(s, step=1e-5):
     """A sprung rotor in MuJoCo's words, and on it masses on two hinges: about the axis, and about the tube's middle line."""
     m, loads = s.machine, s.loads
     bodies = "".join(
-        f"""<body><joint name="f{j}" type="hinge" axis="0 0 1"/><inertial pos="0 0 0" mass="1e-14" diaginertia="1e-14 1e-14 1e-14"/>
+        f"""<body><joint name="f{j}" type="hinge" axis="0 0 1"/>
+        <inertial pos="0 0 0" mass="1e-14" diaginertia="1e-14 1e-14 1e-14"/>
         <body pos="{loads.radius:.17g} 0 0"><joint name="a{j}" type="hinge" axis="0 -1 0"/>
         <inertial pos="0 0 {-loads.gap:.17g}" mass="{loads.mass:.17g}" diaginertia="1e-14 1e-14 1e-14"/></body></body>"""
         for j in range(2)

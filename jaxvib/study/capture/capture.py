@@ -51,10 +51,11 @@ class Capture(Result):
 
     **Attributes** (S speeds, each tried from `starts` perturbed positions): `speed` (S,) ascending, (psi')/w, -1 for loads at
     rest in space, 0 for loads that turn with the rotor; `captured` (S, starts) whether all loads turned with the rotor at
-    the end; `finite` (S, starts) whether the motion stayed so; `threshold`, the least speed from which on all starts were
-    captured, halfway to the next lower speed that was tried, and `uncertainty`, half the distance to that speed or to the
-    highest speed at which half of the starts fail, whichever is more, NaN where there is no threshold; `turns` of the rotor
-    that each run took; `status` a `CaptureStatus`.
+    the end; `finite` (S, starts) whether the motion stayed so; `detached` (S, starts) whether a load did not press on its wall
+    on the way, where it was kept on it all the same; `threshold`, the least speed from which on all starts were captured,
+    halfway to the next lower speed that was tried, and `uncertainty`, half the distance to that speed or to the highest speed
+    at which half of the starts fail, whichever is more, NaN where there is no threshold; `turns` of the rotor that each run
+    took; `status` a `CaptureStatus`.
 
     Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` says how often.
     """
@@ -62,6 +63,7 @@ class Capture(Result):
     speed: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
     captured: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
     finite: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
+    detached: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
     threshold: Array = eqx.field(metadata=in_unit(""))
     uncertainty: Array = eqx.field(metadata=in_unit(""))
     turns: Array = eqx.field(metadata=in_unit(""))
@@ -89,6 +91,11 @@ class Capture(Result):
         """The threshold with its uncertainty, and what stands below it, for a person to read."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
+        if np.any(self.detached):
+            share = 100.0 * np.mean(self.detached)
+            head += (
+                f"\n  detached: in {share:.3g} % of the runs a ball did not press on its wall, and was kept on it all the same"
+            )
         if np.isnan(self.threshold):
             return head
         below = self.fraction[self.speed < float(self.threshold)]
@@ -182,26 +189,28 @@ def capture(
         fastest = float(fastest_and_slowest(scene)[0])
         stepsize_controller = EqualSteps(max(16, math.ceil(PER_RADIAN * end * fastest)))
 
-    def outcomes(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def outcomes(which: np.ndarray) -> list[np.ndarray]:
+        """Which runs are captured, stay finite, leave their wall, (speeds, starts) each."""
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
         ran = ensemble(_thrown, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
-        shape, finite = (which.size, starts), np.asarray(ran.finite)
-        return (np.all(slip < CAUGHT, axis=1) & finite).reshape(shape), finite.reshape(shape)
+        finite = np.asarray(ran.finite)
+        found = (np.all(slip < CAUGHT, axis=1) & finite, finite, np.any(ran.detached, axis=1))
+        return [each.reshape(which.size, starts) for each in found]
 
-    captured, finite = outcomes(tried)
+    parts = outcomes(tried)
     while resolution is not None:
-        least = _least(captured)
+        least = _least(parts[0])
         if least in (0, tried.size) or tried[least] - tried[least - 1] <= resolution:
             break
         finer = np.linspace(tried[least - 1], tried[least], max(4, _SCAN // starts) + 2)[1:-1]
-        more, stayed = outcomes(finer)
         order = np.argsort(np.concatenate([tried, finer]))
         tried = np.concatenate([tried, finer])[order]
-        captured, finite = (np.concatenate(pair)[order] for pair in ((captured, more), (finite, stayed)))
-    return _judged(tried, captured, finite, turns)
+        parts = [np.concatenate(pair)[order] for pair in zip(parts, outcomes(finer), strict=True)]
+    captured, finite, detached = parts
+    return _judged(tried, captured, finite, detached, turns)
 
 
 def _thrown(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
@@ -215,7 +224,7 @@ def _least(captured: np.ndarray) -> int:
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
 
-def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, turns: int) -> Capture:
+def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int) -> Capture:
     least = _least(captured)
     threshold, uncertainty, status = math.nan, math.nan, CaptureStatus.found
     if least == 0:
@@ -231,6 +240,7 @@ def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, turns: 
         speed=speed,
         captured=captured,
         finite=finite,
+        detached=detached,
         threshold=jnp.asarray(threshold),
         uncertainty=jnp.asarray(uncertainty),
         turns=jnp.asarray(turns),

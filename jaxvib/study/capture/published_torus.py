@@ -143,11 +143,11 @@ class PrintedTorus(eqx.Module):
                         - (k/r) N L/rho sign(a'),              N = g cos a + R f'^2 sin a + rho a'^2
 
     f = w t + psi. Against what the same paper's drawing asks for: the rotor's unbalance comes into the last equation with the
-    sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling adds inertia to second
-    derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the tube is printed as R_1;
-    with it the smallest gap of the tables has no threshold, with the gap rho in its place the row p = 0.010 comes out within
-    0.05 (`jaxvib.study.capture.tables`): so that R_1 is a misprint of the paper, not of its program. For comparison with the
-    paper's tables only.
+    sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling adds inertia to
+    second derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the tube is printed
+    as R_1; with it the smallest gap of the tables has no threshold, with the gap rho in its place the row p = 0.010 comes out
+    within 0.05 (`jaxvib.study.capture.tables`): so that R_1 is a misprint of the paper, not of its program. The sine in place
+    of the cosine moves no threshold of that row by 0.01, but for chaotic ones. For comparison with the paper's tables only.
 
     **Attributes**: the scene's parts, and `lever` L m.
     """

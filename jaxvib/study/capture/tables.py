@@ -36,22 +36,22 @@ CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
 _PER_CONTACT = 2.0
 """Steps for each radian of what a contact swings with."""
 
-_COARSE, _REFINED, _ROUNDS, _LANES = 19, 4, 2, 64
+_COARSE, _ROUNDS, _LANES = 19, 2, 64
 
 
 class _Runs(NamedTuple):
     """Runs side by side, (B,) each, and the positions (B, 2) of the balls besides the paper's."""
 
-    gap: np.ndarray
-    damping: np.ndarray
-    stiffness: np.ndarray
-    friction: np.ndarray
-    speed: np.ndarray
-    shift: np.ndarray
+    gap: Array
+    damping: Array
+    stiffness: Array
+    friction: Array
+    speed: Array
+    shift: Array
 
 
 def _alone(run: _Runs) -> tuple[Scene, State]:
-    scene = published_scene(jnp.asarray(run.gap), run.damping, run.stiffness, run.friction)
+    scene = published_scene(run.gap, run.damping, run.stiffness, run.friction)
     return scene, thrown_state(scene, run.speed, run.shift)
 
 
@@ -76,20 +76,21 @@ MODELS = {
     "letter": _Model(_alone, letter_torus, False),
     "contact": _Model(_touching, vector_field, True),
 }
-"""By name: this package's equations, the paper's (`PrintedTorus`), the same to the letter, this package's with `CONTACT` of the balls."""
+"""By name: this package's equations, the paper's (`PrintedTorus`), those to the letter, this package's with `CONTACT`."""
 
 
 class TorusTables(Result):
     """Tables 1 and 2 of the paper, point by point, beside what was computed.
 
-    **Attributes** (P points, M models): `damping` n, `stiffness` p, `friction` k m, `gap` and the `paper`'s least speed of
-    each point, (P,); `models` M names; `threshold` (M, P), the least initial speed from which on every start is captured,
-    -1 where all speeds are, NaN where the highest is not; `uncertainty` (M, P) of it, half the distance of the speeds that
-    were tried last; `islands` (M, P), how often captures give way to failures again, going up the speeds; `fraction` (M, P),
-    the share captured of `starts` perturbed starts at the paper's speed.
+    **Attributes** (P points, M models): `damping` n, `stiffness` p, `friction` k m, `gap`, and the `paper`'s speed, (P,) of
+    the points; `models` M names; `least` (M, P), the least initial speed that is captured, -1 where a ball at rest is, NaN
+    where none is; `threshold` (M, P), the speed from which on all are captured, NaN where the highest is not; both halfway
+    between speeds that differ by `resolution`; `captured` (M, P, S), whether each of the speeds `tried` (S,) is; `fraction`
+    (M, P), the share captured of `starts` perturbed starts at the paper's speed; `turns` of the rotor that each run took.
 
-    Where there are islands the outcome below the threshold is chaotic: a speed that the paper has found is then one of many,
-    and the share says how often its neighbours agree.
+    Where `least` and `threshold` differ, captures and failures alternate between them, and the paper's one number leaves open
+    which of their borders it is; where the share is neither 0 nor 1 the outcome at the paper's speed is chaotic. Bands narrower
+    than the distance of the speeds `tried` stay unseen.
     """
 
     status = Computed.done
@@ -100,10 +101,12 @@ class TorusTables(Result):
     gap: np.ndarray = eqx.field(metadata=in_unit("", "point"))
     paper: np.ndarray = eqx.field(metadata=in_unit("", "point"))
     models: tuple[str, ...] = eqx.field(metadata=in_unit("", "model"))
+    least: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
     threshold: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    uncertainty: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    islands: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
     fraction: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
+    tried: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
+    captured: np.ndarray = eqx.field(metadata=in_unit("", "model", "point", "speed"))
+    resolution: Array = eqx.field(metadata=in_unit(""))
     starts: Array = eqx.field(metadata=in_unit(""))
     turns: Array = eqx.field(metadata=in_unit(""))
 
@@ -113,31 +116,44 @@ class TorusTables(Result):
         ends = np.flatnonzero(np.any(np.diff(keys, axis=0) != 0.0, axis=1)) + 1
         return np.split(np.arange(self.gap.size), ends)
 
+    @property
+    def difference(self) -> np.ndarray:
+        """What is computed less the paper's, (M, P): of `least` and `threshold` the one that is nearer."""
+        both = np.stack([self.least, self.threshold]) - self.paper
+        far = np.where(np.isnan(both), np.inf, np.abs(both))
+        return np.take_along_axis(both, np.argmin(far, axis=0)[None], axis=0)[0]
+
     def summary(self) -> str:
-        """A line for each point: paper, and of each model threshold, its difference, islands, share at the paper's speed."""
-        lines = [f"least initial speeds, {int(self.turns)} turns; share captured of {int(self.starts)} starts at the paper's"]
+        """For each row of the tables a line for each gap and model, for a person to read; "#" are captures, "." failures."""
+        low, high, n = self.tried[0], self.tried[-1], self.tried.size
+        head = (
+            f"initial speeds that are captured in {int(self.turns)} turns: the least, all from; {n} speeds {low:g} .. {high:g};"
+        )
+        lines = [f"{head}\nof {int(self.starts)} starts perturbed at the paper's speed the share; difference of the nearer one"]
         for row in self.rows():
             i = row[0]
             lines.append(f"n = {self.damping[i]:g}, p = {self.stiffness[i]:g}, k = {self.friction[i]:g} m")
-            lines.append("   gap   paper" + "".join(f" | {name:>9s}   diff isl share" for name in self.models))
+            lines.append(f"   gap   paper  {'model':8s}  least    from  nearer  share  {'outcomes':{n}s}")
             for i in row:
-                cells = (
-                    f" | {self.threshold[m, i]:9.3f} {self.threshold[m, i] - self.paper[i]:+6.3f} {int(self.islands[m, i]):3d}"
-                    f" {self.fraction[m, i]:5.2f}"
-                    for m in range(len(self.models))
-                )
-                lines.append(f"  {self.gap[i]:4.1f} {self.paper[i]:7.3f}" + "".join(cells))
+                for m, name in enumerate(self.models):
+                    point = f"  {self.gap[i]:4.1f} {self.paper[i]:7.3f}" if m == 0 else " " * 14
+                    pattern = "".join(".#"[int(x)] for x in self.captured[m, i])
+                    numbers = f"{self.least[m, i]:7.3f} {self.threshold[m, i]:7.3f} {self.difference[m, i]:+7.3f}"
+                    lines.append(f"{point}  {name:8s}{numbers}  {self.fraction[m, i]:5.2f}  {pattern}")
         return "\n".join(lines)
 
     def plot(self) -> Figure:
-        """Least initial speeds over the gap, a panel for each row of the tables. **Returns** a matplotlib figure."""
+        """The speeds nearest to the paper's over the gap, a panel for each row. **Returns** a matplotlib figure."""
         from jaxvib.draw.capture import tables_chart  # slow to import: only who draws pays
 
         panels = [
             (
                 f"n = {self.damping[row[0]]:g}, p = {self.stiffness[row[0]]:g}, k = {1e5 * self.friction[row[0]]:.0f}e-5 m",
                 self.gap[row],
-                {"paper": self.paper[row], **{name: self.threshold[m][row] for m, name in enumerate(self.models)}},
+                {
+                    "paper": self.paper[row],
+                    **{name: (self.paper + self.difference[m])[row] for m, name in enumerate(self.models)},
+                },
             )
             for row in self.rows()
         ]
@@ -155,9 +171,9 @@ def published_tables(
 ) -> TorusTables:
     """The paper's tables of least initial speeds by other equations, and how sure each entry is.
 
-    For each point 19 speeds from -1 to -0.1 are tried, the stretch below the least from which on all are captured twice finer,
-    five times each, and `starts` perturbed starts at the paper's own speed. All points advance together, sorted by the steps
-    they need; the whole is about 1700 runs a model, some minutes on two cores.
+    For each point 19 speeds from -1 to -0.1 are tried, the stretches below the least that is captured and below that from which
+    on all are twice finer, five times each, and `starts` perturbed starts at the paper's own speed. All points advance
+    together, sorted by the steps they need: 2000 runs a model, some minutes on two cores.
 
     **Arguments**: `models` names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor that each run takes; `starts`, all but
     the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`.
@@ -186,39 +202,65 @@ def published_tables(
     def tried(model: _Model, speed: np.ndarray, shift: np.ndarray) -> np.ndarray:
         """Whether each point is captured from speeds (P, S) and positions (S, 2)."""
         each = speed.shape[1]
-        fields = (np.repeat(x, each) for x in (gap, damping, stiffness, friction))
-        runs = _Runs(*fields, speed.ravel(), np.tile(shift, (gap.size, 1)))
+        gaps, dampings, stiffnesses, frictions = (jnp.repeat(jnp.asarray(x), each) for x in (gap, damping, stiffness, friction))
+        places = jnp.tile(jnp.asarray(shift), (gap.size, 1))
+        runs = _Runs(gaps, dampings, stiffnesses, frictions, jnp.asarray(speed.ravel()), places)
         return _outcomes(model, runs, count(turns, "turns")).reshape(speed.shape)
 
+    grid = np.linspace(-1.0, -0.1, _COARSE)
+
     def entry(model: _Model) -> tuple[np.ndarray, ...]:
-        speed = np.tile(np.linspace(-1.0, -0.1, _COARSE), (gap.size, 1))
-        captured = tried(model, speed, np.zeros((_COARSE, 2)))
+        speed = np.tile(grid, (gap.size, 1))
+        captured = first = tried(model, speed, np.zeros((_COARSE, 2)))
         for _ in range(_ROUNDS):
-            least = np.array([_least(line) for line in captured])
-            # Without a threshold between two speeds any stretch is as good.
-            at = np.clip(least, 1, speed.shape[1] - 1)
-            low, high = (np.take_along_axis(speed, (at - k)[:, None], axis=1) for k in (1, 0))
-            finer = low + (high - low) * np.arange(1, _REFINED + 1) / (_REFINED + 1)
+            inside = [_between(speed, np.argmax(captured, axis=1)), _between(speed, _from(captured))]
+            finer = np.concatenate([low + (high - low) * _SHARES for low, high in inside], axis=1)
             speed = np.concatenate([speed, finer], axis=1)
-            captured = np.concatenate([captured, tried(model, finer, np.zeros((_REFINED, 2)))], axis=1)
+            captured = np.concatenate([captured, tried(model, finer, np.zeros((finer.shape[1], 2)))], axis=1)
             order = np.argsort(speed, axis=1)
             speed, captured = (np.take_along_axis(x, order, axis=1) for x in (speed, captured))
-        least = np.array([_least(line) for line in captured])
-        at = np.clip(least, 1, speed.shape[1] - 1)
-        low, high = (np.take_along_axis(speed, (at - k)[:, None], axis=1)[:, 0] for k in (1, 0))
-        threshold = np.where(least == 0, -1.0, np.where(least == speed.shape[1], math.nan, 0.5 * (low + high)))
-        islands = np.sum(captured[:, :-1] & ~captured[:, 1:], axis=1)
+        lowest, above = np.argmax(captured, axis=1), _from(captured)
+        least, threshold = (np.where(at == 0, -1.0, np.mean(_between(speed, at), axis=0)[:, 0]) for at in (lowest, above))
+        least = np.where(np.any(captured, axis=1), least, math.nan)
+        threshold = np.where(above == speed.shape[1], math.nan, threshold)
         fraction = np.mean(tried(model, np.tile(paper[:, None], (1, starts)), shifts), axis=1)
-        return threshold, np.where(least == 0, 0.0, 0.5 * (high - low)), islands.astype(float), fraction
+        return least, threshold, fraction, first
 
-    found = [np.stack(part) for part in zip(*(entry(MODELS[name]) for name in models), strict=True)]
-    numbers = (damping, stiffness, friction, gap, paper)
-    return TorusTables(*numbers, tuple(models), *found, starts=jnp.asarray(starts), turns=jnp.asarray(turns))
+    least, threshold, fraction, captured = (
+        np.stack(part) for part in zip(*(entry(MODELS[name]) for name in models), strict=True)
+    )
+    return TorusTables(
+        damping=damping,
+        stiffness=stiffness,
+        friction=friction,
+        gap=gap,
+        paper=paper,
+        models=tuple(models),
+        least=least,
+        threshold=threshold,
+        fraction=fraction,
+        tried=grid,
+        captured=captured,
+        resolution=jnp.asarray((grid[1] - grid[0]) * _SHARES[0] ** _ROUNDS),
+        starts=jnp.asarray(starts),
+        turns=jnp.asarray(turns),
+    )
 
 
-def _least(captured: np.ndarray) -> int:
-    failing = np.flatnonzero(~captured)
-    return 0 if failing.size == 0 else int(failing[-1]) + 1
+_SHARES = np.arange(1, 5) / 5.0
+"""Where between two speeds others are tried."""
+
+
+def _from(captured: np.ndarray) -> np.ndarray:
+    """The place of the least speed from which on all are captured (P, S); S where there is none."""
+    failing = ~captured[:, ::-1]
+    return np.where(np.any(failing, axis=1), captured.shape[1] - np.argmax(failing, axis=1), 0)
+
+
+def _between(speed: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The speed at a place and the one below it, (P, 1) each; the two at the end of the line where there are none."""
+    at = np.clip(at, 1, speed.shape[1] - 1)[:, None]
+    return np.take_along_axis(speed, at - 1, axis=1), np.take_along_axis(speed, at, axis=1)
 
 
 def _outcomes(model: _Model, runs: _Runs, turns: int) -> np.ndarray:
@@ -231,12 +273,13 @@ def _outcomes(model: _Model, runs: _Runs, turns: int) -> np.ndarray:
     speed = float(published_scene(1.0, 0.1, 0.01, 0.0).drive.speed)
     needed = np.array([_steps_per_second(model, float(gap)) for gap in gaps])[which]
     order, size = np.argsort(-needed, kind="stable"), _LANES * len(jax.devices()) - 1
-    other = _Runs(*(np.asarray([x]) for x in (7.5, 0.2, 0.02, 1e-5, 0.0)), np.asarray([[1e-3, 2e-3]]))
+    gap, damping, stiffness, friction, still = (jnp.asarray([x]) for x in (7.5, 0.2, 0.02, 1e-5, 0.0))
+    other = _Runs(gap, damping, stiffness, friction, still, jnp.asarray([[1e-3, 2e-3]]))
     end, captured = 2.0 * np.pi * turns / speed, np.zeros(runs.gap.size, dtype=bool)
     for begin in range(0, order.size, size):
         block = order[begin : begin + size]
         filled = np.concatenate([block, np.full(size - block.size, block[-1])])
-        values = _Runs(*(jnp.asarray(np.concatenate([x[filled], y])) for x, y in zip(runs, other, strict=True)))
+        values = jax.tree.map(lambda x, y, filled=filled: jnp.concatenate([x[filled], y]), runs, other)
         steps = EqualSteps(max(16, math.ceil(end * needed[block[0]])))
         ran = ensemble(
             model.make, values, end, stepsize_controller=steps, estimate=False, lanes=_LANES, equations=model.equations

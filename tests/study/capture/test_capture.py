@@ -13,7 +13,7 @@ import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.equations.dynamics import State
 from jaxvib.study.capture.capture import capture_time, thrown_state
-from jaxvib.study.capture.published_torus import TABLES, printed_torus, published_torus
+from jaxvib.study.capture.published_torus import TABLES, letter_torus, printed_torus, published_torus
 
 
 def test_a_threshold_is_bracketed_ever_finer():
@@ -42,7 +42,8 @@ def test_fractions_are_of_perturbed_starts_and_say_their_error():
     np.testing.assert_array_equal(again.captured, found.captured)
 
 
-def test_the_printed_model_is_its_equations_solved_together():
+@pytest.mark.parametrize(("equations", "lever"), [(printed_torus, 2.5), (letter_torus, 15.0)])
+def test_the_printed_model_is_its_equations_solved_together(equations, lever):
     """Against the printed equations with x'', y'' and the balls' accelerations as unknowns of one linear system."""
     scene = published_torus(2.5)
     e, w = 1e-3, 140.0
@@ -64,8 +65,8 @@ def test_the_printed_model_is_its_equations_solved_together():
             total[0] -= mb * (arm * s * ddpsi - eb * ca * c * dda)
             total[1] += mb * (arm * c * ddpsi + eb * ca * s * dda)
             pressed = max(g * ca + e2 * u**2 * sa + eb * da[i] ** 2, 0.0)
-            slow = arm / e2**2 * (e2 + e1 * sa) * kb * pressed * np.tanh(dpsi[i] / 0.1)
-            stop = e1 / eb * kb * pressed * np.tanh(da[i] / 0.1)
+            slow = arm / e2**2 * (e2 + e1 * sa) * kb * pressed * np.tanh(dpsi[i] / 0.02)
+            stop = lever / eb * kb * pressed * np.tanh(da[i] / 0.02)
             wrong = (1 - 2 * mb) * ca * (np.sin(psi[i]) - np.cos(psi[i]))
             balls.append(1.4 * arm * ddpsi - (ax * s - ay * c - 2 * eb * ca * da[i] * u - slow))
             balls.append(1.4 * eb * dda - (arm * u**2 * ca - g * sa - ca * (ax * c + ay * s) - wrong - stop))
@@ -75,7 +76,7 @@ def test_the_printed_model_is_its_equations_solved_together():
     expected = np.linalg.solve(matrix, -residual(np.zeros(6)))
     given = ((x * e, v * e * w), ((turn + psi, a), ((1.0 + dpsi) * w, da * w)))
     (place, velocity), (angle, rate) = jax.tree.map(jnp.asarray, given)
-    field = printed_torus(scene)(jnp.asarray(turn / w), State(place, velocity, angle, rate))
+    field = equations(scene)(jnp.asarray(turn / w), State(place, velocity, angle, rate))
     np.testing.assert_allclose(field.velocity / (e * w**2), expected[:2], rtol=1e-10)
     np.testing.assert_allclose(field.rate[0] / w**2, expected[2:4], rtol=1e-9, atol=1e-13)
     np.testing.assert_allclose(field.rate[1] / w**2, expected[4:], rtol=1e-10)
