@@ -52,10 +52,15 @@ def horner(coefficients: list[float], x: str) -> str:
     return text
 
 
-def step_source() -> str:
-    """One step of the 13 stages that the solution needs, for one lane, as assignments."""
+def sincos(i: int | str, x: str) -> str:
+    """Assignments of s{i} and c{i}, the sine and the cosine of x."""
     sine = [(-1) ** k / math.factorial(2 * k + 1) for k in range(1, 8)]
     cosine = [(-1) ** k / math.factorial(2 * k) for k in range(2, 9)]
+    return _SINCOS.format(i=i, x=x, sine=horner(sine, f"z{i}"), cosine=horner(cosine, f"z{i}"))
+
+
+def step_source() -> str:
+    """One step of the 13 stages that the solution needs, for one lane, as assignments."""
     lines = []
     stages = len(TABLEAU.b_sol) - 1
     for i in range(stages):
@@ -66,8 +71,7 @@ def step_source() -> str:
             names[name] = f"Y{i}_{name}" if total else name
             if total:
                 lines.append(f"    Y{i}_{name} = {name} + dt * ({total})")
-        parts = dict(i=i, x=names["p"], sine=horner(sine, f"z{i}"), cosine=horner(cosine, f"z{i}"))
-        lines += _SINCOS.format(**parts).strip("\n").split("\n")
+        lines += sincos(i, names["p"]).strip("\n").split("\n")
         lines += _RATES.format(i=i, **names).strip("\n").split("\n")
     for name in NAMES:
         total = " + ".join(f"{float(b)!r} * K{i}_{name}" for i, b in enumerate(TABLEAU.b_sol[:-1]) if b != 0.0)
@@ -89,13 +93,14 @@ def numbers(scene: Any) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
-def _made(source: str, name: str, **options: Any) -> Callable[..., Any]:
-    space: dict[str, Any] = {"math": math, "np": np, "prange": numba.prange}
+def made(source: str, name: str, known: dict[str, Any] | None = None, **options: Any) -> Callable[..., Any]:
+    """The function of that name in the source, compiled; `known` are constants that it reads."""
+    space: dict[str, Any] = {"math": math, "np": np, "prange": numba.prange, **(known or {})}
     exec(source, space)
     return numba.njit(fastmath={"contract", "afn", "arcp", "nsz"}, error_model="numpy", **options)(space[name])
 
 
-def _indented(text: str, by: int) -> str:
+def indented(text: str, by: int) -> str:
     return "\n".join(" " * by + line for line in text.split("\n"))
 
 
@@ -107,10 +112,10 @@ def run(y, n, par, end, steps):
     y1, y2, v1, v2, p, w = y[0], y[1], y[2], y[3], y[4], y[5]
     dt = end / steps
     for _ in range(steps):
-{_indented(step_source(), 4)}
+{indented(step_source(), 4)}
     return np.array([y1, y2, v1, v2, p, w])
 """
-    return _made(source, "run")
+    return made(source, "run")
 
 
 def scalar_ensemble() -> Callable[..., np.ndarray]:
@@ -124,11 +129,11 @@ def run(y, speeds, par, end, steps):
         n = speeds[lane]
         y1, y2, v1, v2, p, w = y[0], y[1], y[2], y[3], y[4], y[5]
         for _ in range(steps):
-{_indented(step_source(), 8)}
+{indented(step_source(), 8)}
         out[lane, 0], out[lane, 1], out[lane, 2], out[lane, 3], out[lane, 4], out[lane, 5] = y1, y2, v1, v2, p, w
     return out
 """
-    return _made(source, "run", parallel=True)
+    return made(source, "run", parallel=True)
 
 
 def simd_ensemble(lanes: int = 16) -> Callable[..., np.ndarray]:
@@ -148,14 +153,14 @@ def run(y, speeds, par, end, steps):
             for lane in range({lanes}):
                 n = speeds[block * {lanes} + lane]
                 y1, y2, v1, v2, p, w = S[0, lane], S[1, lane], S[2, lane], S[3, lane], S[4, lane], S[5, lane]
-{_indented(body, 12)}
+{indented(body, 12)}
                 S[0, lane], S[1, lane], S[2, lane], S[3, lane], S[4, lane], S[5, lane] = y1, y2, v1, v2, p, w
         for lane in range({lanes}):
             for j in range(6):
                 out[block * {lanes} + lane, j] = S[j, lane]
     return out
 """
-    return _made(source, "run", parallel=True)
+    return made(source, "run", parallel=True)
 
 
 def rates_source() -> str:

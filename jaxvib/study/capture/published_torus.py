@@ -19,7 +19,16 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TorusBalls, torus_balls
 from jaxvib.units import Number, number
 
-__all__ = ["TABLES", "PrintedTorus", "PublishedRow", "letter_torus", "printed_torus", "published_scene", "published_torus"]
+__all__ = [
+    "TABLES",
+    "PrintedTorus",
+    "PublishedRow",
+    "cosine_torus",
+    "letter_torus",
+    "printed_torus",
+    "published_scene",
+    "published_torus",
+]
 
 _SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
 
@@ -149,7 +158,7 @@ class PrintedTorus(eqx.Module):
     within 0.05 (`jaxvib.study.capture.tables`): so that R_1 is a misprint of the paper, not of its program. The sine in place
     of the cosine moves no threshold of that row by 0.01, but for chaotic ones. For comparison with the paper's tables only.
 
-    **Attributes**: the scene's parts, and `lever` L m.
+    **Attributes**: the scene's parts; `lever` L m; `sine` 1, or 0 where the unbalance comes in with the cosine, as it should.
     """
 
     machine: PlanarRotor
@@ -159,6 +168,7 @@ class PrintedTorus(eqx.Module):
     imbalance: Array
     friction: Array
     lever: Array
+    sine: Array
 
     def __call__(self, t: Array, state: State) -> State:
         """The time derivative of `state` at time `t`."""
@@ -174,7 +184,7 @@ class PrintedTorus(eqx.Module):
         slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / width)
         stop = pressed * self.lever / gap**2 * jnp.tanh(climb / width)
         lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin
-        wrong = self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
+        wrong = self.sine * self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
         free_turn = (-2.0 * gap * across * climb * turn / arm - slow) / kappa
         free_climb = ((arm * turn**2 * across - self.gravity * up) / gap - wrong - stop) / kappa
         # whole q'' = pull + sum of what the balls' own accelerations add, which hold q'' again
@@ -203,10 +213,17 @@ def printed_torus(scene: Scene) -> PrintedTorus:
     gravity, imbalance, rolling = scene.effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
     machine, loads = cast(PlanarRotor, scene.machine), cast(TorusBalls, scene.loads)
-    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.gap)
+    one = jnp.ones_like(loads.gap)
+    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.gap, one)
 
 
 def letter_torus(scene: Scene) -> PrintedTorus:
     """As `printed_torus`, to the letter: the friction up the tube has the lever R_1."""
     printed = printed_torus(scene)
     return eqx.tree_at(lambda p: p.lever, printed, printed.loads.tube)
+
+
+def cosine_torus(scene: Scene) -> PrintedTorus:
+    """As `printed_torus`, with the rotor's unbalance projected onto the tube as it should be, by the cosine."""
+    printed = printed_torus(scene)
+    return eqx.tree_at(lambda p: p.sine, printed, jnp.zeros_like(printed.sine))

@@ -22,7 +22,14 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.study.capture.capture import CAUGHT, PER_RADIAN, thrown_state
-from jaxvib.study.capture.published_torus import TABLES, PublishedRow, letter_torus, printed_torus, published_scene
+from jaxvib.study.capture.published_torus import (
+    TABLES,
+    PublishedRow,
+    cosine_torus,
+    letter_torus,
+    printed_torus,
+    published_scene,
+)
 from jaxvib.units import count
 
 if TYPE_CHECKING:
@@ -73,10 +80,12 @@ class _Model(NamedTuple):
 MODELS = {
     "derived": _Model(_alone, vector_field, False),
     "printed": _Model(_alone, printed_torus, False),
+    "cosine": _Model(_alone, cosine_torus, False),
     "letter": _Model(_alone, letter_torus, False),
     "contact": _Model(_touching, vector_field, True),
 }
-"""By name: this package's equations, the paper's (`PrintedTorus`), those to the letter, this package's with `CONTACT`."""
+"""By name: this package's equations, the paper's (`PrintedTorus`), those with the unbalance put right, to the letter, this
+package's with `CONTACT`."""
 
 
 class TorusTables(Result):
