@@ -83,7 +83,7 @@ def main() -> None:
     pressing = ~np.any(one.detached, axis=1)
     apart = np.max(np.abs(np.asarray(one.state.angle[0]) - other[:, 2:4])[pressing])
     print(
-        f"after three turns {np.sum(pressing)} of {speeds.size} runs have not left their wall; the two are {apart:.1e} rad apart"
+        f"after three turns {np.sum(pressing)} of {speeds.size} runs have not left their wall; they are {apart:.1e} rad apart"
     )
     base = spent(lambda: loop(starts, numbers, end, steps.number))
     for name, make in (("free", free), ("touching", touching)):
