@@ -88,3 +88,28 @@ def test_a_restitution_survives_the_file_and_wrong_ones_are_named():
     uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, own_radius=0.0125)
     with pytest.raises(jv.InputError, match="is for loads of one mass"):
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
+
+
+def test_jammed_balls_press_together_with_the_unbalance_of_their_arc():
+    """Three balls near the outer equator of a torus, a little apart, jammed below the resonance of a rotor that whirls.
+
+    S = m R sin(N arcsin(r/R)) / (r/R); the rotor's amplitude is S Omega^2 / |c - (M + N m) Omega^2 + i b Omega|.
+    """
+    own, middle, gap, mass = 0.02, 0.1, 0.005, 0.1
+    machine, drive, arm = jv.planar_rotor(mass=10.0, stiffness=4e4, damping=60.0), jv.ConstantSpeed(150.0), middle + gap
+    loads = jv.torus_balls(count=3, mass=mass, radius=middle, tube=own + gap, own_radius=own, drag=0.4)
+    plane = jv.balls(count=3, mass=mass, radius=arm, drag=0.4, own_radius=own)
+    jam = jv.initial_state(jv.Scene(machine, plane, drive), "jam", mode=1)
+    place = (jam.angle[0] + 1.1 * plane.offsets(), 0.5 * jnp.pi + jnp.asarray([0.05, -0.05, 0.02]))
+    start = jv.State(jam.displacement, jam.velocity, place, (*jam.rate, jnp.zeros(3)))
+    s = jv.Scene(machine, loads, drive, (jv.LoadContact(1e6, restitution=0.3),))
+    run = jv.simulate(s, 6.0, start=start, save="window", stepsize_controller=jv.EqualSteps(36000), estimate=False)
+    angle, omega = np.asarray(run.window.state.angle[0]), float(run.omega)
+    assert 50.0 < omega < 62.0 and np.ptp(run.load_speed) < 1e-3 * omega
+    # A contact gives way by the force in it over its stiffness, 1e-5 m.
+    np.testing.assert_allclose(np.diff(angle, axis=1), 2.0 * np.arcsin(own / arm), rtol=2e-3)
+    pressed = mass * arm * np.sin(3.0 * np.arcsin(own / arm)) / (own / arm)
+    np.testing.assert_allclose(np.abs(mass * arm * np.sum(np.exp(1j * angle), axis=1)), pressed, rtol=1e-3)
+    assert pressed < 0.96 * 3.0 * mass * arm
+    receptance = 1.0 / abs(4e4 - 10.3 * omega**2 + 60j * omega)
+    np.testing.assert_allclose(run.amplitude, pressed * omega**2 * receptance, rtol=2e-3)
