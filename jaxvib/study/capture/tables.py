@@ -196,11 +196,11 @@ def published_tables(
     >>> found.paper.tolist(), found.threshold.shape
     ([-0.868], (1, 1))
 
-    By "printed" the `least` speeds, or the thresholds above bands of failures, come out within 0.1 of the paper for all but
-    four of 47 points, half of them within 0.035: two with small gaps and the lesser friction, whose balls are so slow that they
-    are at the paper's speeds after 6000 turns, and two that were not found. "cosine" moves no border by more than 0.002 but for
-    chaotic ones. By "derived" the captures from speeds below -0.7 are gone, and thresholds at p = 0.005 and 0.003 lie 0.2 to
-    0.7 above the paper's: what does it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w).
+    By "printed" 45 of the 47 points come out within 0.1 of the paper, half of them within 0.04; the other two, of the smallest
+    gaps with the lesser friction and the greater damping, are not captured from the paper's speeds in 6000 turns either.
+    "cosine", tried for two rows, moves no border by more than 0.002 but for chaotic ones. By "derived" captures from speeds
+    below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: what does
+    it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w).
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
