@@ -132,6 +132,7 @@ RESULTS = {
 }
 
 SEVERAL_PANELS = [
+    "TorusTables",
     "Run",
     "Envelope",
     "JamModes",
