@@ -31,7 +31,7 @@ from jaxvib.ode.scalar_rules import (
 )
 from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
 from jaxvib.ode.sincos import sine_and_cosine
-from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
+from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, rewritten
 
 __all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", "scalarized_vmap", "scalars_of"]
 
@@ -122,35 +122,37 @@ def _without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
 
     Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
     """
-    first: dict[Var, Var] = {}
+    first: dict[Var, Var | Literal] = {}
     done: dict[tuple[object, ...], JaxprEqn] = {}
-    kept: list[JaxprEqn] = []
+    kept: list[tuple[JaxprEqn, list[Var | Literal]]] = []
 
-    def name(atom: Var | Literal) -> object:
-        return ("constant", atom.val.tobytes(), str(atom.aval)) if isinstance(atom, Literal) else id(atom)
+    def known(atoms: Sequence[Var | Literal]) -> list[Var | Literal]:
+        return [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in atoms]
+
+    def name(atom: Var | Literal) -> str:
+        return f"{np.asarray(atom.val).tobytes()!r} {atom.aval}" if isinstance(atom, Literal) else str(id(atom))
 
     for equation in program.jaxpr.eqns:
-        inputs = [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in equation.invars]
+        inputs = known(equation.invars)
         names = [name(atom) for atom in inputs]
         if equation.primitive in _commutative():
-            names.sort(key=str)
-        # Parameters that are programs themselves are the same only where they are one object.
-        params = tuple((k, v if isinstance(v, (str, bool, int, type(None))) else repr(v)) for k, v in equation.params.items())
-        key = (equation.primitive, *names, params)
-        inner = any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
-        if key in done and not inner and not equation.effects:
+            names.sort()
+        key = (equation.primitive, *names, *(f"{k}={v!r}" for k, v in equation.params.items()))
+        # What has an effect is done as often as it stands there; parameters that are programs are not compared.
+        alone = bool(equation.effects) or any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
+        if key in done and not alone:
             first.update(zip(equation.outvars, done[key].outvars, strict=True))
-            continue
-        done[key] = equation
-        kept.append(equation.replace(invars=inputs))
-    ends = [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in program.jaxpr.outvars]
-    read = {atom for atom in ends if isinstance(atom, Var)}
-    live: list[JaxprEqn] = []
-    for equation in reversed(kept):
+        else:
+            done[key] = equation
+            kept.append((equation, inputs))
+    results = known(program.jaxpr.outvars)
+    read = {atom for atom in results if isinstance(atom, Var)}
+    live = []
+    for equation, inputs in reversed(kept):
         if equation.effects or any(atom in read for atom in equation.outvars):
-            live.append(equation)
-            read.update(atom for atom in equation.invars if isinstance(atom, Var))
-    return program.replace(jaxpr=program.jaxpr.replace(eqns=live[::-1], outvars=ends))
+            live.append((equation, inputs))
+            read.update(atom for atom in inputs if isinstance(atom, Var))
+    return rewritten(program, live[::-1], results)
 
 
 @functools.cache

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -38,6 +38,7 @@ __all__ = [
     "enumeration_of",
     "jaxpr_as_fun",
     "no_host_checks",
+    "rewritten",
     "traced",
     "user_folder",
     "wide_vectors_are_right",
@@ -58,6 +59,17 @@ except ImportError:
     if not TYPE_CHECKING:
         ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
+
+
+def rewritten(
+    program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
+) -> ClosedJaxpr:
+    """A program of these equations, each with its inputs, and results; the same program where JAX lets nobody write one."""
+    try:
+        changed = [equation.replace(invars=inputs) for equation, inputs in equations]
+        return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
+    except (AttributeError, TypeError):
+        return program
 
 
 Out = TypeVar("Out")

@@ -55,6 +55,17 @@ def test_jaxprs_can_be_read_and_run():
     assert float(value) == float(sine.primitive.bind(jnp.asarray(1.0), **sine.params)) + 2.0
 
 
+def test_programs_are_rewritten(monkeypatch):
+    """ClosedJaxpr.replace, Jaxpr.replace, JaxprEqn.replace; and the same program where one of them is gone."""
+    closed = jax.make_jaxpr(lambda x: (x * x) * (x * x))(1.0)
+    first, second, last = closed.jaxpr.eqns
+    asked = closed, [(first, first.invars), (last, [*first.outvars, *first.outvars])], closed.jaxpr.outvars
+    shorter = compat.rewritten(*asked)
+    assert len(shorter.jaxpr.eqns) == 2 and float(compat.jaxpr_as_fun(shorter)(jnp.asarray(2.0))[0]) == 16.0
+    monkeypatch.delattr(type(first), "replace")
+    assert compat.rewritten(*asked) is closed and second in closed.jaxpr.eqns
+
+
 @pytest.mark.parametrize("kind", [compat.custom_vmap, compat._PlainVmap])
 def test_functions_can_have_a_rule_for_vmap(kind):
     """jax.custom_batching.custom_vmap; without it the rule is left out."""
