@@ -71,6 +71,9 @@ from jaxvib.study.accuracy.harmonics import harmonic_convergence
 from jaxvib.study.accuracy.tiers import compare_tiers
 from jaxvib.study.accuracy.work_precision import work_precision
 
+# What effects are worth
+from jaxvib.study.audit.audit import Audit, AuditStatus, audit
+
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
@@ -192,6 +195,10 @@ __all__ = [
     "compare_tiers",
     "harmonic_convergence",
     "Cost",
+    # What effects are worth
+    "audit",
+    "Audit",
+    "AuditStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",
