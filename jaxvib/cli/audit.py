@@ -60,10 +60,11 @@ def audit(
     picture = output.file("audit.png")
     if picture is not None and found.effects:
         found.plot().savefig(picture)
-    output.done(found.as_dict(), lambda: _text(found), "audit")
+    output.done(found.as_dict(), lambda: audit_text(found), "audit")
 
 
-def _text(found: jv.Audit) -> str:
+def audit_text(found: jv.Audit) -> str:
+    """An `Audit` as a person reads it."""
     took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
     lines = [f"{found.question}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
     head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]

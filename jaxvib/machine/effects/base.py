@@ -129,7 +129,7 @@ class Effect(eqx.Module):
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
         """The effect with usual numbers, as it may be in a `machine` with these `loads` whose scene leaves it out, for an audit
-        to put in; None where no number is usual. `speed` of the rotor, rad/s; `amplitude` (nd,) of the motion, m (tilts rad)."""
+        to put in; None where no number is usual. `speed` of the rotor, rad/s; `amplitude` (nd,) of the motion, m or rad."""
         return None
 
     def check(self, machine: Machine, loads: Loads) -> None:
