@@ -52,7 +52,7 @@ def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
     )
     return {
         "published two-mass machine": (published.scene(), {"mode": 3}),
-        "rotor with four pendulums": (published_rotor(mu=9.2e-4, variant="uncoupled"), {"until": 6.0}),
+        "rotor with four pendulums": (published_rotor(mu=9.2e-4, variant="uncoupled"), {"until": 12.0}),
         "torus balancer": (torus, {"start": thrown_state(torus, -0.5), "until": 90.0}),
         "slow vertical machine": (slow, {}),
     }

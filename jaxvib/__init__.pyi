@@ -67,6 +67,7 @@ from jaxvib.study.maps.run_ups import run_ups
 
 # What accuracy costs
 from jaxvib.study.accuracy.cost import Cost
+from jaxvib.study.accuracy.gradient_check import GradientCheck, GradientStatus, ImplicitRoute, check_gradients
 from jaxvib.study.accuracy.harmonics import harmonic_convergence
 from jaxvib.study.accuracy.tiers import compare_tiers
 from jaxvib.study.accuracy.work_precision import work_precision
@@ -195,6 +196,10 @@ __all__ = [
     "compare_tiers",
     "harmonic_convergence",
     "Cost",
+    "check_gradients",
+    "GradientCheck",
+    "GradientStatus",
+    "ImplicitRoute",
     # What effects are worth
     "audit",
     "Audit",

@@ -90,6 +90,14 @@ def audited():
     return jv.Audit(status=AuditStatus.done, accuracy=0.01, question="jam mode 1 at 60 rad/s", **own, **cost)
 
 
+def checked_gradients():
+    shape = np.array([[1.0, 2.0], [1.0, 2.1]])
+    found = dict(gradient=shape, error=0.1 * shape, difference=shape[0], noise=1e-9 * shape[0], step=np.array([1e-4, 1e-3]))
+    names = dict(numbers=("machine.mass", "loads.drag"), at=np.ones(2), routes=("forward", "reverse"))
+    swept = dict(steps=np.array([1e-2, 1e-3, 1e-4]), sweep=np.ones((2, 3)), tolerance=1e-5, left_out=("machine.damping",))
+    return jv.GradientCheck(status=jv.GradientStatus.differ, value=3.0, **names, **found, **swept)
+
+
 def cached(make):
     made = []
 
@@ -145,6 +153,7 @@ RESULTS = {
     ),
     "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Audit": audited,
+    "GradientCheck": checked_gradients,
     "Synthesis": synthesis,
 }
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["CostPanel", "audit_chart", "convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
+__all__ = ["CostPanel", "audit_chart", "convergence_chart", "cost_chart", "stability_chart", "steps_chart", "tiers_chart"]
 
 
 def tiers_chart(
@@ -160,4 +160,29 @@ def audit_chart(labels: Sequence[str], changes: Mapping[str, np.ndarray], accura
     right.set_yticks(place, [])
     right.set_ylim(n - 0.4, -0.6)
     right.set_xlabel("operations that it adds, % of the scene's")
+    return figure
+
+
+def steps_chart(
+    steps: np.ndarray,
+    off: np.ndarray,
+    best: np.ndarray,
+    at_best: np.ndarray,
+    tolerance: float,
+    *,
+    names: Sequence[str],
+    route: str,
+    ax: Axes | None = None,
+) -> Figure:
+    """Central differences against a derivative, relative, `off` (n, k) over their relative `steps` (k,), a line for each of n
+    names; rings where they are `best` (n,), extrapolated (`at_best`, (n,)); dotted the tolerance."""
+    figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
+    floor = np.finfo(float).eps
+    for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
+        axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
+        axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
+    axes.axhline(tolerance, color="black", ls=":", lw=1.2)
+    axes.set_xlabel("step, relative")
+    axes.set_ylabel(f"differences against {route} mode")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
     return figure

@@ -35,8 +35,8 @@ class EffectRow(NamedTuple):
     Changes by it, relative, of the scene's own value: `amplitude` (of the coordinate that changes most, in units of the largest
     of its kind), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN where nothing is
     known. `uncertainty` of them. What it costs: `operations` of the equations of motion; `seconds` of a run of 100 turns, with
-    it less without; `compile`, seconds to trace and compile that run, with it less without; NaN where no time was taken. Small
-    differences of times are the clock's noise.
+    it less without; `compile`, seconds of processor to trace and compile that run, with it less without; NaN where no time was
+    taken. Small differences of times are the clock's noise.
     `advice`: "needed", "perhaps needed", "negligible", "cannot tell"; `says` why, and with which numbers.
     """
 
@@ -98,9 +98,9 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
     asked = (scene, end, start, None, control, None, 0, jnp.asarray(20.0, end.dtype), _MOST_STEPS, None)
     anew = eqx.filter_jit(lambda *given: integrate.__wrapped__(*given))  # pyright: ignore[reportFunctionMemberAccess]
     with compiled_anew():
-        begun = time.perf_counter()
+        begun = time.process_time()  # which others that compute beside do not change
         program = anew.lower(*asked).compile()  # pyright: ignore[reportFunctionMemberAccess]
-        compiling = time.perf_counter() - begun
+        compiling = time.process_time() - begun
     _, seconds, _ = timed(lambda: program(*asked).omega, repeats)
     return seconds, compiling
 
@@ -161,16 +161,21 @@ def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> E
 
 
 def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, str]:
-    """`advice` and `says` of a row."""
+    """`advice` and `says` of a row, where the motion is `new` with the effect and `old` without it."""
     wanted = "needed" if row.present or row.says == "as given" else "perhaps needed"
+    said = [row.says]
     if new != old:
-        other = f"without it: {old}; with it: {new}"
-        return {"advice": wanted, "says": "; ".join(filter(None, [row.says, other]))}
-    if math.isnan(row.change) or math.isnan(row.uncertainty):
-        return {"advice": "cannot tell", "says": "; ".join(filter(None, [row.says, f"no change is known: {new}"]))}
-    if row.change - row.uncertainty > accuracy:
-        return {"advice": wanted, "says": row.says}
-    if row.change + row.uncertainty <= accuracy:
-        return {"advice": "negligible", "says": row.says}
-    known = f"the motion repeats to {row.uncertainty:.1e} only"
-    return {"advice": "cannot tell", "says": "; ".join(filter(None, [row.says, known]))}
+        said.append(f"without it: {old}; with it: {new}")
+    if new != old and "unsettled" not in (new, old):
+        advice = wanted
+    elif math.isnan(row.change) or math.isnan(row.uncertainty):
+        advice = "cannot tell"
+        said.append(f"no change is known: {new}")
+    elif row.change - row.uncertainty > accuracy:
+        advice = wanted
+    elif row.change + row.uncertainty <= accuracy and new == old:
+        advice = "negligible"
+    else:
+        advice = "cannot tell"
+        said.append(f"the motion repeats to {row.uncertainty:.1e} only")
+    return {"advice": advice, "says": "; ".join(filter(None, said))}

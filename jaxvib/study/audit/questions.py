@@ -29,6 +29,9 @@ _APART = 0.05
 
 _ROUNDING = 1e-9
 
+_WINDOW = 100
+"""Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
+
 _GRID = 100
 """Load speeds among which an exact fold is looked for at once."""
 
@@ -114,7 +117,8 @@ class RunQuestion(NamedTuple):
 
     def full(self, scene: Scene) -> Values:
         """By the full equations."""
-        run = simulate(scene, self.until, start=self.state(scene), save="window", estimate=False, throw=False)
+        asked = dict(save="window", turns=_WINDOW, estimate=False, throw=False)
+        run = simulate(scene, self.until, start=self.state(scene), **asked)  # pyright: ignore[reportArgumentType]
         return _read(scene, run, math.nan)
 
     @classmethod

@@ -177,6 +177,8 @@ class Answers:
         (Values("jam", 10.0, (math.nan,), math.nan, math.nan, math.nan), True, "cannot tell"),
         (Values("no jam", math.nan, (math.nan,), math.nan, math.nan, math.nan), True, "needed"),
         (Values("balanced", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "needed"),
+        (Values("unsettled", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "cannot tell"),
+        (Values("unsettled", 10.0, (1.2,), 5.0, 20.0, 0.05), True, "needed"),
     ],
 )
 def test_advice(without, present, advice):
