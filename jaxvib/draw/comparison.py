@@ -133,11 +133,17 @@ def stability_chart(
     return figure
 
 
-def audit_chart(labels: Sequence[str], changes: Mapping[str, np.ndarray], accuracy: float, added: np.ndarray) -> Figure:
-    """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`; and
-    the operations that they add (n,), relative to those of the scene.
+def audit_chart(
+    labels: Sequence[str],
+    changes: Mapping[str, np.ndarray],
+    uncertainty: np.ndarray,
+    accuracy: float,
+    added: np.ndarray,
+) -> Figure:
+    """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`, grey
+    what cannot be told, below the `uncertainty` (n,); and the operations that they add (n,), relative to those of the scene.
 
-    >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, 0.01, np.array([0.05]))
+    >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
     >>> figure.axes[0].get_xlabel()
     'changes by, %'
     """
@@ -146,11 +152,16 @@ def audit_chart(labels: Sequence[str], changes: Mapping[str, np.ndarray], accura
     place = np.arange(n)
     shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
-    low = max(min([1.0 * accuracy, *shown]) / 3.0, 1e-8)
+    low = max(min([accuracy, *shown]) / 3.0, 1e-8)
+    unknown = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
+    left.hlines(place, low, unknown, color=_FLOOR, lw=14, label="cannot be told")
     for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
+        if not np.any(np.isfinite(values)):
+            continue
         # What is too small to be drawn stands on the edge.
-        left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name.replace("_", " "))
+        left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name)
     left.set_xscale("log")
+    left.set_xlim(left=low)
     left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="accuracy asked for")
     left.set_yticks(place, labels)
     left.set_ylim(n - 0.4, -0.6)

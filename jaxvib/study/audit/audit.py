@@ -85,10 +85,12 @@ class Audit(Result):
         """What each effect changes against the accuracy asked for, and what it costs. **Returns** a matplotlib figure."""
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 
-        changes = {name: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
-        labels = [f"{row.effect}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
+        told = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
+        changes = {told[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
+        labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
+        uncertainty = np.array([row.uncertainty for row in self.effects])
         added = np.array([row.operations for row in self.effects], float) / self.operations
-        return audit_chart(labels, changes, self.accuracy, added)
+        return audit_chart(labels, changes, uncertainty, self.accuracy, added)
 
 
 def audit(

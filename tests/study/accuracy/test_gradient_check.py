@@ -73,6 +73,30 @@ def test_noise_is_told_from_error():
     assert ends.status_name == "not_finite"
 
 
+def test_an_implicit_derivative_is_that_of_the_equation():
+    """x of b x^3 + k x = c, by hand: dx/dc = 1/(3 b x^2 + k); and the wrong equation is seen."""
+
+    def solved(scene):
+        b, k, c = scene.loads.drag, scene.loads.radius, scene.loads.mass
+        x = c / k
+        for _ in range(20):
+            x = x - (b * x**3 + k * x - c) / (3.0 * b * x**2 + k)
+        return x
+
+    def residual(scene, x):
+        return scene.loads.drag * x**3 + scene.loads.radius * x - scene.loads.mass
+
+    route = jv.ImplicitRoute(solution=solved, residual=residual, read=lambda s, x: 2.0 * x)
+    check = jv.check_gradients(SCENE, lambda s: 2.0 * solved(s), free=("loads.drag", "loads.mass"), implicit=route).require()
+    x = float(solved(SCENE))
+    by_hand = 2.0 / (3.0 * 0.5 * x**2 + 0.1) * np.array([-0.5 * x**3, 0.5])
+    numbers = [check.numbers.index(name) for name in ("loads.drag", "loads.mass")]
+    np.testing.assert_allclose(check.gradient[2, numbers], by_hand, rtol=1e-9)
+    wrong = route._replace(residual=lambda s, x: residual(s, -x))
+    assert jv.check_gradients(SCENE, lambda s: 2.0 * solved(s), implicit=wrong, routes=()).status_name == "differ"
+
+
+@pytest.mark.slow
 def test_a_jam_has_the_derivatives_that_its_equation_says():
     """jam_modes against the implicit function theorem on n(Omega) = n, and both against differences."""
 
