@@ -173,6 +173,7 @@ SEVERAL_PANELS = [
     "RunUps",
     "Capture",
     "Cost",
+    "Audit",
 ]
 
 

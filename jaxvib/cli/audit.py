@@ -24,7 +24,11 @@ from jaxvib.units import number
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Ask for a run from there, in place of a jam.")
 @click.option("--put-in/--no-put-in", default=True, show_default=True, help="Put in the effects that the scene leaves out.")
 @click.option(
-    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Timings; the fastest counts; 0 for no times."
+    "--repeats",
+    type=click.IntRange(min=0),
+    default=3,
+    show_default=True,
+    help="Timings; the fastest counts; 0: none.",
 )
 @click.option("--prices", "priced", is_flag=True, help="In place of SCENE: operations that effects, drives, coordinates add.")
 @WITHOUT

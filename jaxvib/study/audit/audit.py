@@ -17,6 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
+from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.accuracy.exact_reference import usual_mode
 from jaxvib.study.audit.compared import CHANGES, Asked, EffectRow, effect_row, field_operations
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
@@ -186,7 +187,7 @@ def _question(
             chosen = usual_mode(admitted(scene)) if mode is None else mode
             jammed = JamQuestion(chosen)
             if mode is not None:
-                jammed.state(scene)  # raises where there is no such mode
+                jam_modes(admitted(scene)).select(mode)  # raises where there is no such mode
             return jammed, f"jam mode {chosen} at {float(scene.drive.speed):.5g} rad/s"
         except InputError:
             if mode is not None:

@@ -83,8 +83,9 @@ class JamQuestion(NamedTuple):
         )
 
     def state(self, scene: Scene) -> State:
-        """Near the jam of light loads."""
-        return initial_state(admitted(scene), "jam", mode=self.mode, apart=_APART if scene.loads.count > 1 else 0.0)
+        """Near the jam of light loads; NaN where there is none."""
+        apart = _APART if scene.loads.count > 1 else 0.0
+        return initial_state(admitted(scene), "jam", mode=self.mode, apart=apart, throw=False)
 
     def full(self, scene: Scene) -> Values:
         """By the full equations, from near the jam of light loads, until nothing changes."""

@@ -14,7 +14,7 @@ import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.study.audit.compared import Asked, effect_row
 from jaxvib.study.audit.numbers import dimensionless_numbers, gravity_share
-from jaxvib.study.audit.questions import RunQuestion, Values, admitted
+from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
 from jaxvib.study.audit.variants import Variant, possible_variants, present_variants
 
 SCENE = jv.Scene(
@@ -252,6 +252,8 @@ def test_a_run_is_asked_for_where_there_is_no_jam():
     question = RunQuestion.usual(ROTOR, None, None)
     assert question.start == "rest" and question.until > 2.0 * 460.0 / 230.0
     assert not question.can(ROTOR) and admitted(ROTOR).effects == ()
+    slower = eqx.tree_at(lambda s: s.drive.speed, BARE, 20.0)
+    assert np.all(np.isnan(JamQuestion(3).state(slower).displacement))  # no jam there, and no error
     turning = RunQuestion.usual(SCENE, 3.0, None)
     assert turning == RunQuestion(3.0, "turning") and float(turning.state(SCENE).rate[0][0]) == 60.0
 
