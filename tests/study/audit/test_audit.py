@@ -12,8 +12,10 @@ from plugin_effect import SealFriction
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
+from jaxvib.machine.files import DRIVES, EFFECTS
 from jaxvib.study.audit.compared import Asked, effect_row
 from jaxvib.study.audit.numbers import dimensionless_numbers, gravity_share
+from jaxvib.study.audit.prices import prices
 from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
 from jaxvib.study.audit.variants import Variant, possible_variants, present_variants
 
@@ -121,6 +123,24 @@ def test_a_scene_without_an_effect_traces_the_program_from_before(scene):
     for effect, variant in zip(scene.effects, present_variants(scene, None), strict=False):
         left = tuple(each for each in scene.effects if each is not effect)
         assert program(variant.scene) == program(jv.Scene(scene.machine, scene.loads, scene.drive, left)) != program(scene)
+
+
+def test_every_effect_drive_and_coordinate_has_its_price_and_costs_nothing_where_it_is_not():
+    rows = {(row.part, row.kind): row for row in prices()}
+    assert {kind for part, kind in rows if part == "effect"} == set(EFFECTS)
+    assert {kind for part, kind in rows if part == "drive"} == set(DRIVES)
+    bare = rows["machine", "one_mass"]
+    # What was counted when this was written, and a little to spare: more says that something absent is traced.
+    assert bare.added == 0 and bare.operations == rows["drive", "constant_speed"].operations <= 185
+    assert all((row.added > 0) == (row.kind not in ("constant_speed", "one_mass", "ball")) for row in rows.values())
+    sizes = [
+        rows["machine", kind].operations for kind in ("planar_rotor", "rotor, loads at one station", "rotor, loads at stations")
+    ]
+    assert bare.operations < sizes[0] < sizes[1] < sizes[2] and rows["loads", "torus_ball"].added > 100
+    # Nor has a scene a state for what it has not.
+    state, motor = jv.initial_state(BARE), jv.Scene(BARE.machine, BARE.loads, jv.DCMotor(60.0, 20.0, 0.1))
+    assert state.rotor is None and len(jax.tree.leaves(state)) == 4 and state.displacement.shape == (1,)
+    assert len(jax.tree.leaves(jv.initial_state(motor))) == 6
 
 
 def test_what_is_put_in_is_not_multiplied_by_nothing():
