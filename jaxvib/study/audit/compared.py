@@ -34,7 +34,7 @@ class EffectRow(NamedTuple):
     """One effect: its name; `present`, whether the scene has it (it was taken out) or not (it was put in); by which `tier`.
 
     Changes by it, relative, of the scene's own value: `amplitude` (of the coordinate that changes most, in units of the largest
-    of its kind), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN where nothing is
+    of its kind, and in a machine that hardly moves of a hundredth of the loads' unbalance radius), `foundation_force`, `omega` of the loads, `fold` (the rotor speed at which the jam ends); NaN where nothing is
     known. `uncertainty` of them. What it costs: `operations` of the equations of motion; `seconds` of a run of 100 turns, with
     it less without; `compile`, seconds of processor to trace and compile that run, with it less without; NaN where no time was
     taken. Small differences of times are the clock's noise.
@@ -124,15 +124,21 @@ def field_operations(scene: Scene) -> int:
 
 def relative_changes(new: Values, old: Values, own: Values, units: tuple[str, ...]) -> dict[str, float]:
     """What changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
-    moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), np.asarray(own.amplitude)
+    moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
     shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(moved, units, strict=True)]
     known = [x for x in shares if not math.isnan(x)]
     found = {"amplitude": float(max(known, key=abs)) if known else math.nan}
     for name in CHANGES[1:]:
         before, after, scale = getattr(old, name), getattr(new, name), getattr(own, name)
+        scale = own.magnified * scale if name == "foundation_force" else scale
         found[name] = (after - before) / abs(scale) if scale else math.nan
     return found
+
+
+def _size(values: Values) -> float:
+    size = values.magnified * max(values.amplitude)
+    return size if size > 0.0 else math.nan
 
 
 def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
@@ -144,7 +150,8 @@ def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> E
     sizes = [(len(each.effects), len(admitted(each).effects)) for each in (scene, variant.scene)]
     if sizes[0][0] != sizes[1][0] and sizes[0][1] == sizes[1][1]:
         changes["fold"] = math.nan  # theories of jams leave the effect out of both
-    uncertainty = own.uncertainty + other.uncertainty
+    # The other one's, too, relative to this scene's own motion.
+    uncertainty = own.uncertainty + other.uncertainty * _size(other) / _size(own)
     sign = 1 if variant.present else -1
     cost = sign * (field_operations(scene) - field_operations(variant.scene))
     ours, theirs = ask.times(scene), ask.times(variant.scene)

@@ -12,6 +12,7 @@ from jaxvib.equations.collected import require_collected
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -32,6 +33,9 @@ _ROUNDING = 1e-9
 _WINDOW = 100
 """Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
 
+_LEAST = 0.01
+"""Amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to that."""
+
 _GRID = 100
 """Load speeds among which an exact fold is looked for at once."""
 
@@ -42,7 +46,8 @@ class Values(NamedTuple):
     **Attributes**: `kind` of motion, in words; `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad;
     `foundation_force` N; `fold`, the rotor speed (rad/s) at which the jam ends, NaN where there is none or none is asked for;
     `uncertainty`, relative, below which nothing of this can be told; `closest`: the least distance of two loads in units of
-    their diameter, NaN where they have none or the tier takes them as collected.
+    their diameter, NaN where they have none or the tier takes them as collected; `magnified`: changes are relative to so many
+    times these amplitudes and this force, more than 1 where the machine hardly moves, see `_LEAST`.
     """
 
     kind: str
@@ -52,6 +57,7 @@ class Values(NamedTuple):
     fold: float
     uncertainty: float
     closest: float = math.nan
+    magnified: float = 1.0
 
 
 class JamQuestion(NamedTuple):
@@ -186,15 +192,18 @@ def fold_speed(scene: Scene, omega: float) -> float:
 
 def _read(scene: Scene, run: Run, fold: float) -> Values:
     kind = status_name(run.regime.name) if bool(run.status == RunStatus.done) else f"failed: {status_name(run.status)}"
-    drift = float(run.drift)
+    drift, amplitude = float(run.drift), np.asarray(run.amplitude)
+    moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
+    magnified = max(1.0, _LEAST * float(natural_units(scene).displacement) / moved) if moved > 0.0 else 1.0
     return Values(
         kind,
         float(run.omega),
-        tuple(np.asarray(run.amplitude).tolist()),
+        tuple(amplitude.tolist()),
         float(run.foundation_force),
         fold,
-        max(drift, _ROUNDING) if np.isfinite(drift) else math.nan,
+        max(drift / magnified, _ROUNDING) if np.isfinite(drift) else math.nan,
         _closest(scene, run),
+        magnified,
     )
 
 

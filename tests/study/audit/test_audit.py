@@ -211,6 +211,14 @@ def test_advice(without, present, advice):
     assert effect_row(Asked(ask, 0), scene, variant, 0.01).advice == advice
 
 
+def test_a_balanced_machine_is_judged_by_what_its_loads_could_do():
+    still = Values("balanced", 10.0, (1e-12,), 1e-10, math.nan, 1e-9, magnified=1e9)
+    moved = still._replace(amplitude=(3e-12,), uncertainty=1e-7)
+    row = effect_row(Asked(Answers(with_=still, without=moved), 0), SCENE, Variant("gravity", True, BARE), 0.01)
+    np.testing.assert_allclose([row.amplitude, row.foundation_force, row.uncertainty], [-2e-9, 0.0, 3e-7 + 1e-9], rtol=1e-12)
+    assert row.advice == "negligible"
+
+
 def test_gravity_in_the_radial_load_is_what_the_bearing_paper_says():
     """The largest change over a turn of N = m (l f'^2 - g sin f), by `normal_force`: below 0.5 % above 157 rad/s only."""
     still = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
