@@ -149,10 +149,8 @@ def audit(
     ask = Asked(question, repeats)
     own = ask.values(scene, ask.tier(scene))
     until = question.until if isinstance(question, RunQuestion) else None
-    variants = [
-        *present_variants(scene, until),
-        *possible_variants(scene, [own.magnified * a for a in own.amplitude], possible),
-    ]
+    amplitude = [own.magnified * a for a in own.amplitude]
+    variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"
     if not np.isfinite(own.omega):
         status = "failed"
