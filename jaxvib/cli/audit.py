@@ -23,6 +23,7 @@ from jaxvib.units import number
 @click.option("--until", help="End of the run, such as 20s, where no jam is asked for [100 slow periods after the run-up].")
 @click.option("--start", type=click.Choice(["rest", "turning"]), help="Ask for a run from there, in place of a jam.")
 @click.option("--put-in/--no-put-in", default=True, show_default=True, help="Put in the effects that the scene leaves out.")
+@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Ask every tier.")
 @click.option(
     "--repeats",
     type=click.IntRange(min=0),
@@ -40,6 +41,7 @@ def audit(
     until: str | None,
     start: Literal["rest", "turning"] | None,
     put_in: bool,
+    tiers: bool,
     repeats: int,
     priced: bool,
     without: tuple[str, ...],
@@ -60,7 +62,8 @@ def audit(
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
     possible = None if put_in else ()
     loaded = loaded_scene(scene, without)
-    found = jv.audit(loaded, accuracy=share, mode=mode, until=until, start=start, possible=possible, repeats=repeats)
+    asked = dict(mode=mode, until=until, start=start, possible=possible, tiers=tiers, repeats=repeats)
+    found = jv.audit(loaded, accuracy=share, **asked)  # pyright: ignore[reportArgumentType]
     picture = output.file("audit.png")
     if picture is not None and found.effects:
         found.plot().savefig(picture)
@@ -76,11 +79,12 @@ def audit_text(found: jv.Audit) -> str:
     if rows:
         lines.append(table(f"what effects change, %; asked for {100.0 * found.accuracy:g} %", head, rows))
     lines += [f"{row.effect}: {row.says}" for row in found.effects if row.says]
-    tiers = [
+    offs = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
         for t in found.tiers
     ]
-    lines.append(table("tiers: off by, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], tiers))
+    if offs:
+        lines.append(table("tiers: off by, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
     lines += [f"{t.tier}: {t.says}" for t in found.tiers]
     if found.numbers:
         numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]

@@ -102,6 +102,7 @@ def audit(
     until: Number | None = None,
     start: Literal["rest", "turning"] | State | None = None,
     possible: Sequence[Effect] | None = None,
+    tiers: bool = True,
     repeats: int = 3,
 ) -> Audit:
     """What each effect changes and costs on a scene, and each tier; what the scene could leave out, and what it may lack.
@@ -121,6 +122,7 @@ def audit(
     - `start`: of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is asked
       for in any case; unless said otherwise "turning" where the rotor's speed is constant, "rest" elsewhere
     - `possible`: effects to put in, in place of those that the package knows; `()` for none
+    - `tiers`: whether every tier is asked as well
     - `repeats`: how often a run of 100 turns is timed, the fastest counts; 0 for no times, which saves a compilation for each
       effect
 
@@ -131,7 +133,7 @@ def audit(
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"), (jv.Gravity(),))
-    >>> found = jv.audit(scene, mode=1, possible=(), repeats=0)
+    >>> found = jv.audit(scene, mode=1, possible=(), tiers=False, repeats=0)
     >>> found.advised("needed"), found.advised("negligible")
     ([], ['gravity'])
 
@@ -170,7 +172,7 @@ def audit(
         seconds=seconds,
         compile=compiling,
         effects=[effect_row(ask, scene, variant, float(accuracy)) for variant in variants],
-        tiers=tier_rows(scene, question, own, repeats),
+        tiers=tier_rows(scene, question, own, repeats) if tiers else [],
         numbers=dimensionless_numbers(scene, own, accuracy),
         coordinates=scene.machine.structure().coordinates,
     )
