@@ -90,7 +90,7 @@ class CubicSupport(_Support):
         platform = which + 1 if carrier.axes == (1,) else None
         position = 0.0 if carrier.tilt is not None else None
         stiffness = jnp.max(jnp.abs(carrier.bed_stiffness[:, which])) * 0.04 / (3.0 * a**2)
-        return Typical(cls(stiffness, platform, position), "1 % stiffer in the mean at the amplitude")
+        return Typical(cls(stiffness, platform, position), f"1 % stiffer in the mean at a swing of {1e3 * float(a):.3g} mm")
 
     def support_potential(self, displacement: Array) -> Array:
         """k3 r^4 / 4."""

@@ -21,7 +21,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.accuracy.exact_reference import usual_mode
 from jaxvib.study.audit.compared import CHANGES, Asked, EffectRow, effect_row, field_operations
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
-from jaxvib.study.audit.questions import JamQuestion, RunQuestion, admitted
+from jaxvib.study.audit.questions import LEAST, JamQuestion, RunQuestion, admitted
 from jaxvib.study.audit.tiers import TierRow, tier_rows
 from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
@@ -110,7 +110,7 @@ def audit(
     Each effect of the scene is taken out, each that it has not and could have is put in, with usual numbers
     (`Effect.typical`), and the same question is asked of both scenes: of a scene that jams at a constant rotor speed, its jam,
     by the exact orbit or, where that is refused, by the full equations until nothing changes; of any other, where a run has
-    come to. What couples a rotor's tilts, and the limit of a motor's power, are taken out alike. Effects are asked for their
+    come to. Judged is that motion, not the way to it. What couples a rotor's tilts, and the limit of a motor's power, are taken out alike. Effects are asked for their
     properties, so that one of your own is audited as the package's are.
 
     **Arguments**
@@ -151,7 +151,8 @@ def audit(
     ask = Asked(question, repeats)
     own = ask.values(scene, ask.tier(scene))
     until = question.until if isinstance(question, RunQuestion) else None
-    amplitude = [own.magnified * a for a in own.amplitude]
+    # Of a machine that hardly moves, what its loads could do: their unbalance radius.
+    amplitude = [a * (own.magnified / LEAST if own.magnified > 1.0 else 1.0) for a in own.amplitude]
     variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
     status = "done"
     if not np.isfinite(own.omega):

@@ -168,6 +168,9 @@ def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> E
         advice="",
         says=variant.says,
     )
+    if isinstance(ask.question, JamQuestion) and tier == "full" and own.kind != "jammed":
+        lost = f"a run from the jam came to another motion ({own.kind})"
+        return row._replace(advice="cannot tell", says="; ".join(filter(None, [row.says, lost])))
     return row._replace(**_advice(row, new.kind, old.kind, accuracy))
 
 

@@ -23,7 +23,7 @@ from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
 from jaxvib.steady.orbits.orbit import OrbitStatus
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
-__all__ = ["JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
+__all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
 
 _APART = 0.05
 """How far from their middle the outermost loads start, rad: none stay together only because nothing parts them."""
@@ -33,7 +33,7 @@ _ROUNDING = 1e-9
 _WINDOW = 100
 """Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
 
-_LEAST = 0.01
+LEAST = 0.01
 """Amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to that."""
 
 _GRID = 100
@@ -47,7 +47,7 @@ class Values(NamedTuple):
     `foundation_force` N; `fold`, the rotor speed (rad/s) at which the jam ends, NaN where there is none or none is asked for;
     `uncertainty`, relative, below which nothing of this can be told; `closest`: the least distance of two loads in units of
     their diameter, NaN where they have none or the tier takes them as collected; `magnified`: changes are relative to so many
-    times these amplitudes and this force, more than 1 where the machine hardly moves, see `_LEAST`.
+    times these amplitudes and this force, more than 1 where the machine hardly moves, see `LEAST`.
     """
 
     kind: str
@@ -89,12 +89,15 @@ class JamQuestion(NamedTuple):
         )
 
     def state(self, scene: Scene) -> State:
-        """Near the jam of light loads; NaN where there is none."""
-        apart = _APART if scene.loads.count > 1 else 0.0
-        return initial_state(admitted(scene), "jam", mode=self.mode, apart=apart, throw=False)
+        """On the exact jam without what theories of jams leave out, loads a little apart; NaN where there is none."""
+        n = scene.loads.count
+        orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
+        displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
+        spread = _APART * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1))
+        return State(displacement, velocity, (angle + spread,), rate)
 
     def full(self, scene: Scene) -> Values:
-        """By the full equations, from near the jam of light loads, until nothing changes."""
+        """By the full equations, from near the exact jam, until nothing changes."""
         run = settle(scene, start=self.state(scene), throw=False)
         return _read(scene, run, fold_speed(admitted(scene), float(run.omega)))
 
@@ -194,7 +197,7 @@ def _read(scene: Scene, run: Run, fold: float) -> Values:
     kind = status_name(run.regime.name) if bool(run.status == RunStatus.done) else f"failed: {status_name(run.status)}"
     drift, amplitude = float(run.drift), np.asarray(run.amplitude)
     moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
-    magnified = max(1.0, _LEAST * float(natural_units(scene).displacement) / moved) if moved > 0.0 else 1.0
+    magnified = max(1.0, LEAST * float(natural_units(scene).displacement) / moved) if moved > 0.0 else 1.0
     return Values(
         kind,
         float(run.omega),

@@ -65,6 +65,9 @@ def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Val
     if not np.all(np.isfinite(amplitude)):
         status = getattr(found, "status", None)
         return TierRow(tier.name, False, *nothing, says="no such motion" if status is None else status_name(status))
+    says = tier.answers
+    if isinstance(question, JamQuestion) and isinstance(found, Values) and found.kind != "jammed":
+        says = f"the run left the jam: {found.kind}"
     off = (amplitude - size) / np.max(size)
     return TierRow(
         tier.name,
@@ -74,7 +77,7 @@ def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Val
         float(found.omega) / own.omega - 1.0,
         seconds,
         compiling,
-        tier.answers,
+        says,
     )
 
 
