@@ -110,8 +110,8 @@ def audit(
     Each effect of the scene is taken out, each that it has not and could have is put in, with usual numbers
     (`Effect.typical`), and the same question is asked of both scenes: of a scene that jams at a constant rotor speed, its jam,
     by the exact orbit or, where that is refused, by the full equations until nothing changes; of any other, where a run has
-    come to. Judged is that motion, not the way to it. What couples a rotor's tilts, and the limit of a motor's power, are taken out alike. Effects are asked for their
-    properties, so that one of your own is audited as the package's are.
+    come to. Judged is that motion, not the way to it. What couples a rotor's tilts, and the limit of a motor's power, are taken
+    out alike. Effects are asked for their properties, so that one of your own is audited as the package's are.
 
     **Arguments**
 
