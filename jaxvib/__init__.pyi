@@ -67,9 +67,13 @@ from jaxvib.study.maps.run_ups import run_ups
 
 # What accuracy costs
 from jaxvib.study.accuracy.cost import Cost
+from jaxvib.study.accuracy.gradient_check import GradientCheck, GradientStatus, ImplicitRoute, check_gradients
 from jaxvib.study.accuracy.harmonics import harmonic_convergence
 from jaxvib.study.accuracy.tiers import compare_tiers
 from jaxvib.study.accuracy.work_precision import work_precision
+
+# What effects are worth
+from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
@@ -192,6 +196,14 @@ __all__ = [
     "compare_tiers",
     "harmonic_convergence",
     "Cost",
+    "check_gradients",
+    "GradientCheck",
+    "GradientStatus",
+    "ImplicitRoute",
+    # What effects are worth
+    "audit",
+    "Audit",
+    "AuditStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",

@@ -4,9 +4,6 @@ A budget is what was counted when it was written down, with a tenth to spare. On
 more often than before: make it less, or raise the budget together with the reason.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -14,32 +11,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-
-
-def operations(function: Callable[..., Any], *arguments: Any) -> int:
-    """Operations of the program that `function` is traced to, those of loop bodies and of called programs counted once."""
-    return sum(1 for _ in _walk(jax.make_jaxpr(function)(*arguments).jaxpr))
-
-
-def _walk(jaxpr: Any) -> Iterator[Any]:
-    for equation in jaxpr.eqns:
-        inner = [each for value in equation.params.values() for each in _programs(value)]
-        if inner:
-            for each in inner:
-                yield from _walk(each)
-        else:
-            yield equation
-
-
-def _programs(value: Any) -> Iterator[Any]:
-    if hasattr(value, "jaxpr"):
-        yield value.jaxpr
-    elif hasattr(value, "eqns"):
-        yield value
-    elif isinstance(value, (list, tuple)):
-        for each in value:
-            yield from _programs(each)
-
+from jaxvib.runtime.operations import operations
 
 SCENE = scene("two_mass", "balls")
 START = jv.initial_state(SCENE, "rest")

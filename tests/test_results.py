@@ -25,6 +25,10 @@ from jaxvib.steady.orbits.diagram import SpecialPoint
 from jaxvib.study.accuracy.cost import CostRow
 from jaxvib.study.accuracy.harmonics import HarmonicConvergence
 from jaxvib.study.accuracy.tiers import Tiers, TierValues
+from jaxvib.study.audit.audit import AuditStatus
+from jaxvib.study.audit.compared import EffectRow
+from jaxvib.study.audit.numbers import NumberRow
+from jaxvib.study.audit.tiers import TierRow
 from jaxvib.study.capture.capture import _judged
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
@@ -72,6 +76,26 @@ def synthesis():
     rest = dict(unverified="not asked for", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
     found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]), history=np.ones((3, 2)))
     return Synthesis(scene=SCENE, before=outcome, after=outcome, verified=None, run=None, **rest, **found)
+
+
+def audited():
+    rows = [
+        EffectRow("gravity", True, "exact orbit", 0.1, 0.2, np.nan, 1e-3, 1e-9, 14, 0.1, 0.2, "needed", ""),
+        EffectRow("stop", False, "full", 1e-5, 0.0, 0.0, np.nan, 1e-9, 60, np.nan, np.nan, "negligible", "as given"),
+    ]
+    tiers = [TierRow("leading order", False, *[np.nan] * 5, says="refused"), TierRow("full", True, *[1e-3] * 5, says="all")]
+    numbers = [NumberRow("lift: R / (M g)", 2.0, 1.0, "perhaps needed", "springs would have to pull")]
+    own = dict(kind="jam mode 1", omega=27.0, amplitude=np.ones(1), foundation_force=9.0, fold=90.0, coordinates=("y1",))
+    cost = dict(operations=200, seconds=0.1, compile=2.0, effects=rows, tiers=tiers, numbers=numbers)
+    return jv.Audit(status=AuditStatus.done, accuracy=0.01, question="jam mode 1 at 60 rad/s", **own, **cost)
+
+
+def checked_gradients():
+    shape = np.array([[1.0, 2.0], [1.0, 2.1]])
+    found = dict(gradient=shape, error=0.1 * shape, difference=shape[0], noise=1e-9 * shape[0], step=np.array([1e-4, 1e-3]))
+    names = dict(numbers=("machine.mass", "loads.drag"), at=np.ones(2), routes=("forward", "reverse"))
+    swept = dict(steps=np.array([1e-2, 1e-3, 1e-4]), sweep=np.ones((2, 3)), tolerance=1e-5, left_out=("machine.damping",))
+    return jv.GradientCheck(status=jv.GradientStatus.differ, value=3.0, **names, **found, **swept)
 
 
 def cached(make):
@@ -128,6 +152,8 @@ RESULTS = {
         np.array([0.1, 0.2]), np.ones((2, 3)), np.ones((2, 3), bool), ((), (SpecialPoint("torus", 1.0, 2.0),))
     ),
     "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
+    "Audit": audited,
+    "GradientCheck": checked_gradients,
     "Synthesis": synthesis,
 }
 
@@ -147,6 +173,7 @@ SEVERAL_PANELS = [
     "RunUps",
     "Capture",
     "Cost",
+    "Audit",
 ]
 
 

@@ -105,6 +105,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
+    "audit": "audit",
     "capture": "capture",
     "cost": "cost",
     "identify": "identify",

@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["CostPanel", "convergence_chart", "cost_chart", "stability_chart", "tiers_chart"]
+__all__ = ["CostPanel", "audit_chart", "convergence_chart", "cost_chart", "stability_chart", "steps_chart", "tiers_chart"]
 
 
 def tiers_chart(
@@ -130,4 +130,70 @@ def stability_chart(
     axes.set_xlabel("speed of loads, rad/s")
     axes.set_ylabel(label)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def audit_chart(
+    labels: Sequence[str],
+    changes: Mapping[str, np.ndarray],
+    uncertainty: np.ndarray,
+    accuracy: float,
+    added: np.ndarray,
+) -> Figure:
+    """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`, grey
+    what cannot be told, below the `uncertainty` (n,); and the operations that they add (n,), relative to those of the scene.
+
+    >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
+    >>> figure.axes[0].get_xlabel()
+    'changes by, %'
+    """
+    n = len(labels)
+    figure, (left, right) = panels(1, 2, size=(6.0, 1.6 + 0.34 * max(n, 3)))
+    place = np.arange(n)
+    shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    low = max(min([accuracy, *shown]) / 3.0, 1e-8)
+    unknown = np.maximum(100.0 * np.nan_to_num(uncertainty), low)
+    left.hlines(place, low, unknown, color=_FLOOR, lw=14, label="cannot be told")
+    for color, mark, (name, values) in zip(COLORS, "os^D", changes.items(), strict=False):
+        if not np.any(np.isfinite(values)):
+            continue
+        # What is too small to be drawn stands on the edge.
+        left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name)
+    left.set_xscale("log")
+    left.set_xlim(left=low)
+    left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="accuracy asked for")
+    left.set_yticks(place, labels)
+    left.set_ylim(n - 0.4, -0.6)
+    left.set_xlabel("changes by, %")
+    left.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=3, fontsize=9)
+    right.barh(place, 100.0 * added, color=COLORS[0], height=0.55)
+    right.set_yticks(place, [])
+    right.set_ylim(n - 0.4, -0.6)
+    right.set_xlabel("operations that it adds, % of the scene's")
+    return figure
+
+
+def steps_chart(
+    steps: np.ndarray,
+    off: np.ndarray,
+    best: np.ndarray,
+    at_best: np.ndarray,
+    tolerance: float,
+    *,
+    names: Sequence[str],
+    route: str,
+    ax: Axes | None = None,
+) -> Figure:
+    """Central differences against a derivative, relative, `off` (n, k) over their relative `steps` (k,), a line for each of n
+    names; rings where they are `best` (n,), extrapolated (`at_best`, (n,)); dotted the tolerance."""
+    figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
+    floor = np.finfo(float).eps
+    for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
+        axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
+        axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
+    axes.axhline(tolerance, color="black", ls=":", lw=1.2)
+    axes.set_xlabel("step, relative")
+    axes.set_ylabel(f"differences against {route} mode")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
     return figure

@@ -27,6 +27,8 @@ from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
 
 __all__ = [
+    "DRIVES",
+    "EFFECTS",
     "TEMPLATES",
     "Tables",
     "called",
@@ -48,14 +50,14 @@ _MACHINES = {
     "rotor": rotor,
 }
 _LOADS = {"ball": balls, "roller": rollers, "pendulum": pendulums, "torus_ball": torus_balls}
-_DRIVES = {
+DRIVES = {
     "constant_speed": ConstantSpeed,
     "spin_up": SpinUp,
     "run_up": RunUp,
     "dc_motor": DCMotor,
     "induction_motor": InductionMotor,
 }
-_EFFECTS = {
+EFFECTS = {
     "gravity": Gravity,
     "static_imbalance": StaticImbalance,
     "moment_imbalance": MomentImbalance,
@@ -65,7 +67,7 @@ _EFFECTS = {
     "stop": Stop,
     "load_contact": LoadContact,
 }
-_SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": _DRIVES}
+_SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
 
 T = TypeVar("T")
@@ -185,14 +187,14 @@ def scene_from_tables(tables: Tables) -> Scene:
     if not isinstance(chosen, Mapping):
         raise InputError("effects", "is not a table; write [effects] and below it, for example, gravity = true")
     for name, value in chosen.items():
-        if name not in _EFFECTS:
-            raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(_EFFECTS))}")
+        if name not in EFFECTS:
+            raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(EFFECTS))}")
         if isinstance(value, Mapping):
-            effects.append(called(_EFFECTS[name], value, f"effects.{name}"))
-        elif isinstance(value, list) and _EFFECTS[name].repeatable and all(isinstance(each, Mapping) for each in value):
-            effects += [called(_EFFECTS[name], each, f"effects.{name}[{index}]") for index, each in enumerate(value)]
+            effects.append(called(EFFECTS[name], value, f"effects.{name}"))
+        elif isinstance(value, list) and EFFECTS[name].repeatable and all(isinstance(each, Mapping) for each in value):
+            effects += [called(EFFECTS[name], each, f"effects.{name}[{index}]") for index, each in enumerate(value)]
         elif value is True:
-            effects.append(called(_EFFECTS[name], {}, f"effects.{name}"))
+            effects.append(called(EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
             raise InputError(f"effects.{name}", f"is {value!r}; write true, false or a table of its arguments")
     return Scene(**parts, effects=tuple(effects))
@@ -223,7 +225,7 @@ def called(build: Callable[..., T], values: Mapping[str, object], section: str) 
 
 def rebuilt(part: Any, section: str) -> Any:
     """A part of a scene made anew from its numbers by its constructor, which checks them; itself where no file can hold it."""
-    build = {**_MACHINES, **_LOADS, **_DRIVES, **_EFFECTS}.get(part.kind)
+    build = {**_MACHINES, **_LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
     return called(build, _fields(part, build), section)
@@ -252,7 +254,7 @@ def scene_to_toml(scene: Scene) -> str:
         tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
     tables["effects"] = {}
     for effect in scene.effects:
-        fields = _fields(effect, _EFFECTS[effect.kind])
+        fields = _fields(effect, EFFECTS[effect.kind])
         if effect.repeatable:
             tables["effects"].setdefault(effect.kind, []).append(fields)
         else:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -11,7 +13,7 @@ import jax
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import user_folder
 
-__all__ = ["default_folder", "use_cache"]
+__all__ = ["compiled_anew", "default_folder", "use_cache"]
 
 _folder: list[Path] = []
 
@@ -69,6 +71,20 @@ def keep_programs(folder: Path | None) -> None:
 def program_folder() -> Path | None:
     """Where traced programs are cached; None where they are not."""
     return _folder[0] if _folder else None
+
+
+@contextlib.contextmanager
+def compiled_anew() -> Iterator[None]:
+    """In here no program is read from the disk or written there: what compiling takes can be measured, of programs that this
+    process has not compiled yet."""
+    folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
+    keep_programs(None)
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        yield
+    finally:
+        keep_programs(folder)
+        jax.config.update("jax_enable_compilation_cache", enabled)
 
 
 def require_own(folder: Path) -> None:

@@ -15,7 +15,20 @@ from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.loads import Loads, Pressing
 from jaxvib.units import Number, number
 
-__all__ = ["Effect", "Friction", "Gravity", "Imbalance", "MomentImbalance", "StaticImbalance", "total_gravity"]
+__all__ = [
+    "BALANCE_GRADE",
+    "Effect",
+    "Friction",
+    "Gravity",
+    "Imbalance",
+    "MomentImbalance",
+    "StaticImbalance",
+    "Typical",
+    "total_gravity",
+]
+
+BALANCE_GRADE = 6.3e-3
+"""Eccentricity times speed of a rotor of an ordinary machine, m/s: grade G6.3 of ISO 21940-11."""
 
 
 _AXES = {"up": 1, "axis": 2}
@@ -64,6 +77,13 @@ class Imbalance(NamedTuple):
     moment: tuple[Array, Array]
 
 
+class Typical(NamedTuple):
+    """An `effect` with usual numbers, for a scene that leaves it out, and what `says` which numbers these are."""
+
+    effect: Effect
+    says: str
+
+
 def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
     """The acceleration of gravity of a scene with these `effects`, m/s^2, by the axis it pulls against; see `Effect`."""
     total: dict[int, Array] = {}
@@ -105,6 +125,12 @@ class Effect(eqx.Module):
         """The acceleration of gravity that the effect brings into the scene, m/s^2, by the axis of a load's position (0 across,
         1 up, 2 along the rotor's axis) that it pulls against; {} where it brings none."""
         return {}
+
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
+        """The effect with usual numbers, as it may be in a `machine` with these `loads` whose scene leaves it out, for an audit
+        to put in; None where no number is usual. `speed` of the rotor, rad/s; `amplitude` (nd,) of the motion, m or rad."""
+        return None
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
@@ -203,6 +229,13 @@ class Gravity(Effect):
         self.along = along
         self.kind = "gravity"
 
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
+        """In the rotor's plane, along the axis where loads move there."""
+        if len(jax.eval_shape(loads.position, *loads.rest())) > _AXES["axis"]:
+            return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, where that is vertical")
+        return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, where the axis lies level")
+
     @property
     def gravity(self) -> dict[int, Array]:
         """g, against the direction it is given for."""
@@ -247,6 +280,12 @@ class StaticImbalance(Effect):
         self.angle = number(angle, "rad", "effects.static_imbalance.angle")
         self.kind = "static_imbalance"
 
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
+        """`BALANCE_GRADE` of all the mass that the rotor moves."""
+        moment = _carried(machine)[0] * BALANCE_GRADE / speed
+        return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m, grade G6.3 of all the mass that moves with the rotor")
+
     def imbalance(self, angle: Array) -> Imbalance:
         """M e (cos, sin) of the heavy side."""
         zero = jnp.zeros_like(self.moment)
@@ -282,6 +321,15 @@ class MomentImbalance(Effect):
         self.angle = number(angle, "rad", "effects.moment_imbalance.angle")
         self.kind = "moment_imbalance"
 
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
+        """`BALANCE_GRADE` at the radius of gyration on either side, where the machine can tilt."""
+        mass, inertia = _carried(machine)
+        if inertia is None:
+            return None
+        moment = jnp.sqrt(mass * inertia) * BALANCE_GRADE / speed
+        return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m^2, grade G6.3 at the radius of gyration")
+
     def imbalance(self, angle: Array) -> Imbalance:
         """(A - C) delta (cos, sin) of the moment."""
         zero = jnp.zeros_like(self.moment)
@@ -292,3 +340,12 @@ class MomentImbalance(Effect):
         """A machine that can tilt."""
         if machine.carrier().tilt is None:
             raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {machine.kind!r}")
+
+
+def _carried(machine: Machine) -> tuple[Array, Array | None]:
+    """The mass (kg) that a force at the port meets, and the inertia (kg m^2) that a moment meets; None where nothing tilts."""
+    carrier = machine.carrier()
+    mass = 1.0 / (carrier.port @ jnp.linalg.solve(carrier.mass, carrier.port.T))[0, 0]
+    if carrier.tilt is None:
+        return mass, None
+    return mass, 1.0 / (carrier.tilt @ jnp.linalg.solve(carrier.mass, carrier.tilt.T))[0, 0]

@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import Effect, Friction
+from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.units import Number, number
 
@@ -92,6 +92,15 @@ class DryFriction(Effect):
             raise InputError(f"{field}.reaction", f"is {reaction!r}; allowed: {', '.join(get_args(Reaction))}")
         self.reaction = reaction
         self.kind = "dry_friction"
+
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
+        """A ball bearing as wide as a fifth of the loads' radius."""
+        if not loads.circular:
+            return None
+        assert isinstance(loads, CircularLoads)
+        diameter = 0.2 * jnp.max(loads.radius)
+        return Typical(cls(0.0015, diameter), f"a ball bearing, mu2 = 0.0015, of {1e3 * float(diameter):.3g} mm")
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads on a circle that hang on bearings."""

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import Effect, Friction
+from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.effects.friction import sliding_sign
 from jaxvib.machine.loads import Loads
 from jaxvib.units import Number, number
@@ -63,6 +63,11 @@ class RollingFriction(Effect):
             raise InputError(f"{field}.direction", f"is {direction!r}; allowed: {', '.join(get_args(Direction))}")
         self.direction = direction
         self.kind = "rolling_friction"
+
+    @classmethod
+    def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
+        """Steel on steel."""
+        return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads that roll and press on a track."""

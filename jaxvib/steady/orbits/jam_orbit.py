@@ -23,7 +23,7 @@ from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
 from jaxvib.units import Number, count, number, traced
 
-__all__ = ["exact_mode_speeds", "jam_orbit"]
+__all__ = ["branch_at", "exact_mode_speeds", "jam_orbit"]
 
 _POINTS = (16, 32, 64, 128)
 """Points on half a period, tried in turn until the asked accuracy holds."""
@@ -210,7 +210,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
     crowded = np.sort(np.append(crowded, target))
     omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
-    speed, slope = (np.ravel(x) for x in _branch(scene, jnp.asarray(omega).reshape(-1, _LANES)))
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
     known = np.isfinite(speed)
     omega, speed = _between(omega[known], speed[known], slope[known])
     rising = speed[1:] > speed[:-1]
@@ -240,8 +240,9 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 
 
 @cached
-def _branch(scene: Scene, omega: Array) -> tuple[Array, Array]:
-    """Rotor speeds and slopes of exact jams at load speeds, in batches; NaN where there is none."""
+def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
+    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
+    none."""
     model = collected_model(linear_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 

@@ -15,7 +15,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
 
-__all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_period", "unstable"]
+__all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_period", "unstable", "usual_mode"]
 
 
 SLOW_PERIODS, MOST_PERIODS = 20.0, 2000.0
@@ -43,13 +43,20 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
     """
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed")
-    modes = jam_modes(scene)
-    if mode is None:
-        rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
-        if not rising:
-            raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
-        mode = rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
+    mode = usual_mode(scene) if mode is None else mode
     return ExactJam(mode, *(jam_orbit(scene, mode=mode, points=collocation_points(scene, points)) for points in (32, 24)))
+
+
+def usual_mode(scene: Scene) -> int:
+    """The jam mode that is asked about where none is named: the last but one that is stable by its slope.
+
+    **Raises** `InputError` where no mode is stable, and as `jam_modes`.
+    """
+    modes = jam_modes(scene)
+    rising = [k for k in modes.mode_numbers() if bool(modes.select(k).stable)]
+    if not rising:
+        raise InputError("mode", "is missing, and no jam mode of this scene is stable by its slope; give one")
+    return rising[-2] if len(rising) > 1 else rising[-1]  # the last one turns with the rotor, nearly
 
 
 def collocation_points(scene: Scene, points: int) -> int:

@@ -42,11 +42,13 @@ class JamValues(Protocol):
 class Tier(NamedTuple):
     """A way to compute a jam.
 
-    **Attributes**: `name`; `require(scene)` raises `InputError`, which names the property that a part of the scene lacks, where
-    the tier cannot answer; `jam(scene, mode, until)` the jam mode's result, until a time (s) where the tier integrates in time.
+    **Attributes**: `name`; `answers`: which questions, in words; `require(scene)` raises `InputError`, which names the property
+    that a part of the scene lacks, where the tier cannot answer; `jam(scene, mode, until)` the jam mode's result, until a time
+    (s) where the tier integrates in time.
     """
 
     name: str
+    answers: str
     require: Callable[[Scene], object]
     jam: Callable[[Scene, int, float], JamValues]
 
@@ -67,13 +69,29 @@ class Tier(NamedTuple):
 
 
 TIERS = (
-    Tier("leading order", jammed_loads, lambda scene, mode, until: jam_modes(scene).select(mode, throw=False)),
-    Tier("exact orbit", require_collected, lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False)),
+    Tier(
+        "leading order",
+        "every jam of light loads, folds; no harmonics, no way there",
+        jammed_loads,
+        lambda scene, mode, until: jam_modes(scene).select(mode, throw=False),
+    ),
+    Tier(
+        "exact orbit",
+        "the periodic motion of a jam, all harmonics, its stability; no way there",
+        require_collected,
+        lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False),
+    ),
     Tier(
         "envelope",
+        "run-ups and jams of light loads; no harmonics",
         averaged_loads,
         lambda scene, mode, until: envelope(scene, until, start="jam", mode=mode, save="window", throw=False),
     ),
-    Tier("full", lambda scene: None, lambda scene, mode, until: settle(scene, mode=mode, throw=False)),
+    Tier(
+        "full",
+        "every motion of every scene in time; no unstable jam",
+        lambda scene: None,
+        lambda scene, mode, until: settle(scene, mode=mode, throw=False),
+    ),
 )
 """From the cheapest to the one that answers for every scene."""

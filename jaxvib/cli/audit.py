@@ -1,0 +1,115 @@
+"""jaxvib audit."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Literal
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.errors import InputError
+from jaxvib.study.audit.compared import EffectRow
+from jaxvib.study.audit.prices import PriceRow, prices
+from jaxvib.units import number
+
+
+@app.command("audit")
+@click.argument("scene", type=click.Path(path_type=Path), required=False)
+@click.option("--accuracy", default="1%", show_default=True, help="Relative change below which an effect is negligible.")
+@click.option("--mode", type=int, help="Number of the jam mode [the last below the rotor's own speed that is stable].")
+@click.option("--until", help="End of the run, such as 20s, where no jam is asked for [100 slow periods after the run-up].")
+@click.option("--start", type=click.Choice(["rest", "turning"]), help="Ask for a run from there, in place of a jam.")
+@click.option("--put-in/--no-put-in", default=True, show_default=True, help="Put in the effects that the scene leaves out.")
+@click.option("--tiers/--no-tiers", default=True, show_default=True, help="Ask every tier.")
+@click.option(
+    "--repeats",
+    type=click.IntRange(min=0),
+    default=3,
+    show_default=True,
+    help="Timings; the fastest counts; 0: none.",
+)
+@click.option("--prices", "priced", is_flag=True, help="In place of SCENE: operations that effects, drives, coordinates add.")
+@WITHOUT
+@shared
+def audit(
+    scene: Path | None,
+    accuracy: str,
+    mode: int | None,
+    until: str | None,
+    start: Literal["rest", "turning"] | None,
+    put_in: bool,
+    tiers: bool,
+    repeats: int,
+    priced: bool,
+    without: tuple[str, ...],
+    output: Output,
+) -> None:
+    """What each effect of SCENE changes and costs, and each tier; what it could leave out, and what it may lack.
+
+    Each effect is taken out, and each that the scene has not and could have is put in with usual numbers. --out adds the
+    figure."""
+    if priced:
+        if scene is not None:
+            raise InputError("--prices", "goes without a scene; leave one of them out")
+        rows = prices()
+        output.done({"prices": [row._asdict() for row in rows]}, lambda: _prices_table(rows), "prices")
+        return
+    if scene is None:
+        raise InputError("SCENE", "is missing; give the path of a scene file, or --prices")
+    share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
+    possible = None if put_in else ()
+    loaded = loaded_scene(scene, without)
+    asked = dict(mode=mode, until=until, start=start, possible=possible, tiers=tiers, repeats=repeats)
+    found = jv.audit(loaded, accuracy=share, **asked)  # pyright: ignore[reportArgumentType]
+    picture = output.file("audit.png")
+    if picture is not None and found.effects:
+        found.plot().savefig(picture)
+    output.done(found.as_dict(), lambda: audit_text(found), "audit")
+
+
+def audit_text(found: jv.Audit) -> str:
+    """An `Audit` as a person reads it."""
+    took = "" if math.isnan(found.seconds) else f", a run of 100 turns {found.seconds:.2g} s, compiled in {found.compile:.2g} s"
+    lines = [f"{found.question}: {found.kind}; {found.message}", f"equations of motion: {found.operations} operations{took}"]
+    head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]
+    rows = [_effect(row, found) for row in found.effects]
+    if rows:
+        lines.append(table(f"what effects change, %; asked for {100.0 * found.accuracy:g} %", head, rows))
+    lines += [f"{row.effect}: {row.says}" for row in found.effects if row.says]
+    offs = [
+        [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]
+        for t in found.tiers
+    ]
+    if offs:
+        lines.append(table("tiers: off by, %", ["tier", "amplitude", "force", "load speed", "seconds", "first call, s"], offs))
+    lines += [f"{t.tier}: {t.says}" for t in found.tiers]
+    if found.numbers:
+        numbers = [[n.name, f"{n.value:.3g}", f"{n.limit:.3g}", n.advice] for n in found.numbers]
+        lines.append(table("not modelled: what numbers say", ["number", "value", "limit", "advice"], numbers))
+        lines += [f"{n.name.partition(':')[0]}: {n.says}" for n in found.numbers]
+    return "\n".join(lines)
+
+
+def _effect(row: EffectRow, found: jv.Audit) -> list[str]:
+    name = row.effect if row.present else f"({row.effect})"
+    changes = map(_percent, (row.amplitude, row.foundation_force, row.omega, row.fold))
+    cost = [f"{row.operations:+d}"]
+    for mine, whole in ((row.seconds, found.seconds), (row.compile, found.compile)):
+        cost.append("" if math.isnan(mine) else f"{100.0 * mine / whole:+.0f} %")
+    return [name, row.advice, *changes, row.tier.replace("exact orbit", "exact"), *cost]
+
+
+def _percent(share: float) -> str:
+    return "" if math.isnan(share) else f"{100.0 * share:+.2g}"
+
+
+def _seconds(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.2g}"
+
+
+def _prices_table(rows: list[PriceRow]) -> str:
+    cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.beside] for row in rows]
+    return table("operations of the traced equations of motion", ["part", "operations", "adds", "beside"], cells)

@@ -1,0 +1,297 @@
+"""Derivatives of any quantity of a scene against finite differences whose own error is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.checked import checked
+from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import member
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["GradientCheck", "GradientStatus", "ImplicitRoute", "check_gradients"]
+
+_RATIO = math.sqrt(10.0)
+_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
+"""Relative steps of the sweep; each is `_RATIO` times the next."""
+
+_SMALL = 1e-3
+"""Derivatives are judged relative to themselves, but for those below this share of the largest: relative to that."""
+
+_SAFETY = 3.0
+"""Differences within so many times what finite differences may be off say nothing."""
+
+
+class GradientStatus(eqx.Enumeration):
+    """What came of a check; the members are the sentences a user reads."""
+
+    agree = "every derivative agrees with finite differences"
+    differ = "derivatives differ from finite differences by more than was asked for and these may be off"
+    noisy = "no derivative differs, but finite differences are too noisy to tell to the tolerance that was asked for"
+    not_finite = "a derivative, or the quantity beside the point, is not a finite number"
+
+
+class ImplicitRoute(NamedTuple):
+    """A quantity read off what solves an equation: `read(scene, x)` where `residual(scene, x)` = 0, with `solution(scene)` = x.
+
+    Its derivative by the implicit function theorem is d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp). x is an array
+    (n,) or a scalar, the residual as long.
+    """
+
+    solution: Callable[[Scene], Array]
+    residual: Callable[[Scene, Array], Array]
+    read: Callable[[Scene, Array], Array]
+
+
+class GradientCheck(Result):
+    """Derivatives of a quantity by the numbers p of a scene, route by route, against finite differences.
+
+    All derivatives are p dq/dp, what a relative change of the number changes, in the quantity's own unit. **Attributes**
+    (n numbers, r routes, k steps): `value` of the quantity; `numbers`: their names (n,), `at` their values (n,) in SI;
+    `routes`: their names (r,); `gradient` (r, n); `difference` (n,) by finite differences, `noise` (n,) what these may be off,
+    `step` (n,) relative, the best one; `error` (r, n) of each route against them, relative; `steps` (k,) of the sweep and
+    `sweep` (n, k) the central differences at each; `tolerance`; `left_out`: numbers that are 0, of which no relative step can
+    be made.
+    """
+
+    status: GradientStatus
+    value: float = eqx.field(metadata=in_unit(""))
+    numbers: tuple[str, ...]
+    at: np.ndarray = eqx.field(metadata=in_unit("SI", "number"))
+    routes: tuple[str, ...]
+    gradient: np.ndarray = eqx.field(metadata=in_unit("", "route", "number"))
+    difference: np.ndarray = eqx.field(metadata=in_unit("", "number"))
+    noise: np.ndarray = eqx.field(metadata=in_unit("", "number"))
+    step: np.ndarray = eqx.field(metadata=in_unit("", "number"))
+    error: np.ndarray = eqx.field(metadata=in_unit("", "route", "number"))
+    steps: np.ndarray = eqx.field(metadata=in_unit("", "step"))
+    sweep: np.ndarray = eqx.field(metadata=in_unit("", "number", "step"))
+    tolerance: float = eqx.field(metadata=in_unit(""))
+    left_out: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """A line for each number, the worst first, for a person to read."""
+        scale = _scale(self.difference)
+        with np.errstate(invalid="ignore"):
+            worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
+        lines = [f"{self.message} (asked for {self.tolerance:.0e}, relative)"]
+        for i in np.argsort(-worst):
+            found = ", ".join(f"{route} off by {self.error[k, i]:.1e}" for k, route in enumerate(self.routes))
+            floor = f"finite differences good to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
+            lines.append(f"  {self.numbers[i]}: {self.difference[i]:.9g}; {found}; {floor}")
+        if self.left_out:
+            lines.append(f"  not asked, they are 0: {', '.join(self.left_out)}")
+        return "\n".join(lines)
+
+    def require(self) -> GradientCheck:
+        """Itself where every derivative agrees. **Raises** `ComputationError` with the summary elsewhere: `differ`, `noisy`,
+        `not_finite`."""
+        if not bool(self.status == GradientStatus.agree):
+            raise ComputationError(self.status_name, self.summary())
+        return self
+
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Central differences against the first route over their step, a line for each number, and where they were best.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
+        from jaxvib.draw.comparison import steps_chart  # slow to import: only who draws pays
+
+        off = np.abs(self.sweep - self.gradient[0][:, None]) / _scale(self.difference)[:, None]
+        best = np.abs(self.difference - self.gradient[0]) / _scale(self.difference)
+        return steps_chart(self.steps, off, self.step, best, self.tolerance, names=self.numbers, route=self.routes[0], ax=ax)
+
+
+def check_gradients(
+    scene: Scene,
+    quantity: Callable[[Scene], ArrayLike],
+    *,
+    free: Sequence[str] | None = None,
+    routes: Sequence[str] = ("forward", "reverse"),
+    implicit: ImplicitRoute | None = None,
+    tolerance: float = 1e-5,
+) -> GradientCheck:
+    """Whether the derivatives of a quantity of a scene are right: each route against finite differences, for your own tests.
+
+    Each number p of the scene is moved by relative steps from 1e-2 to 1e-7, and central differences
+
+        D(h) = (q(p + h p) - q(p - h p)) / (2 h),      E(h) = D(h/r) + (D(h/r) - D(h)) / (r^2 - 1),      r = sqrt 10
+
+    are extrapolated once, E. Best is the step where E agrees best with those at the next larger and the next smaller one; the
+    larger of both differences is what E may be off, the noise: truncation at large steps, rounding (eps |q|/h at least) and
+    the quantity's own tolerance at small ones. A derivative differs where it is away from E by more than `tolerance` and three
+    times the noise.
+
+    **Arguments**
+
+    - `quantity`: a function of a `Scene` that gives one number, such as `lambda s: jv.jam_modes(s).select(3).foundation_force`
+    - `free`: names of the numbers, such as "machine.stiffness" or "loads.drag": all their entries; unless said otherwise all
+      numbers of the scene. Those that are 0 are left out
+    - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
+      it is given `diffrax.ForwardMode()`, and then forward)
+    - `implicit`: a third route for a quantity that reads off what solves an equation, see `ImplicitRoute`
+    - `tolerance`: relative, of each derivative; of those below a thousandth of the largest (as p dq/dp) relative to that
+
+    **Returns** `GradientCheck`; its `require()` is the assertion. **Raises** `InputError` for a scene in single precision, a
+    quantity that is no number, unknown names and routes.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"))
+    >>> check = jv.check_gradients(scene, lambda s: jv.natural_frequencies(s)[0], free=("machine.stiffness", "machine.mass"))
+    >>> check.require().status_name, bool(check.noise[0] < 1e-7 * abs(check.difference[0]))
+    ('agree', True)
+
+    Source: Ridders 1982, for the extrapolation and its error.
+    """
+    scene = checked(scene)
+    if scene.drive.speed.dtype.itemsize < 8:
+        raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
+    unknown = [route for route in routes if route not in _MODES]
+    if unknown or not (routes or implicit):
+        raise InputError("routes", f"are {list(routes)!r}; name some of {', '.join(_MODES)}")
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
+        raise InputError("tolerance", f"is {tolerance!r}; it must be a number between 0 and 1, such as 1e-5")
+    numbers, left_out, put = _numbers(scene, free)
+    at = np.asarray([float(each.value) for each in numbers])
+
+    def by(shares: Array) -> Array:
+        """The quantity where each number is moved by that share of itself."""
+        return jnp.asarray(quantity(put(shares)))
+
+    nothing = jnp.zeros(len(numbers))
+    value = by(nothing)
+    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise InputError("quantity", f"gives {value.dtype} of shape {value.shape}; it must give one real number")
+    gradient = {route: np.asarray(_MODES[route](by)(nothing), float) for route in routes}
+    if implicit is not None:
+        gradient["implicit"] = np.asarray(_implicit(implicit, put, nothing), float)
+    sweep = np.asarray([[_central(by, len(numbers), i, h) for h in _STEPS] for i in range(len(numbers))])
+    difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolated(row, float(value)) for row in sweep), strict=True))
+    scale, routed = _scale(difference), np.stack(list(gradient.values()))
+    away = np.abs(routed - difference)
+    return GradientCheck(
+        status=member(GradientStatus, _judged(away, noise, scale, tolerance)),
+        value=float(value),
+        numbers=tuple(each.name for each in numbers),
+        at=at,
+        routes=tuple(gradient),
+        gradient=routed,
+        difference=difference,
+        noise=noise,
+        step=best,
+        error=away / scale,
+        steps=np.asarray(_STEPS),
+        sweep=sweep,
+        tolerance=float(tolerance),
+        left_out=left_out,
+    )
+
+
+_MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {
+    "forward": jax.jacfwd,
+    "reverse": jax.grad,
+}
+
+
+class _Number(NamedTuple):
+    """One entry of a scene: its `name`, the `leaf` it is in, its `place` in that leaf, flat, and its `value`."""
+
+    name: str
+    leaf: int
+    place: int
+    value: float
+
+
+def _numbers(scene: Scene, free: Sequence[str] | None) -> tuple[list[_Number], tuple[str, ...], Callable[[Array], Scene]]:
+    """The numbers that are asked for, those that are 0, and what gives the scene with each moved by a share (n,) of itself."""
+    leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
+    names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
+    for name in free or ():
+        if name not in names:
+            raise InputError("free", f"names {name!r}; this scene has: {', '.join(names)}")
+    found, zero = [], []
+    for k, (name, (_, leaf)) in enumerate(zip(names, leaves, strict=True)):
+        if free is not None and name not in free:
+            continue
+        for place, value in enumerate(np.ravel(np.asarray(leaf))):
+            each = _Number(name if leaf.ndim == 0 else f"{name}[{place}]", k, place, float(value))
+            (found if value != 0.0 else zero).append(each)
+    if not found:
+        raise InputError("free", "names no number that is not 0; name others")
+
+    def put(shares: Array) -> Scene:
+        flat = [jnp.ravel(leaf) for _, leaf in leaves]
+        for i, each in enumerate(found):
+            flat[each.leaf] = flat[each.leaf].at[each.place].multiply(1.0 + shares[i])
+        shaped = [new.reshape(leaf.shape) for new, (_, leaf) in zip(flat, leaves, strict=True)]
+        return jax.tree.unflatten(structure, shaped)
+
+    return found, tuple(each.name for each in zero), put
+
+
+def _central(by: Callable[[Array], Array], n: int, i: int, step: float) -> float:
+    move = jnp.asarray(np.eye(n)[i] * step)
+    return (float(by(move)) - float(by(-move))) / (2.0 * step)
+
+
+def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, float]:
+    """The derivative from central differences (k,) at falling steps, what it may be off, and the step it was best at."""
+    better = central[1:] + (central[1:] - central[:-1]) / (_RATIO**2 - 1.0)
+    apart = np.abs(np.diff(better))
+    rounding = np.finfo(float).eps * abs(value) / np.asarray(_STEPS[2:-1])
+    noise = np.maximum(np.maximum(apart[:-1], apart[1:]), rounding)
+    # Steps so small that the quantity does not feel them agree with each other, and not with the larger ones.
+    inner = better[1:-1]
+    for k in range(1, noise.size):
+        with np.errstate(invalid="ignore"):
+            if np.any(np.abs(inner[k] - inner[:k]) > noise[:k] + noise[k]):
+                noise[k] = math.nan
+    if not np.any(np.isfinite(noise)):
+        return math.nan, math.nan, math.nan
+    k = int(np.nanargmin(noise))
+    return float(inner[k]), float(noise[k]), _STEPS[k + 1]
+
+
+def _scale(difference: np.ndarray) -> np.ndarray:
+    size = np.abs(difference)
+    most = np.max(size[np.isfinite(size)], initial=0.0)
+    return np.maximum(size, _SMALL * most if most > 0.0 else np.finfo(float).tiny)
+
+
+def _judged(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:
+    if not (np.all(np.isfinite(away)) and np.all(np.isfinite(noise))):
+        return "not_finite"
+    if np.any(away > tolerance * scale + _SAFETY * noise):
+        return "differ"
+    return "noisy" if np.any(_SAFETY * noise > tolerance * scale) else "agree"
+
+
+def _implicit(route: ImplicitRoute, put: Callable[[Array], Scene], nothing: Array) -> Array:
+    x = jnp.atleast_1d(jax.lax.stop_gradient(jnp.asarray(route.solution(put(nothing)))))
+    shape = jnp.shape(route.solution(put(nothing)))
+
+    def residual(p: Array, x: Array) -> Array:
+        return jnp.atleast_1d(route.residual(put(p), x.reshape(shape)))
+
+    def read(p: Array, x: Array) -> Array:
+        return route.read(put(p), x.reshape(shape))
+
+    inner = jnp.linalg.solve(jax.jacfwd(residual, 1)(nothing, x), jax.jacfwd(residual)(nothing, x))
+    return jax.grad(read)(nothing, x) - jax.grad(read, 1)(nothing, x) @ inner

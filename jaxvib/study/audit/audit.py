@@ -1,0 +1,201 @@
+"""What each effect and each tier is worth on a scene: what it changes, what it costs, and which effects may be missing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.equations.dynamics import State
+from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import member
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.study.accuracy.exact_reference import usual_mode
+from jaxvib.study.audit.compared import CHANGES, Asked, EffectRow, effect_row, field_operations
+from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
+from jaxvib.study.audit.questions import LEAST, JamQuestion, RunQuestion, admitted
+from jaxvib.study.audit.tiers import TierRow, tier_rows
+from jaxvib.study.audit.variants import possible_variants, present_variants
+from jaxvib.units import Number, count, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Audit", "AuditStatus", "audit"]
+
+
+class AuditStatus(eqx.Enumeration):
+    """What is known of an audit; the members are the sentences a user reads."""
+
+    done = "what each effect changes was computed"
+    unsettled = "the motion had not settled to the accuracy that was asked for: smaller changes cannot be told; run longer"
+    failed = "the scene's own motion could not be computed, so that nothing can be compared with it"
+
+
+class Audit(Result):
+    """What each effect and each tier is worth on a scene.
+
+    **Attributes**: `accuracy` that was asked for, relative; `question` that was asked, in words; the scene's own `kind` of
+    motion, `omega` rad/s, `amplitude` (nd,) m, of tilts rad, `foundation_force` N and `fold` rad/s; `operations` of its
+    equations of motion, `seconds` of a run of 100 turns and `compile` (NaN where no time was taken); `effects`, `tiers` and
+    `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`; `coordinates`: their names.
+    """
+
+    status: AuditStatus
+    accuracy: float = eqx.field(metadata=in_unit(""))
+    question: str
+    kind: str
+    omega: float = eqx.field(metadata=in_unit("rad/s"))
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "coordinate"))
+    foundation_force: float = eqx.field(metadata=in_unit("N"))
+    fold: float = eqx.field(metadata=in_unit("rad/s"))
+    operations: int = eqx.field(metadata=in_unit(""))
+    seconds: float = eqx.field(metadata=in_unit("s"))
+    compile: float = eqx.field(metadata=in_unit("s"))
+    effects: list[EffectRow] = eqx.field(metadata=in_unit("", "effect", name="effect"))
+    tiers: list[TierRow] = eqx.field(metadata=in_unit("", "tier", name="tier"))
+    numbers: list[NumberRow] = eqx.field(metadata=in_unit("", "number", name="number"))
+    coordinates: tuple[str, ...] = ()
+
+    def advised(self, advice: str) -> list[str]:
+        """The names of the effects with that `advice`."""
+        return [row.effect for row in self.effects if row.advice == advice]
+
+    def summary(self) -> str:
+        """What the scene calls for, what it could leave out, and what it may lack, for a person to read."""
+        lines = [f"{self.question}: {self.kind}; {self.message}"]
+        for row in self.effects:
+            change = "no change is known" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
+            where = "" if row.present else ", not in the scene"
+            lines.append(f"  {row.effect}{where}: {row.advice} ({change}, {row.operations:+d} operations)")
+        for tier in self.tiers:
+            lines.append(f"  {tier.tier}: {tier.words()}")
+        for found in self.numbers:
+            lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.says}")
+        return "\n".join(lines)
+
+    def plot(self) -> Figure:
+        """What each effect changes against the accuracy asked for, and what it costs. **Returns** a matplotlib figure."""
+        from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
+
+        told = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
+        changes = {told[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
+        labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
+        uncertainty = np.array([row.uncertainty for row in self.effects])
+        added = np.array([row.operations for row in self.effects], float) / self.operations
+        return audit_chart(labels, changes, uncertainty, self.accuracy, added)
+
+
+def audit(
+    scene: Scene,
+    *,
+    accuracy: float = 0.01,
+    mode: int | None = None,
+    until: Number | None = None,
+    start: Literal["rest", "turning"] | State | None = None,
+    possible: Sequence[Effect] | None = None,
+    tiers: bool = True,
+    repeats: int = 3,
+) -> Audit:
+    """What each effect changes and costs on a scene, and each tier; what the scene could leave out, and what it may lack.
+
+    Each effect of the scene is taken out, each that it has not and could have is put in, with usual numbers
+    (`Effect.typical`), and the same question is asked of both scenes: of a scene that jams at a constant rotor speed, its jam,
+    by the exact orbit or, where that is refused, by the full equations until nothing changes; of any other, where a run has
+    come to. Judged is that motion, not the way to it. What couples a rotor's tilts, and the limit of a motor's power, are taken
+    out alike. Effects are asked for their properties, so that one of your own is audited as the package's are.
+
+    **Arguments**
+
+    - `accuracy`: the relative change below which an effect is negligible
+    - `mode`: the jam mode, unless said otherwise the last but one that is stable by its slope
+    - `until`: s or text, the end of the run, where a run is asked for: unless said otherwise 100 slow periods, and besides
+      twice the time at which the drive's acceleration jumps last
+    - `start`: of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is asked
+      for in any case; unless said otherwise "turning" where the rotor's speed is constant, "rest" elsewhere
+    - `possible`: effects to put in, in place of those that the package knows; `()` for none
+    - `tiers`: whether every tier is asked as well
+    - `repeats`: how often a run of 100 turns is timed, the fastest counts; 0 for no times, which saves a compilation for each
+      effect
+
+    **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1 and as `jam_modes`, `simulate`;
+    `ComputationError` (status "absent") for a mode that does not exist.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed("60 rad/s"), (jv.Gravity(),))
+    >>> found = jv.audit(scene, mode=1, possible=(), tiers=False, repeats=0)
+    >>> found.advised("needed"), found.advised("negligible")
+    ([], ['gravity'])
+
+    Source: ours.
+    """
+    if isinstance(accuracy, bool) or not isinstance(accuracy, (int, float)) or not 0.0 < accuracy < 1.0:
+        raise InputError("accuracy", f"is {accuracy!r}; it must be a number between 0 and 1, such as 0.01 for 1 %")
+    for k, effect in enumerate(possible or ()):
+        if not isinstance(effect, Effect):
+            raise InputError(f"possible[{k}]", f"is {effect!r}; it must be an Effect, for example Gravity()")
+    scene = checked(scene)
+    count(repeats, "repeats", low=0)
+    end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
+    question, words = _question(scene, mode, end, start)
+    ask = Asked(question, repeats)
+    own = ask.values(scene, ask.tier(scene))
+    until = question.until if isinstance(question, RunQuestion) else None
+    # Of a machine that hardly moves, what its loads could do: their unbalance radius.
+    amplitude = [a * (own.magnified / LEAST if own.magnified > 1.0 else 1.0) for a in own.amplitude]
+    variants = [*present_variants(scene, until), *possible_variants(scene, amplitude, possible)]
+    status = "done"
+    if not np.isfinite(own.omega):
+        status = "failed"
+    elif not own.uncertainty <= 0.5 * accuracy:
+        status = "unsettled"
+    seconds, compiling = ask.times(scene)
+    return Audit(
+        status=member(AuditStatus, status),
+        accuracy=float(accuracy),
+        question=words,
+        kind=own.kind,
+        omega=own.omega,
+        amplitude=np.asarray(own.amplitude),
+        foundation_force=own.foundation_force,
+        fold=own.fold,
+        operations=field_operations(scene),
+        seconds=seconds,
+        compile=compiling,
+        effects=[effect_row(ask, scene, variant, float(accuracy)) for variant in variants],
+        tiers=tier_rows(scene, question, own, repeats) if tiers else [],
+        numbers=dimensionless_numbers(scene, own, accuracy),
+        coordinates=scene.machine.structure().coordinates,
+    )
+
+
+def _question(
+    scene: Scene, mode: int | None, until: float | None, start: Literal["rest", "turning"] | State | None
+) -> tuple[JamQuestion | RunQuestion, str]:
+    if not (start is None or isinstance(start, State) or start in ("rest", "turning")):
+        raise InputError("start", f"is {start!r}; it must be 'rest', 'turning' or a State")
+    if mode is not None and start is not None:
+        raise InputError("mode", f"is {mode!r}, which goes without a start: a jam is asked for, or a run")
+    if start is None and (scene.drive.constant or mode is not None):
+        try:
+            chosen = usual_mode(admitted(scene)) if mode is None else mode
+            jammed = JamQuestion(chosen)
+            if mode is not None:
+                jam_modes(admitted(scene)).select(mode)  # raises where there is no such mode
+            return jammed, f"jam mode {chosen} at {float(scene.drive.speed):.5g} rad/s"
+        except InputError:
+            if mode is not None:
+                raise
+    run = RunQuestion.usual(scene, until, start)
+    name = "a state" if isinstance(run.start, State) else run.start
+    return run, f"the motion {run.until:.4g} s after {name}"

@@ -1,0 +1,165 @@
+"""Dimensionless numbers that say what a scene may lack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.linear import linear_model
+from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.scene import Scene
+from jaxvib.study.audit.questions import Values, mean_torque
+
+__all__ = ["NumberRow", "dimensionless_numbers", "gravity_share"]
+
+_G = 9.81
+_STEEL = 7850.0
+_ROLLING, _BEARING, _BEARING_WIDTH = 3e-5, 0.0015, 0.2
+
+
+class NumberRow(NamedTuple):
+    """A dimensionless number of a scene: its `name`, `value`, the `limit` above which it asks for something, the `advice`
+    ("perhaps needed" above the limit, else "negligible"), and what the number `says`."""
+
+    name: str
+    value: float
+    limit: float
+    advice: str
+    says: str
+
+
+def dimensionless_numbers(scene: Scene, values: Values, accuracy: float) -> list[NumberRow]:
+    """The numbers that judge what `scene` leaves out, at the motion `values` and a relative `accuracy`.
+
+    - gravity on the loads: g/(R Omega^2), its share in the force with which a load presses on its track
+    - crowding: the share of the track that the loads' diameters fill, N arcsin(r/R)/pi, and what of the unbalance is lost
+      where they lie side by side, 1 - sin(N a)/(N sin a), sin a = r/R; r that of steel balls where none is given
+    - distance: how near two loads come to each other, in diameters, where nothing keeps them apart
+    - dry against viscous friction: that of a ball bearing, or of steel on steel, over the drag b_W R^2 (n - Omega)
+    - gyroscopic: the loads' inertia about the axis over that of the machine about a tilt, with R as its radius of gyration,
+      where the machine cannot tilt
+    - lift: the foundation force over the weight, above which supports that a machine stands on would have to pull
+
+    What the scene holds already is not asked for. **Returns** a list of `NumberRow`.
+
+    Source: ours; the first is the claim of Artyunin and Sumenkov 2019 that gravity is below 0.5 %.
+    """
+    if not np.isfinite(values.omega) or values.omega == 0.0:
+        return []
+    found = [make(scene, values, accuracy) for make in _NUMBERS]
+    return [row for row in found if row is not None]
+
+
+def gravity_share(radius: float, omega: float, g: float = _G) -> float:
+    """g/(R Omega^2): the share of gravity in the radial load of a load at `radius` R m that turns at `omega` rad/s.
+
+    >>> round(100.0 * gravity_share(0.08, 169.6), 3)      # per cent, of the published rotor's pendulums in their first jam
+    0.426
+
+    Source: Artyunin and Sumenkov 2019, who say that it is below 0.5 %: it is above sqrt(g/(0.005 R)), 157 rad/s here.
+    """
+    return g / (radius * omega**2)
+
+
+def _row(name: str, value: float, limit: float, says: str) -> NumberRow:
+    return NumberRow(name, value, limit, "perhaps needed" if value > limit else "negligible", says)
+
+
+def _arm(scene: Scene) -> float:
+    across, up, *_ = scene.loads.position(*scene.loads.rest())
+    return float(np.mean(np.hypot(np.asarray(across), np.asarray(up))))
+
+
+def _own_radius(scene: Scene) -> tuple[float, str] | None:
+    """That of the loads, or of steel balls of their mass, and where it is from; None for loads on bearings."""
+    own = getattr(scene.loads, "own_radius", None)
+    if own is not None:
+        return float(own), ""
+    if scene.loads.has_bearing:
+        return None
+    radius = (3.0 * float(np.mean(np.asarray(scene.loads.mass))) / (4.0 * math.pi * _STEEL)) ** (1.0 / 3.0)
+    return radius, f"balls of steel of this mass have the radius {1e3 * radius:.3g} mm; "
+
+
+def _gravity(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    if total_gravity(scene.effects):
+        return None
+    share = gravity_share(_arm(scene), values.omega)
+    return _row("gravity: g/(R Omega^2)", share, accuracy, "its share in the force with which loads press on their track")
+
+
+def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    own, n = _own_radius(scene), scene.loads.count
+    if own is None or n < 2 or not scene.loads.circular:
+        return None
+    ratio = own[0] / _arm(scene)
+    half = math.asin(min(ratio, 1.0))
+    filled = n * half / math.pi
+    if filled >= 1.0:
+        says = f"{own[1]}they have no room on the track: give lighter loads, or more than one track"
+        return NumberRow("crowding: N arcsin(r/R)/pi", filled, 1.0, "perhaps needed", says)
+    if not own[1]:
+        return None
+    lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
+    says = f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and carry this share less: give own_radius"
+    return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, says)
+
+
+def _distance(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    if not np.isfinite(values.closest) or any(effect.couples_loads for effect in scene.effects):
+        return None
+    says = "diameter over the least distance of two loads: above 1 they pass through each other, and load_contact is called for"
+    return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
+
+
+def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    drag = mean_torque(scene, values.omega)
+    if any(effect.has_friction for effect in scene.effects) or not drag > 0.0:
+        return None
+    arm, n = _arm(scene), scene.loads.count
+    pressed = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
+    if scene.loads.has_bearing:
+        lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
+        says, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
+    else:
+        own = _own_radius(scene)
+        assert own is not None
+        lever, name = _ROLLING / own[0] * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
+        says = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"
+    return _row(name, lever * pressed / drag, accuracy, says)
+
+
+def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    structure = scene.machine.structure()
+    if structure.tilt is not None:
+        return None
+    model = linear_model(scene)
+    whole = float(1.0 / (model.carrier.port @ jnp.linalg.solve(model.mass, model.carrier.port.T))[0, 0])
+    n = scene.loads.count
+    loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
+    says = "the machine does not tilt in this model: where it may, loads that turn couple its tilts (a rotor's own inertia too)"
+    return _row("gyroscopic: sum kappa m / M", loads / whole, accuracy, says)
+
+
+def _lift(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
+    carrier = scene.machine.carrier()
+    if carrier.axes != (1,) or any(effect.place(carrier) is not None for effect in scene.effects):
+        return None
+    loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
+    weight = _G * (float(jnp.trace(carrier.mass)) + loads)
+    says = "foundation force over weight: above 1 springs that the machine stands on would have to pull; stop, cubic_support"
+    return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, says)
+
+
+_NUMBERS: tuple[Callable[[Scene, Values, float], NumberRow | None], ...] = (
+    _gravity,
+    _crowding,
+    _distance,
+    _friction,
+    _gyroscopic,
+    _lift,
+)

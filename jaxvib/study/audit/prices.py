@@ -1,0 +1,107 @@
+"""What effects, drives and coordinates cost where a scene has them: operations of the traced equations of motion."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.files import DRIVES, EFFECTS
+from jaxvib.machine.loads import Loads, balls, pendulums
+from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import planar_rotor, rotor
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import torus_balls
+from jaxvib.study.audit.compared import field_operations
+from jaxvib.units import Numbers
+
+__all__ = ["PriceRow", "prices"]
+
+T = TypeVar("T")
+
+
+class PriceRow(NamedTuple):
+    """`part` of a scene ("effect", "drive", "machine", "loads") and its `kind`; `operations` of the equations of motion with
+    it, how many are `added` to those of the scene `beside` it."""
+
+    part: str
+    kind: str
+    operations: int
+    added: int
+    beside: str
+
+
+def prices() -> list[PriceRow]:
+    """The operations that each effect, each drive, each coordinate of a machine and of a load adds to the equations of motion.
+
+    Of a platform with a ball at constant speed; an effect that does not go with it stands in the simplest scene of the others
+    with which it goes. Numbers do not count, operations hold for any. **Returns** a list of `PriceRow`.
+
+    >>> rows = prices()
+    >>> [row.added for row in rows if row.kind == "constant_speed"], min(row.added for row in rows if row.part == "effect") > 0
+    ([0], True)
+
+    Source: ours.
+    """
+    machines: dict[str, Machine] = {
+        "one_mass": one_mass(mass=1.0, stiffness=1.0, damping=1.0),
+        "two_mass": two_mass(mass=(1.0,) * 2, stiffness=(1.0,) * 2, damping=(1.0,) * 2, link_stiffness=1.0, link_damping=1.0),
+        "three_mass": three_mass(
+            mass=(1.0,) * 3, stiffness=(1.0,) * 3, damping=(1.0,) * 3, link_stiffness=(1.0,) * 3, link_damping=(1.0,) * 3
+        ),
+        "network of four": network(
+            mass=[1.0] * 4,
+            stiffness=[1.0] * 4,
+            damping=[1.0] * 4,
+            links=[(1, 2), (2, 3), (3, 4)],
+            link_stiffness=[1.0] * 3,
+            link_damping=[1.0] * 3,
+            exciter=4,
+        ),
+        "planar_rotor": planar_rotor(mass=1.0, stiffness=1.0, damping=1.0),
+        "rotor, loads at one station": _rotor(0.0),
+        "rotor, loads at stations": _rotor((0.5, -0.5)),
+    }
+    sized = {"count": 1, "mass": 0.1, "radius": 0.2, "drag": 0.1}
+    loads: dict[str, Loads] = {
+        "ball": balls(**sized, own_radius=0.02),
+        "pendulum": pendulums(**sized),
+        "torus_ball": torus_balls(**sized, tube=0.05, own_radius=0.02),
+    }
+    constant = ConstantSpeed(1.0)
+
+    def row(part: str, kind: str, scene: Scene, beside: Scene) -> PriceRow:
+        whole, base = field_operations(scene), field_operations(beside)
+        name = f"{beside.machine.kind}, {beside.loads.kind}, {beside.drive.kind}"
+        return PriceRow(part, kind, whole, whole - base, name)
+
+    platform, planar = (Scene(machines[kind], loads["ball"], constant) for kind in ("one_mass", "planar_rotor"))
+    found = [
+        row("drive", kind, Scene(platform.machine, platform.loads, _made(drive)), platform) for kind, drive in DRIVES.items()
+    ]
+    for kind, machine in machines.items():
+        each = balls(**{**sized, "count": 2}) if "stations" in kind else platform.loads
+        found.append(row("machine", kind, Scene(machine, each, constant), platform))
+    found += [row("loads", kind, Scene(planar.machine, each, constant), planar) for kind, each in loads.items()]
+    hosts = [Scene(machines[m], each, constant) for m in ("one_mass", "rotor, loads at one station") for each in loads.values()]
+    for kind, effect in EFFECTS.items():
+        for host in hosts:
+            with contextlib.suppress(InputError):  # it does not go with this machine or these loads
+                found.append(row("effect", kind, Scene(host.machine, host.loads, constant, (_made(effect),)), host))
+                break
+    return found
+
+
+def _made(build: Callable[..., T]) -> T:
+    """An effect or a drive with 0.5 for each number that it needs."""
+    parameters = inspect.signature(build).parameters.values()
+    return build(**{each.name: 0.5 for each in parameters if each.default is each.empty})
+
+
+def _rotor(stations: Numbers) -> Machine:
+    sized = {"mass": 1.0, "transverse_inertia": 1.0, "polar_inertia": 1.0, "stiffness": (1.0, 1.0), "damping": (1.0, 1.0)}
+    return rotor(**sized, position=(0.5, -0.5), stations=stations)  # pyright: ignore[reportArgumentType]

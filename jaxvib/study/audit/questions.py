@@ -1,0 +1,220 @@
+"""The questions by which two scenes are compared: a jam, or where a motion in time comes to."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.collected import require_collected
+from jaxvib.equations.dynamics import State
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.settle import settle
+from jaxvib.motion.simulate import simulate
+from jaxvib.motion.start import initial_state
+from jaxvib.results.status import status_name
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
+from jaxvib.steady.orbits.orbit import OrbitStatus
+from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
+
+__all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
+
+_APART = 0.05
+"""How far from their middle the outermost loads start, rad: none stay together only because nothing parts them."""
+
+_ROUNDING = 1e-9
+
+_WINDOW = 100
+"""Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
+
+LEAST = 0.01
+"""Amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to that."""
+
+_GRID = 100
+"""Load speeds among which an exact fold is looked for at once."""
+
+
+class Values(NamedTuple):
+    """What a motion is judged by.
+
+    **Attributes**: `kind` of motion, in words; `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad;
+    `foundation_force` N; `fold`, the rotor speed (rad/s) at which the jam ends, NaN where there is none or none is asked for;
+    `uncertainty`, relative, below which nothing of this can be told; `closest`: the least distance of two loads in units of
+    their diameter, NaN where they have none or the tier takes them as collected; `magnified`: changes are relative to so many
+    times these amplitudes and this force, more than 1 where the machine hardly moves, see `LEAST`.
+    """
+
+    kind: str
+    omega: float
+    amplitude: tuple[float, ...]
+    foundation_force: float
+    fold: float
+    uncertainty: float
+    closest: float = math.nan
+    magnified: float = 1.0
+
+
+class JamQuestion(NamedTuple):
+    """The jam `mode`: exactly, or where that is refused as the motion settles to from near it."""
+
+    mode: int
+
+    def can(self, scene: Scene) -> bool:
+        """Whether the exact orbit answers."""
+        try:
+            require_collected(scene)
+        except InputError:
+            return False
+        return True
+
+    def exact(self, scene: Scene) -> Values:
+        """By the exact orbit; NaN, and a kind that says so, where there is no such jam."""
+        orbit = jam_orbit(scene, mode=self.mode, throw=False)
+        there = bool(np.isfinite(orbit.omega))
+        kind = f"jam mode {self.mode}, {'stable' if orbit.stable else 'unstable'}" if there else f"no jam mode {self.mode}"
+        accurate = bool(orbit.status == OrbitStatus.found)
+        return Values(
+            kind if accurate or not there else f"{kind} ({status_name(orbit.status)})",
+            float(orbit.omega),
+            tuple(np.abs(np.asarray(orbit.amplitude)).tolist()),
+            float(orbit.foundation_force),
+            fold_speed(admitted(scene), float(orbit.omega)),
+            max(float(orbit.error), _ROUNDING) if there else math.nan,
+        )
+
+    def state(self, scene: Scene) -> State:
+        """On the exact jam without what theories of jams leave out, loads a little apart; NaN where there is none."""
+        n = scene.loads.count
+        orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
+        displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
+        spread = _APART * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1))
+        return State(displacement, velocity, (angle + spread,), rate)
+
+    def full(self, scene: Scene) -> Values:
+        """By the full equations, from near the exact jam, until nothing changes."""
+        run = settle(scene, start=self.state(scene), throw=False)
+        return _read(scene, run, fold_speed(admitted(scene), float(run.omega)))
+
+
+class RunQuestion(NamedTuple):
+    """Where the motion has come to at the end `until` (s) of a run from `start`: "rest", "turning" with the rotor, loads evenly
+    spread, or a state."""
+
+    until: float
+    start: Literal["rest", "turning"] | State
+
+    def state(self, scene: Scene) -> State:
+        """The state that `scene` starts from."""
+        if isinstance(self.start, State):
+            return self.start
+        if self.start == "turning":
+            return turning_state(scene)
+        return initial_state(scene, "rest", apart=_APART if scene.loads.count > 1 else 0.0)
+
+    def can(self, scene: Scene) -> bool:
+        """No: there is no exact orbit to ask for."""
+        return False
+
+    def exact(self, scene: Scene) -> Values:
+        """None of these."""
+        raise NotImplementedError
+
+    def full(self, scene: Scene) -> Values:
+        """By the full equations."""
+        asked = dict(save="window", turns=_WINDOW, estimate=False, throw=False)
+        run = simulate(scene, self.until, start=self.state(scene), **asked)  # pyright: ignore[reportArgumentType]
+        return _read(scene, run, math.nan)
+
+    @classmethod
+    def usual(cls, scene: Scene, until: float | None, start: Literal["rest", "turning"] | State | None) -> RunQuestion:
+        """The run that is asked for; where its end is not named, `SLOW_PERIODS` slow periods after the drive's last jump."""
+        if start is None:
+            start = "turning" if scene.drive.constant else "rest"
+        if until is None:
+            jumps = [float(t) for t in scene.drive.jump_ts()]
+            until = 2.0 * max(jumps, default=0.0) + 5.0 * SLOW_PERIODS * slow_period(scene)
+        return cls(until, start)
+
+
+def admitted(scene: Scene) -> Scene:
+    """The scene without the effects that theories of jams leave out, an imbalance among them: it shakes at another speed."""
+    kept = tuple(e for e in scene.effects if (e.averages_out or e.has_friction) and not e.has_imbalance)
+    return scene if len(kept) == len(scene.effects) else Scene(scene.machine, scene.loads, scene.drive, kept)
+
+
+def turning_state(scene: Scene) -> State:
+    """The carrier at rest, the loads evenly spread and as fast as the rotor."""
+    first, *others = scene.loads.rest()
+    n, still = scene.loads.count, jnp.zeros(scene.machine.structure().mass.shape[:1])
+    zero = jnp.zeros((n,))
+    rotor = None if scene.drive.ideal else (jnp.zeros(()), scene.drive.speed)
+    spread = first + 2.0 * jnp.pi / n * jnp.arange(n)
+    return State(still, still, (spread, *others), (zero + scene.drive.speed, *(zero for _ in others)), rotor)
+
+
+def mean_torque(scene: Scene, omega: float) -> float:
+    """Mean torque that the rotor puts into loads which turn at `omega` on the average, N m: that of drag, without friction."""
+    n = scene.loads.count
+    u = scene.loads.rest()
+    rate = (jnp.full((n,), omega), *(jnp.zeros((n,)) for _ in u[1:]))
+    torque = scene.loads.resistance(u, rate, scene.drive.speed)[0]
+    return float(jnp.sum(jnp.broadcast_to(torque, (n,))))
+
+
+def fold_speed(scene: Scene, omega: float) -> float:
+    """The rotor speed, rad/s, at which the exact jam at load speed `omega` ends: at the fold next above it along the branch, or
+    below it where there is none above; NaN where the branch has none there, or theories of jams refuse the scene."""
+    try:
+        folds = jam_modes(scene).folds
+    except InputError:
+        return math.nan
+    light = np.asarray(folds.omega)[np.asarray(folds.exists)]
+    above, below = light[light > omega], light[light < omega]
+    if not light.size or not np.isfinite(omega):
+        return math.nan
+    near = float(above[0]) if above.size else float(below[-1])
+    low, high, found = 0.97 * near, 1.03 * near, math.nan
+    for _ in range(2):
+        grid = np.linspace(low, high, _GRID)
+        speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(grid)[None]))
+        turns = np.flatnonzero((slope[1:] > 0.0) != (slope[:-1] > 0.0))
+        turns = turns[np.isfinite(slope[turns]) & np.isfinite(slope[turns + 1])]
+        if not turns.size:
+            return math.nan
+        k = int(turns[np.argmin(np.abs(grid[turns] - near))])
+        low, high = float(grid[k]), float(grid[k + 1])
+        found = float(speed[k] if abs(slope[k]) < abs(slope[k + 1]) else speed[k + 1])
+    return found
+
+
+def _read(scene: Scene, run: Run, fold: float) -> Values:
+    kind = status_name(run.regime.name) if bool(run.status == RunStatus.done) else f"failed: {status_name(run.status)}"
+    drift, amplitude = float(run.drift), np.asarray(run.amplitude)
+    moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
+    magnified = max(1.0, LEAST * float(natural_units(scene).displacement) / moved) if moved > 0.0 else 1.0
+    return Values(
+        kind,
+        float(run.omega),
+        tuple(amplitude.tolist()),
+        float(run.foundation_force),
+        fold,
+        max(drift / magnified, _ROUNDING) if np.isfinite(drift) else math.nan,
+        _closest(scene, run),
+        magnified,
+    )
+
+
+def _closest(scene: Scene, run: Run) -> float:
+    own, n = getattr(scene.loads, "own_radius", None), scene.loads.count
+    if own is None or n < 2:
+        return math.nan
+    place = [np.asarray(x) for x in scene.loads.position(*run.window.state.angle)]
+    first, second = np.triu_indices(n, 1)
+    distance = np.sqrt(sum((x[:, first] - x[:, second]) ** 2 for x in place))
+    return float(np.min(distance) / (2.0 * float(own)))

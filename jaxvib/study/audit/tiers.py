@@ -1,0 +1,99 @@
+"""What each tier can answer for a scene, how far it is off, and what it costs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.envelope.envelope import envelope
+from jaxvib.results.status import status_name
+from jaxvib.study.accuracy.cost import timed
+from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
+from jaxvib.study.accuracy.tier import TIERS, JamValues, Tier
+from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values
+
+__all__ = ["TierRow", "tier_rows"]
+
+
+class TierRow(NamedTuple):
+    """One tier: its name; `answers`, whether it answers the audit's question for the scene; by how much it is off, relative to
+    the best one that answers, in `amplitude` (of the coordinate that is off most, in units of the largest), `foundation_force`
+    and `omega`, NaN where it does not answer; `seconds` of an answer and of the first one besides, `compile`, NaN where no time
+    was taken; `says` what it is for, or why it does not answer."""
+
+    tier: str
+    answers: bool
+    amplitude: float
+    foundation_force: float
+    omega: float
+    seconds: float
+    compile: float
+    says: str
+
+    def words(self) -> str:
+        """The row in words."""
+        if not self.answers:
+            return f"does not answer; {self.says}"
+        off = max(abs(self.amplitude), abs(self.foundation_force), abs(self.omega))
+        took = "" if math.isnan(self.seconds) else f", {self.seconds:.2g} s"
+        return f"off by {100.0 * off:.2g} %{took}; {self.says}"
+
+
+def tier_rows(scene: Scene, question: JamQuestion | RunQuestion, own: Values, repeats: int) -> list[TierRow]:
+    """A row for each of `TIERS`, against the values `own` of the best tier that answers; without times for 0 `repeats`."""
+    return [_row(tier, scene, question, own, repeats) for tier in TIERS]
+
+
+def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Values, repeats: int) -> TierRow:
+    nothing = (math.nan,) * 5
+    refusal = tier.refusal(scene)
+    if refusal is not None:
+        return TierRow(tier.name, False, *nothing, says=refusal)
+    ask = _call(tier, scene, question, own)
+    if isinstance(ask, str):
+        return TierRow(tier.name, False, *nothing, says=ask)
+    try:
+        found, seconds, compiling = timed(ask, repeats) if repeats else (ask(), math.nan, math.nan)
+    except (InputError, ComputationError) as problem:
+        return TierRow(tier.name, False, *nothing, says=str(problem))
+    amplitude, size = np.abs(np.asarray(found.amplitude)), np.asarray(own.amplitude)
+    if not np.all(np.isfinite(amplitude)):
+        status = getattr(found, "status", None)
+        return TierRow(tier.name, False, *nothing, says="no such motion" if status is None else status_name(status))
+    says = tier.answers
+    if isinstance(question, JamQuestion) and isinstance(found, Values) and found.kind != "jammed":
+        says = f"the run left the jam: {found.kind}"
+    off = (amplitude - size) / np.max(size)
+    return TierRow(
+        tier.name,
+        True,
+        float(off[np.argmax(np.abs(off))]),
+        float(found.foundation_force) / own.foundation_force - 1.0,
+        float(found.omega) / own.omega - 1.0,
+        seconds,
+        compiling,
+        says,
+    )
+
+
+def _call(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Values) -> Callable[[], JamValues | Values] | str:
+    """What asks the tier, or why it cannot be asked."""
+    timeless = tier.name in ("leading order", "exact orbit")
+    if isinstance(question, JamQuestion):
+        if not timeless and "unstable" in own.kind:
+            return "the jam is unstable, a run leaves it"
+        until = 10.0 * SLOW_PERIODS * slow_period(scene)
+        if tier.name == "full":
+            return lambda: question.full(scene)
+        return lambda: tier.jam(scene, question.mode, until)
+    if timeless:
+        return "knows the jams of this scene, not which of them a run comes to"
+    if tier.name == "full":
+        return lambda: question.full(scene)
+    start = question.state(scene)
+    return lambda: envelope(scene, question.until, start=start, save="window", throw=False)

@@ -1,0 +1,87 @@
+"""Scenes with one effect more or less."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxvib.errors import InputError
+from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.drive import ConstantSpeed, SpinUp
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.files import EFFECTS
+from jaxvib.machine.scene import Scene
+
+__all__ = ["Variant", "possible_variants", "present_variants"]
+
+_DROOP = 0.015
+"""Share of its speed that an induction motor twice as strong as needed loses: half of a usual rated slip of 3 %."""
+
+
+class Variant(NamedTuple):
+    """A `scene` with one thing more or less than the one that is audited: its `name`; `present`, whether the audited scene has
+    it; `says`, with which numbers it was put in."""
+
+    name: str
+    present: bool
+    scene: Scene
+    says: str = ""
+
+
+class WithoutGyroscopic(Machine):
+    """A machine without what couples its coordinates through the rotor's speed."""
+
+    machine: Machine
+    kind: str = eqx.field(static=True)
+
+    def __init__(self, machine: Machine):
+        self.machine, self.kind = machine, str(machine.kind)
+
+    def carrier(self) -> Carrier:
+        """The machine's, without its gyroscopic matrix."""
+        return eqx.tree_at(lambda c: c.gyroscopic, self.machine.carrier(), None)
+
+
+def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
+    """The scene without each effect that it has, without gyroscopic coupling, without the limit of its motor's power (the rotor
+    then rises to the motor's speed over half the time `until`, s)."""
+    kinds = [effect.kind for effect in scene.effects]
+    for k, effect in enumerate(scene.effects):
+        number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
+        rest = (*scene.effects[:k], *scene.effects[k + 1 :])
+        yield Variant(effect.kind + number, True, Scene(scene.machine, scene.loads, scene.drive, rest))
+    if scene.machine.structure().gyroscopic is not None:
+        machine = WithoutGyroscopic(scene.machine)
+        yield Variant("gyroscopic coupling", True, eqx.tree_at(lambda s: s.machine, scene, machine))
+    if not scene.drive.ideal and until is not None:
+        drive = SpinUp(scene.drive.speed, until / 2.0)
+        yield Variant("limited power", True, eqx.tree_at(lambda s: s.drive, scene, drive), "against a drive that nothing slows")
+
+
+def possible_variants(scene: Scene, amplitude: Sequence[float], given: Sequence[Effect] | None) -> Iterator[Variant]:
+    """The scene with each effect that it has not and could have: the `given` ones, else those that the package knows, with
+    usual numbers (`Effect.typical`); and with a drive that gives way, where its speed is given."""
+    there = {effect.kind for effect in scene.effects if not effect.repeatable}
+    for effect in given or ():
+        if effect.kind not in there:
+            more = Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, effect))
+            yield Variant(effect.kind, False, more, "as given")
+    if given is not None:
+        return
+    known = {effect.kind for effect in scene.effects}
+    for kind, effect in EFFECTS.items():
+        if kind in known:
+            continue
+        with contextlib.suppress(InputError):  # it does not go with this machine or these loads
+            usual = effect.typical(scene.machine, scene.loads, scene.drive.speed, jnp.asarray(amplitude))
+            if usual is not None:
+                more = Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, usual.effect))
+                yield Variant(kind, False, more, usual.says)
+    if scene.drive.constant:
+        slower = ConstantSpeed(scene.drive.speed * (1.0 - _DROOP))
+        says = f"a motor that loses {100.0 * _DROOP:g} % of its speed: induction_motor, dc_motor"
+        yield Variant("drive that gives way", False, eqx.tree_at(lambda s: s.drive, scene, slower), says)
