@@ -10,46 +10,56 @@ from typing import Any
 from jaxvib.errors import InputError
 from jaxvib.machine.files import called, closest, load_scene, read_toml
 from jaxvib.units import count, number
-from optimize.quantities import (
-    Quantity,
-    amplitude,
-    force_per_amplitude,
-    foundation_force,
-    jam_frequency,
-    negative,
-    support_frequency_squared,
-    total,
-)
+from optimize import quantities
+from optimize.quantities import Quantity
 from optimize.space import DesignSpace, hold
+from optimize.wishes.quantity import Demand
 
 __all__ = ["TEMPLATE", "Design", "load_design"]
 
 _QUANTITIES = {
-    "amplitude": amplitude,
-    "foundation_force": foundation_force,
-    "force_per_amplitude": force_per_amplitude,
-    "jam_frequency": jam_frequency,
-    "support_frequency_squared": support_frequency_squared,
-    "total": total,
+    name: getattr(quantities, name)
+    for name in (
+        "amplitude",
+        "phase",
+        "foundation_force",
+        "force_per_amplitude",
+        "jam_frequency",
+        "fold_margin",
+        "largest_multiplier",
+        "power",
+        "support_frequency_squared",
+        "total",
+        "product",
+        "total_mass",
+        "static_deflection",
+        "spring_cost",
+        "peak_force",
+        "settling_time",
+    )
 }
-_SECTIONS = ["scene", "free", "hold", "objective", "search"]
+_STATISTICS = {"expected": quantities.expected, "worst": quantities.worst}
+_SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", "search"]
 
 
 @dataclass(frozen=True)
 class Design:
-    """A design file: the `space`, the `objective`, and the arguments of `synthesize` in `search`."""
+    """A design file: the `space`, the `objective`, the arguments of `synthesize` in `search`, and the demands `subject_to`."""
 
     space: DesignSpace
     objective: Quantity
     search: dict[str, Any] = field(default_factory=dict)
+    subject_to: tuple[Demand, ...] = ()
 
 
 def load_design(path: str | Path) -> Design:
     """Reads a design file.
 
     `scene` names the scene file, relative to the design file; `[free]` gives bounds for each number that may change;
-    every `[[hold]]` a quantity and, unless it shall stay as it is, its value; `[objective]` the quantity to make small, or
-    large with `maximize = true`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`.
+    `[ties]` what follows what, `[choices]` the values that can be had; every `[[hold]]` a quantity and, unless it shall stay as
+    it is, its value; every `[[demand]]` a quantity that is `at_most` or `at_least` a value; `[objective]` the quantity to make
+    small, or large with `maximize = true`. A quantity with `tolerances` is taken over machines that are off by these,
+    `statistic = "expected"` or `"worst"`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`.
 
     **Arguments**: `path` of a TOML file.
 
@@ -70,19 +80,23 @@ def load_design(path: str | Path) -> Design:
         if name not in _SECTIONS:
             raise InputError(name, f"is no part of a design file; {closest(name, _SECTIONS)}")
     for name in ("scene", "free", "objective"):
-        if name not in tables:
+        if name not in tables and not (name == "free" and "choices" in tables):
             raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
     if not isinstance(tables["scene"], str):
         raise InputError("scene", f"is {tables['scene']!r}; give the path of a scene file, in quotes")
-    for name in ("free", "objective", "search"):
+    for name in ("free", "ties", "choices", "objective", "search"):
         if not isinstance(tables.get(name, {}), Mapping):
             raise InputError(name, f"is not a table; write [{name}]")
-    held = tables.get("hold", [])
-    if not isinstance(held, list):
-        raise InputError("hold", "is not a list of tables; write [[hold]] for each quantity")
+    for name in ("hold", "demand"):
+        if not isinstance(tables.get(name, []), list):
+            raise InputError(name, f"is not a list of tables; write [[{name}]] for each quantity")
     scene = load_scene(Path(path).parent / tables["scene"])
-    values = [_quantity(table, f"hold[{k}]", ("value",)) for k, table in enumerate(held)]
-    space = DesignSpace(scene, dict(tables["free"]), [hold(q, more.get("value")) for q, more in values])
+    values = [_quantity(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
+    held = [hold(q, more.get("value")) for q, more in values]
+    ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
+    free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
+    space = DesignSpace(scene, free, held, ties=ties, choices=choices)
+    demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     objective, more = _quantity(tables["objective"], "objective", ("maximize",))
     if not isinstance(more.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {more['maximize']!r}; write true or false, without quotes")
@@ -99,7 +113,15 @@ def load_design(path: str | Path) -> Design:
                 raise InputError("search.rate", f"is {search[name]:g}; it must be less than 1")
             continue
         count(value, f"search.{name}", low=0 if name in ("seed", "polishing") else 1)
-    return Design(space, objective, search)
+    return Design(space, objective, search, demands)
+
+
+def _demands(table: Any, section: str) -> list[Demand]:
+    quantity, more = _quantity(table, section, ("at_most", "at_least"))
+    if not more:
+        raise InputError(section, "has no limit; give at_most or at_least, or both")
+    made = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
+    return [made[name](limit) for name, limit in more.items()]
 
 
 def _quantity(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity, dict[str, Any]]:
@@ -109,12 +131,20 @@ def _quantity(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity
     if name not in _QUANTITIES:
         problem = "is missing" if name is None else f"is {name!r}"
         raise InputError(f"{section}.quantity", f"{problem}; {closest(str(name), list(_QUANTITIES))}")
-    values = {k: v for k, v in table.items() if k not in ("quantity", *more)}
-    if isinstance(values.get("of"), list):
-        values["of"] = tuple(values["of"])
+    own = (*more, "tolerances", "statistic", "samples")
+    values = {k: v for k, v in table.items() if k not in ("quantity", *own)}
+    for key in ("of", "prices"):
+        if isinstance(values.get(key), list):
+            values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in values[key])
     if "mode" in values:
         count(values["mode"], f"{section}.mode")
-    return called(_QUANTITIES[name], values, section), {k: table[k] for k in more if k in table}
+    quantity = called(_QUANTITIES[name], values, section)
+    if "tolerances" in table:
+        how = table.get("statistic", "expected")
+        if how not in _STATISTICS:
+            raise InputError(f"{section}.statistic", f"is {how!r}; {closest(str(how), list(_STATISTICS))}")
+        quantity = _STATISTICS[how](quantity, table["tolerances"], samples=table.get("samples", 64))
+    return quantity, {k: table[k] for k in more if k in table}
 
 
 TEMPLATE = """# A design: which numbers of the scene may change, what keeps its value, what is wanted.
@@ -132,7 +162,23 @@ value = "570 rpm"                 # left out: what it is in the scene
 [[hold]]
 quantity = "support_frequency_squared"   # the sum of k/M over the supports: how soft the machine may stand
 
+# [[demand]]                      # at_most, at_least or both
+# quantity = "amplitude"
+# mode = 3
+# of = [1, 2]
+# at_least = "2 mm"
+# tier = "exact"                  # of the exact motion; "leading" (of light loads) unless said otherwise
+
+# [ties]                          # what follows what: equal, or [name, factor], or [name, "keep"] for the present ratio
+# "machine.stiffness[1]" = "machine.stiffness[0]"
+
+# [choices]                       # values that can be had, such as springs of a catalogue; numbers of loads
+# "machine.stiffness[0]" = ["20 N/mm", "25 N/mm", "32 N/mm"]
+# "loads.count" = [2, 3, 4]
+
 [objective]
+# tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }    # over machines that are off by so much:
+# statistic = "worst"             # the worst of them; "expected": the mean
 quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
 mode = 3
 of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); a number: that platform's own

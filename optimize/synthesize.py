@@ -1,35 +1,33 @@
-"""From a design space and a wish to a machine, checked by time integration."""
+"""From a design space and a wish to a machine, checked by the exact motion and by time integration."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError, InputError
-from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.scene_field import SCENE
-from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
-from jaxvib.results.fields import in_unit
-from jaxvib.results.result import Result
-from jaxvib.results.status import Computed
-from jaxvib.steady.jams.jam import JamStatus, jam_modes
+from jaxvib.results.status import failure
 from jaxvib.units import count
-from optimize.quantities import Pair, Quantity, between, force_per_amplitude
-from optimize.search import Search, descend, draw_starts, polish
+from optimize.quantities import amplitude, force_per_amplitude, foundation_force, jam_frequency
+from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
+from optimize.search.find import Found, Options, choose
+from optimize.search.polish import FEASIBLE
+from optimize.search.problem import Problem, made, problem_of, reported
+from optimize.search.sense import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from optimize.wishes.answers import Answers
+from optimize.wishes.jams import between
+from optimize.wishes.quantity import Demand, Quantity, walk
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
@@ -39,168 +37,48 @@ _CONVERGED = 1e-6
 _SAME = 1e-3
 """How near two designs must be, relative to the ranges of the free numbers, to count as the same machine."""
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """A machine in numbers, in one jam mode.
-
-    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m,
-    of platform 1 (y1) first, and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not
-    exist.
-    """
-
-    parameters: dict[str, float | list[float]]
-    exists: bool
-    omega: float
-    amplitude: tuple[float, ...]
-    foundation_force: float
-    force_per_amplitude: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """The same for JSON: freed numbers beside the quantities, None where there is no number."""
-
-        def plain(value: float) -> float | None:
-            return value if math.isfinite(value) else None
-
-        return {
-            **self.parameters,
-            "omega": plain(self.omega),
-            "amplitude": [plain(a) for a in self.amplitude],
-            "foundation_force": plain(self.foundation_force),
-            "force_per_amplitude": plain(self.force_per_amplitude),
-        }
-
-
-class Synthesis(Result):
-    """What a search found.
-
-    **Attributes**: `scene` the best design; `before`, `after` its `Outcome` by the jam's equations, `verified` by time
-    integration of the full equations from `run` (both None where that was not done or failed: `unverified` says why); `starts`
-    searches made, from `drawn` random designs;
-    `converged` how many of them ended where no free number can improve; `same` how many ended at the best design; `designs`
-    (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history` (iterations,
-    starts) of the objective; `objective` and `unit` its name and unit.
-    """
-
-    status = Computed.done
-
-    scene: Scene = eqx.field(metadata=SCENE)
-    before: Outcome
-    after: Outcome
-    verified: Outcome | None
-    run: Run | None
-    unverified: str
-    starts: int
-    drawn: int
-    converged: int
-    same: int
-    designs: np.ndarray = eqx.field(metadata=in_unit("", "start", "parameter"))
-    values: np.ndarray = eqx.field(metadata=in_unit("", "start"))
-    done: np.ndarray = eqx.field(metadata=in_unit("", "start"))
-    history: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
-    objective: str
-    unit: str
-
-    def summary(self) -> str:
-        """Before, after and verified, for a person to read."""
-        rows = [("before", self.before), ("after", self.after)] + ([("verified", self.verified)] if self.verified else [])
-        lines = [f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"]
-        for name, outcome in rows:
-            numbers = ", ".join(f"{key} {_show(value)}" for key, value in outcome.parameters.items())
-            lines.append(f"  {name}: {numbers}")
-            if outcome.exists:
-                lines.append(
-                    f"    Omega {outcome.omega:.6g} rad/s, amplitude {_show(list(outcome.amplitude))} m, foundation force "
-                    f"{outcome.foundation_force:.4g} N, force per amplitude {outcome.force_per_amplitude:.4g} N/m"
-                )
-            else:
-                lines.append("    this jam mode does not exist")
-        if self.unverified:
-            lines.append(f"  not verified: {self.unverified}")
-        return "\n".join(lines)
-
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """Every quantity after the search against before.
-
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
-        """
-        from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
-
-        names = amplitude_names(self.scene)
-        return before_after(
-            _flat(self.before, names), _flat(self.after, names), title=f"search for {wanted(self.objective)}", ax=ax
-        )
-
-    def plot_convergence(self, *, ax: Axes | None = None) -> Figure:
-        """The objective of every start over the iterations.
-
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
-        """
-        from jaxvib.draw.charts import convergence
-
-        return convergence(
-            self.history, best=int(np.argmin(self.values)), label=f"{self.objective}, {self.unit}".rstrip(", "), ax=ax
-        )
-
-
-def wanted(objective: str) -> str:
-    """The objective in words."""
-    return f"greatest {objective.removeprefix('negative ')}" if objective.startswith("negative ") else f"least {objective}"
-
-
-def _show(value: float | list[float]) -> str:
-    return ", ".join(f"{v:.5g}" for v in value) if isinstance(value, list) else f"{value:.5g}"
-
-
-def amplitude_names(scene: Scene) -> list[str]:
-    """Names of the coordinates' amplitudes: that of platform 1 is the coordinate y1's."""
-    names = scene.machine.structure().coordinates
-    if not isinstance(scene.machine, Platforms):
-        return [f"amplitude of {name}" for name in names]
-    return [f"amplitude of platform {k + 1} ({name})" for k, name in enumerate(names)]
-
-
-def _flat(outcome: Outcome, names: list[str]) -> dict[str, float]:
-    flat: dict[str, float] = {}
-    for name, value in outcome.parameters.items():
-        if isinstance(value, list):
-            flat.update({f"{name}[{k}]": v for k, v in enumerate(value)} if len(value) > 1 else {name: value[0]})
-        else:
-            flat[name] = value
-    flat["jam frequency, rad/s"] = outcome.omega
-    flat.update({f"{name}, m": a for name, a in zip(names, outcome.amplitude, strict=True)})
-    flat["foundation force, N"] = outcome.foundation_force
-    flat["force per amplitude, N/m"] = outcome.force_per_amplitude
-    return flat
+Tell = Callable[[str, float], None]
 
 
 def synthesize(
     space: DesignSpace,
     objective: Quantity,
     *,
+    subject_to: Sequence[Demand] = (),
     starts: int = 256,
     seed: int = 0,
     iterations: int = 100,
     polishing: int = 12,
     rate: float = 0.05,
+    begin: Synthesis | None = None,
     verify: bool = True,
-    progress: Callable[[str, float], None] | None = None,
+    throw: bool = True,
+    progress: Tell | None = None,
 ) -> Synthesis:
-    """Searches a design space from many random starts at once for the least value of a quantity.
+    """Searches a design space from many random starts at once for the least value of a quantity, subject to demands.
 
     Starts are drawn evenly from the bounds and moved onto what is held; Adam (optax) descends from all of them at once, each
-    step along what is held; Newton's method with a line search polishes. Gradients are those of the jam's equations.
+    step along what is held, demands by an augmented Lagrangian; sequential quadratic programming with exact first derivatives
+    polishes. Catalogues are chosen from by branch and bound, numbers of loads by trying each. Jam modes are followed from one
+    design to the next and looked up on the whole branch in the end.
 
     **Arguments**
 
-    - `space`: a `DesignSpace`; `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`
+    - `space`: a `DesignSpace`; `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`; what shall be large is written
+      `-quantity`
+    - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
     - `starts`, `seed`: how many random starts, and which; `iterations` of the descent with first step `rate` (in parts of a
-      free number's range), then `polishing` steps of Newton's method
-    - `verify`: integrate the full equations of the best design, from its jam until it has settled, and measure
-    - `progress`: called with what is being done and how much of it is (0 to 1)
+      free number's range), then `polishing` steps of sequential quadratic programming
+    - `begin`: go on from where another search of this space ended, in place of random starts
+    - `verify`: compute the exact motion of the best design, integrate its full equations from the jam until they have settled,
+      and measure
+    - `throw`: raise where demands contradict each other; otherwise the status and `limits` say so
+    - `progress`: called with what is being done and how much of it is (0 to 1). An interrupt (Ctrl-C) ends the search with the
+      best that it has
 
     **Returns** `Synthesis`. **Raises** `InputError` for values that are not allowed, `ComputationError` (status
-    "no_feasible_start") if no design in the bounds has the objective and keeps what is held.
+    "no_feasible_start" if no design in the bounds has the objective, "contradictory" where no design meets all demands: it names
+    those that are not met, and by how much).
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -215,104 +93,237 @@ def synthesize(
 
     Source: the antiphase paper, section 5.1, found there by algebra.
     """
+    options = _options(starts, seed, iterations, polishing, rate)
+    demands = _checked(space, objective, subject_to)
+    tell = progress or (lambda _what, _share: None)
+    if begin is not None:
+        options = dataclasses.replace(options, begin=_begun(space, begin), starts=len(begin.designs))
+    space, problem, found = _searched(space, objective, demands, options, tell)
+    best = found.best
+    others = made(problem, neighbours(problem, found))
+    scene = checked(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), others))
+    kept = found.violation < 10.0 * FEASIBLE
+    done = kept & (found.left < _CONVERGED)
+    values = np.where(kept, found.point.values[:, 0], np.inf)
+    if not kept[best]:
+        status = SynthesisStatus.contradictory
+    elif found.interrupted:
+        status = SynthesisStatus.interrupted
+    else:
+        status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
+
+    named = _named(space, scene, objective, demands)
+    sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
+    batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
+    told = reported((*(q for _, q in named), objective, *sides), batch, problem)
+    limits = limits_of(problem, found, told[1, len(named) + 1 :].reshape(-1, 2))
+    if throw and not kept[best]:
+        broken = "; ".join(
+            f"{x.what}: at best {x.value:.5g} {x.unit}, {100.0 * x.broken:.3g} % off" for x in limits if x.broken
+        )
+        raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
+    tell("checking", 0.9)
+    verify = verify and bool(kept[best])
+    run, unverified = _run(scene, objective.mode, verify)
+    other = _other_tiers(scene, [q for _, q in named], verify, run, objective.mode)
+    rows = _table(space, scene, named, told[:2, : len(named)], other)
+    n = len(_standard(scene, objective))
+    before, after = (_outcome(space, s, told[k, :n]) for k, s in enumerate((space.scene, scene)))
+    verified = None if run is None else _by_run(space, run, objective)
+    tell("done", 1.0)
+    return Synthesis(
+        status=status,
+        scene=scene,
+        before=before,
+        after=after,
+        verified=verified,
+        run=run,
+        unverified=unverified,
+        starts=len(found.point.z),
+        drawn=found.drawn,
+        converged=int(np.sum(done)),
+        same=int(np.sum(kept & (np.max(np.abs(found.point.z - found.point.z[best]), axis=1) < _SAME))),
+        designs=found.point.z,
+        values=values,
+        done=done,
+        history=found.history,
+        objective=objective.name,
+        unit=objective.unit,
+        kkt=float(found.optimality.kkt[best]),
+        table=rows,
+        limits=limits,
+        influences=influences_of(problem, told[1:, len(named)]),
+        machines=machines_of(problem, found, _SAME),
+    )
+
+
+def _options(starts: int, seed: int, iterations: int, polishing: int, rate: float) -> Options:
     count(starts, "starts")
     count(iterations, "iterations")
     count(polishing, "polishing", low=0)
     if not 0.0 < rate < 1.0:
         raise InputError("rate", f"is {rate!r}; it must be greater than 0 and less than 1")
+    count(seed, "seed", low=0)
+    return Options(starts, seed, iterations, float(rate), polishing)
+
+
+def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Demand]) -> tuple[Demand, ...]:
+    if not isinstance(space, DesignSpace):
+        raise InputError("space", f"is {space!r}; it must be a DesignSpace")
     if not isinstance(objective, Quantity):
         raise InputError("objective", f"is {objective!r}; it must be a Quantity, for example force_per_amplitude(mode=3)")
+    demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
+    for demand in demands:
+        if not isinstance(demand, Demand):
+            raise InputError("subject_to", f"has {demand!r}; write demands such as amplitude(mode=3) > '2 mm'")
+    checked(space.scene)
     between(space.scene, objective.of)
-    if objective.mode is not None:
-        jam_modes(space.scene).select(objective.mode, throw=False)  # says which numbers there are
-    tell = progress or (lambda _what, _share: None)
     if not space.scene.drive.constant:
         raise InputError("drive", f"is {space.scene.drive.kind!r}; a design is sought at one speed, give a ConstantSpeed")
     if space.scene.drive.speed.dtype != jnp.float64:
         raise InputError(
             "scene", 'is in float32; a search needs jax.config.update("jax_enable_x64", True) before the scene is built'
         )
-    count(seed, "seed", low=0)
-    search = Search(space, objective)
+    return demands
 
-    tell("drawing starts", 0.0)
-    drawn = draw_starts(search, starts, seed)
-    if len(drawn.z) == 0:
+
+def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
+    if not isinstance(begin, Synthesis):
+        raise InputError("begin", f"is {begin!r}; it must be the Synthesis of an earlier search of this space")
+    if begin.designs.shape[1] != space.size:
+        raise InputError("begin", f"has {begin.designs.shape[1]} free numbers; this space has {space.size}")
+    return np.asarray(begin.designs)
+
+
+def _searched(
+    space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options, tell: Tell
+) -> tuple[DesignSpace, Problem, Found]:
+    """The best of the searches for each number of loads; of one alone where that is not free."""
+    best: tuple[DesignSpace, Problem, Found] | None = None
+    existing = drawn = 0
+    for loads in space.counts or (space.scene.loads.count,):
+        here = space if loads == space.scene.loads.count else _with_loads(space, loads)
+        problem = problem_of(here, objective, demands, options.starts)
+        if problem.keys and space.scene.loads.circular and not float(space.scene.loads.drag_sum()) > 0.0:  # pyright: ignore
+            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+        found = choose(problem, options, tell)
+        if found is None:
+            continue
+        existing, drawn = existing + found.existing, drawn + found.drawn
+        if best is None or _rank(found) < _rank(best[2]):
+            best = here, problem, found
+    if best is None:
         raise ComputationError(
             "no_feasible_start",
-            f"of {drawn.drawn} random designs in the bounds {drawn.existing} have {objective.name}, and none of those keeps "
-            f"what is held (the nearest is off by {drawn.nearest:.2g} of the value); widen the bounds, hold other values or "
-            "ask for another mode",
+            f"of the random designs in the bounds ({options.starts} starts) none has {objective.words}; widen the bounds or ask "
+            "for another mode",
         )
-    z, descent = descend(search, drawn.z, iterations, rate, lambda share: tell("descending", 0.1 + 0.4 * share))
-    ends = polish(search, z, polishing, lambda share: tell("polishing", 0.5 + 0.4 * share))
-    values = np.where(ends.good, ends.history[-1], np.inf)
-    done = ends.good & (ends.left < _CONVERGED)
-    if not np.any(np.isfinite(values)):
-        raise ComputationError(
-            "diverged",
-            f"no search from {starts} starts ended at a possible design; give a smaller rate (search.rate of a design file)",
-        )
-    best = int(np.argmin(values))
-    scene = space.at(jnp.asarray(ends.z[best]))
-    tell("checking by time integration", 0.9)
-    run, unverified = None, ""
-    if objective.mode is None:
-        unverified = "the objective belongs to no jam mode that could be integrated"
-    elif not verify:
-        unverified = "not asked for"
-    else:
-        try:
-            run = settle(scene, mode=objective.mode)
-        except ComputationError as error:  # the machine that was found is worth more than the check that failed
-            unverified = str(error)
-    tell("done", 1.0)
-    return Synthesis(
-        scene=scene,
-        before=_by_algebra(space, space.scene, objective),
-        after=_by_algebra(space, scene, objective),
-        verified=None if run is None else _by_run(space, run, objective),
-        run=run,
-        unverified=unverified,
-        starts=len(drawn.z),
-        drawn=drawn.drawn,
-        converged=int(np.sum(done)),
-        same=int(np.sum(np.max(np.abs(ends.z - ends.z[best]), axis=1) < _SAME)),
-        designs=ends.z,
-        values=values,
-        done=done,
-        history=np.concatenate([descent, ends.history]),
-        objective=objective.name,
-        unit=objective.unit,
-    )
+    return best
 
 
-def _by_algebra(space: DesignSpace, scene: Scene, objective: Quantity) -> Outcome:
-    mode = objective.mode
-    parameters = space.parameters(scene)
+def _rank(found: Found) -> tuple[bool, float]:
+    kept = bool(found.violation[found.best] < 10.0 * FEASIBLE)
+    return not kept, float(found.point.values[found.best, 0] if kept else found.violation[found.best])
+
+
+def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
+    """The space with another number of loads. **Raises** `InputError` for loads that have numbers of their own."""
+    now = space.scene.loads
+    if not getattr(now, "alike", False):
+        raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
+    scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(now, count=loads))
+    return eqx.tree_at(lambda s: s.scene, space, checked(scene))
+
+
+def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
     if mode is None:
-        nothing = tuple(math.nan for _ in scene.machine.carrier().coordinates)
-        return Outcome(parameters, False, math.nan, nothing, math.nan, math.nan)
-    jam = jam_modes(scene).select(mode, throw=False)
-    return Outcome(
-        parameters=parameters,
-        exists=not bool(jam.status == JamStatus.absent),
-        omega=float(jam.omega),
-        amplitude=tuple(float(a) for a in jam.amplitude),
-        foundation_force=float(jam.foundation_force),
-        force_per_amplitude=float(force_per_amplitude(mode=mode, of=objective.of)(scene)),
-    )
+        return None, "the objective belongs to no jam mode that could be integrated"
+    if not verify:
+        return None, "not asked for"
+    try:
+        return settle(scene, mode=mode), ""
+    except ComputationError as error:  # the machine that was found is worth more than the check that failed
+        return None, str(error)
+
+
+def _standard(scene: Scene, objective: Quantity) -> list[tuple[str, Quantity]]:
+    """What a table of a machine in a jam mode tells besides."""
+    mode = objective.mode
+    if mode is None:
+        return []
+    rows = [("jam frequency", jam_frequency(mode=mode))]
+    rows += [(name, amplitude(mode=mode, of=k + 1)) for k, name in enumerate(amplitude_names(scene))]
+    rows += [("foundation force", foundation_force(mode=mode))]
+    return [*rows, ("force per amplitude", force_per_amplitude(mode=mode, of=objective.of))]
+
+
+def _named(space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand]) -> list[tuple[str, Quantity]]:
+    """The quantities of the table: the standard ones of a jam, then what is sought, held and demanded besides."""
+    standard = _standard(scene, objective)
+    sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
+    own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
+    known = {q for _, q in standard}
+    return standard + [(q.words, q) for q in dict.fromkeys(own) if q not in known]
+
+
+def _table(
+    space: DesignSpace,
+    scene: Scene,
+    named: Sequence[tuple[str, Quantity]],
+    values: np.ndarray,
+    other: tuple[list[float], list[float]],
+) -> tuple[Row, ...]:
+    """Free numbers and quantities before and after."""
+    start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.places]) for s in (space.scene, scene))
+    numbers = zip(space.words(), start, end, strict=True)
+    table = [Row(word, unit, float(a), float(b), math.nan, math.nan) for (word, unit), a, b in numbers]
+    if space.counts:
+        counts = float(space.scene.loads.count), float(scene.loads.count)
+        table.append(Row("number of loads", "", *counts, math.nan, math.nan))
+    told = zip(named, *values, *other, strict=True)
+    return tuple(table + [Row(name, q.unit, float(b), float(a), e, t) for (name, q), b, a, e, t in told])
+
+
+def _other_tiers(
+    scene: Scene, quantities: Sequence[Quantity], verify: bool, run: Run | None, mode: int | None
+) -> tuple[list[float], list[float]]:
+    """The same quantities of the exact motion, and of the run that checks the design; NaN where they have no such tier."""
+
+    def value(quantity: Quantity, answers: Answers, tier: str) -> float:
+        other = quantity.at_tier(tier)  # pyright: ignore[reportArgumentType]
+        if other == quantity and tier not in {getattr(q, "tier", None) for q in walk(quantity)}:
+            return math.nan
+        if tier == "time" and any(getattr(q, "tier", tier) != tier or hasattr(q, "case") for q in walk(other)):
+            return math.nan
+        try:
+            return float(other.read(answers))
+        except (InputError, ComputationError):  # a theory that does not hold this scene
+            return math.nan
+
+    answers = Answers(scene)
+    exact = [value(q, answers, "exact") if verify else math.nan for q in quantities]
+    if run is None or mode is None:
+        return exact, [math.nan] * len(exact)
+    measured = Answers(scene)
+    measured.keep_run(mode, run)
+    return exact, [value(q, measured, "time") for q in quantities]
+
+
+def _outcome(space: DesignSpace, scene: Scene, values: np.ndarray) -> Outcome:
+    numbers = [float(v) for v in values] or [math.nan] * (3 + len(scene.machine.structure().coordinates))
+    omega, *amplitudes, force, ratio = numbers
+    return Outcome(space.parameters(scene), math.isfinite(omega), omega, tuple(amplitudes), force, ratio)
 
 
 def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
-    of: Pair = between(run.scene, objective.of)
-    force = float(run.foundation_force)
-    whose = float(run.amplitude[of - 1]) if isinstance(of, int) else float(relative_amplitude(run.window, *of))
+    answers = Answers(run.scene)
+    mode = objective.mode or 1
+    answers.keep_run(mode, run)
     return Outcome(
         parameters=space.parameters(run.scene),
         exists=True,
         omega=float(run.omega),
         amplitude=tuple(float(a) for a in run.amplitude),
-        foundation_force=force,
-        force_per_amplitude=force / whose,
+        foundation_force=float(run.foundation_force),
+        force_per_amplitude=float(force_per_amplitude(mode=mode, of=objective.of, tier="time").read(answers)),
     )

@@ -33,7 +33,7 @@ from jaxvib.study.capture.capture import _judged
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
-from optimize.synthesize import Outcome, Synthesis
+from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
 
 DATA = pathlib.Path(__file__).parent / "data"
 MACHINE = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
@@ -75,7 +75,15 @@ def synthesis():
     outcome = Outcome({"machine.stiffness": [4e4]}, True, 27.0, (1e-3,), 100.0, 1e5)
     rest = dict(unverified="not asked for", starts=2, drawn=9, converged=1, same=1, objective="amplitude", unit="m")
     found = dict(designs=np.zeros((2, 1)), values=np.ones(2), done=np.array([True, False]), history=np.ones((3, 2)))
-    return Synthesis(scene=SCENE, before=outcome, after=outcome, verified=None, run=None, **rest, **found)
+    told = dict(
+        status=SynthesisStatus.done,
+        kkt=1e-9,
+        table=(Row("stiffness of the support", "N/m", 4e4, 5e4, float("nan"), float("nan")),),
+        limits=(Limit("power drawn, mode 1 at most 50 W", "W", 50.0, 50.0, 0.0, True, -0.1, -0.1),),
+        influences=(Influence("stiffness of the support", -1.0, 1.0),),
+        machines=(Machine(1, 1e-3, (5e4,)), Machine(1, 2e-3, (4e4,))),
+    )
+    return Synthesis(scene=SCENE, before=outcome, after=outcome, verified=None, run=None, **rest, **found, **told)
 
 
 def audited():

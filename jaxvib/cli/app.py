@@ -113,7 +113,7 @@ _HOMES = {
     "criterion": "criterion",
     "modes": "modes",
     "new": "commands",
-    "optimize": "commands",
+    "optimize": "optimize",
     "simulate": "commands",
 }
 """The module of `jaxvib.cli` that holds each command."""

@@ -1,4 +1,4 @@
-"""jaxvib new, simulate, optimize."""
+"""jaxvib new, simulate."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import Output, app, shared
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.ode.progress import ProgressBar
@@ -18,7 +18,6 @@ from jaxvib.units import number
 if TYPE_CHECKING:
     from jaxvib.motion.start import Start
     from jaxvib.results.fields import Plain
-    from optimize import Outcome, Synthesis
 
 
 @app.command("new")
@@ -139,90 +138,3 @@ def _regime(found: jv.Regime) -> dict[str, Plain]:
         "rotor_caught": bool(found.caught),
         "change": float(found.change),
     }
-
-
-@app.command("optimize")
-@click.argument("design", type=click.Path(path_type=Path))
-@click.option("--starts", type=int, help="Random starts, in place of the design file's.")
-@click.option("--seed", type=int, help="Which random starts, in place of the design file's.")
-@click.option("--no-verify", is_flag=True, help="Do not check the best machine by time integration.")
-@shared
-def optimize(design: Path, starts: int | None, seed: int | None, no_verify: bool, output: Output) -> None:
-    """Search the machine that DESIGN asks for; --out keeps its scene file, the pictures and the motion it was checked by."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    from optimize import load_design, synthesize
-
-    loaded = load_design(design)
-    given = {"starts": starts, "seed": seed}
-    options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        console=Console(stderr=True),
-        transient=True,
-        disable=not sys.stderr.isatty(),
-    ) as bar:
-        task = bar.add_task("", total=1.0)
-        best = synthesize(
-            loaded.space,
-            loaded.objective,
-            verify=not no_verify,
-            progress=lambda what, share: bar.update(task, description=what, completed=share),
-            **options,
-        )
-    for name, save in (
-        ("found.toml", lambda path: jv.save_scene(best.scene, path)),
-        ("before_after.png", lambda path: best.plot().savefig(path)),
-        ("convergence.png", lambda path: best.plot_convergence().savefig(path)),
-    ):
-        path = output.file(name)
-        if path is not None:
-            save(path)
-    if best.run is not None:
-        picture, data = output.file("history.png"), output.file("run.npz")
-        if picture is not None and data is not None:
-            best.run.plot().savefig(picture)
-            best.run.save(data)
-    document = {
-        "objective": best.objective,
-        "before": best.before.as_dict(),
-        "after": best.after.as_dict(),
-        "verified": None if best.verified is None else best.verified.as_dict(),
-        "unverified": best.unverified,
-        "starts": best.starts,
-        "drawn": best.drawn,
-        "converged": best.converged,
-        "same": best.same,
-    }
-    output.done(document, lambda: _outcomes(best), "optimize")
-
-
-def _outcomes(best: Synthesis) -> str:
-    from optimize.synthesize import amplitude_names, wanted
-
-    columns: list[tuple[str, Outcome]] = [("before", best.before), ("after", best.after)]
-    if best.verified is not None:
-        columns.append(("verified", best.verified))
-    rows: list[list[str]] = []
-
-    def row(name: str, read: Any) -> None:
-        rows.append([name, *(f"{read(outcome):.5g}" for _, outcome in columns)])
-
-    for name, value in best.after.parameters.items():
-        if isinstance(value, list):
-            for k in range(len(value)):
-                row(f"{name}[{k}]", lambda o, name=name, k=k: o.parameters[name][k])
-        else:
-            row(name, lambda o, name=name: o.parameters[name])
-    row("jam frequency, rad/s", lambda o: o.omega)
-    for k, name in enumerate(amplitude_names(best.scene)):
-        row(f"{name}, mm", lambda o, k=k: 1e3 * o.amplitude[k])
-    row("foundation force, N", lambda o: o.foundation_force)
-    row("force per amplitude, N/m", lambda o: o.force_per_amplitude)
-    counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
-    checked = "verified: measured on the full equations, integrated until they settled"
-    if best.verified is None:
-        checked = f"not verified: {best.unverified}"
-    return counted + "\n" + table(wanted(best.objective), ["", *(name for name, _ in columns)], rows) + "\n" + checked

@@ -135,21 +135,28 @@ def solid_and_dashed(
         axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name)
 
 
-def before_after(before: Mapping[str, float], after: Mapping[str, float], *, title: str = "", ax: Axes | None = None) -> Figure:
-    """Bars of every quantity after the search, as a multiple of what it was before; the values stand beside them."""
-    shared = [name for name in after if name in before and np.isfinite(before[name]) and before[name] != 0.0]
-    figure, (axis,) = panels(1, size=(8.0, 0.55 * len(shared) + 1.4), ax=ax)
-    ratios = [after[name] / before[name] for name in shared]
-    places = np.arange(len(shared))[::-1]
-    axis.barh(places, ratios, color=COLORS[0], height=0.6)
+def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Figure:
+    """For each (name, before, after) a bar from 1 to after/before on a logarithmic axis, so that what falls a thousandfold is as
+    plain as what grows so; the values stand beside it. What has no ratio is written only."""
+    figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
+    ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
+    drawn = np.isfinite(ratios) & (ratios > 0.0)
+    places = np.arange(len(rows))[::-1]
+    widest = max([1.5, *np.exp(np.abs(np.log(ratios[drawn])))])
+    for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
+        if there:
+            axis.barh(place, ratio - 1.0, left=1.0, color=COLORS[0] if ratio <= 1.0 else COLORS[1], height=0.6)
+        share = f"   ({ratio:.3g} x)" if there else ""
+        axis.text(
+            1.02, place, f"{before:.4g} → {after:.4g}{share}", va="center", fontsize=9, transform=axis.get_yaxis_transform()
+        )
     axis.axvline(1.0, color="black", lw=0.9)
-    for place, name, ratio in zip(places, shared, ratios, strict=True):
-        axis.text(max(ratio, 1.0), place, f"   {before[name]:.4g} → {after[name]:.4g}", va="center", fontsize=9)
-    axis.set_yticks(places, shared)
-    axis.set_xlim(0.0, 1.45 * max([1.0, *ratios]))
+    axis.set_xscale("log")
+    axis.set_xlim(widest**-1.1, widest**1.1)
+    axis.set_yticks(places, [name for name, _, _ in rows])
     axis.set_xlabel("after / before")
     axis.set_title(title)
-    axis.grid(False)
+    axis.grid(False, axis="y")
     return figure
 
 

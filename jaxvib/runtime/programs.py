@@ -36,7 +36,7 @@ __all__ = ["cached"]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib"}), "jaxlib", "numpy")
+_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
 """Whose versions a traced program depends on."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
@@ -212,7 +212,8 @@ def _digest(content: bytes) -> str:
 def _sources() -> str:
     """Changes whenever a line of the code that programs are traced from may have changed."""
     package = Path(__file__).parents[1]
-    files = [file.stat() for file in sorted(package.rglob("*.py"))]
+    packages = [package, package.parent / "optimize"]
+    files = [file.stat() for each in packages for file in sorted(each.rglob("*.py"))]
     versions = [importlib.metadata.version(name) for name in _PACKAGES]
     return f"{versions} {os.environ.get('EQX_ON_ERROR')} {[(file.st_size, file.st_mtime_ns) for file in files]}"
 

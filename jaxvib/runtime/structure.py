@@ -20,7 +20,7 @@ __all__ = ["KNOWN_PACKAGES", "Description", "Undescribable", "describe", "rebuil
 Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
 """What JSON can hold."""
 
-KNOWN_PACKAGES = {"jaxvib", "jax", "equinox", "diffrax", "optimistix", "lineax"}
+KNOWN_PACKAGES = {"jaxvib", "optimize", "jax", "equinox", "diffrax", "optimistix", "optax", "lineax"}
 """Whose classes and functions a description may name: their sources and versions are known."""
 
 

@@ -25,7 +25,7 @@ from jaxvib.units import traced
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_modes"]
+__all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
 
 JUDGED = "by slope, for light loads that stay together"
 """How the stability of a jam mode is judged, and for whom that holds."""
@@ -201,7 +201,7 @@ def _jam_modes(scene: Scene) -> JamModes:
     close = (close | jnp.roll(close, -1))[chosen]
 
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
-        found = _jam_at(model, number, w, n, flat)
+        found = jam_at(model, number, w, n, flat)
         values = jax.tree.map(
             lambda value: jnp.where(is_there, value, jnp.nan) if jnp.issubdtype(value.dtype, jnp.inexact) else value,
             found,
@@ -217,7 +217,7 @@ def _jam_modes(scene: Scene) -> JamModes:
     return JamModes(**fields, resonances=model.modes()[0], folds=pieces.folds)
 
 
-def _jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+def jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
     displacement = model.displacement(omega)
     # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
     radius = jammed_loads(model.scene).unbalance() / jnp.min(jnp.diagonal(model.mass))
@@ -260,7 +260,7 @@ def branch_points(model: LinearModel, omega: Array) -> tuple[Jam, Folds]:
 
     def jam(number: Array, w: Array) -> Jam:
         flat = jnp.abs(branch_slope(model, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
-        return _jam_at(model, number, w, rotor_speed_at(model, w), flat)
+        return jam_at(model, number, w, rotor_speed_at(model, w), flat)
 
     jams = jax.vmap(jam)(numbers, omega)
     return jams, pieces.folds

@@ -109,6 +109,11 @@ class Orbit(Result):
             (jnp.broadcast_to(rate, self.offsets.shape),),
         )
 
+    def relative_amplitude(self, i: int, j: int) -> Array:
+        """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period."""
+        c = self.displacement_harmonics
+        return _swing(np.asarray(self.orders), c[i - 1 : i] - c[j - 1 : j])[0]
+
     def summary(self) -> str:
         """A few lines a person can read; amplitudes zero to peak."""
         kinds = {unit: [k for k, each in enumerate(self.units) if each == unit] for unit in dict.fromkeys(self.units)}
@@ -236,9 +241,9 @@ def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmo
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
     # Directions of the force on the bed are put together as those of a vector.
-    force = jnp.sqrt(jnp.sum(_swing(grid, harmonics.force) ** 2))
+    force = jnp.sqrt(jnp.sum(_swing(grid.orders, harmonics.force) ** 2))
     push = _least_push(model, grid, motion, harmonics)
-    return (*branch, _swing(grid, harmonics.displacement), force, motion.rotor_speed * drive, push)
+    return (*branch, _swing(grid.orders, harmonics.displacement), force, motion.rotor_speed * drive, push)
 
 
 def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
@@ -257,9 +262,9 @@ def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, har
     return jnp.min(-jnp.cumsum(needed)[:-1])
 
 
-def _swing(grid: Grid, harmonics: Array) -> Array:
+def _swing(orders: np.ndarray, harmonics: Array) -> Array:
     """(max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
-    orders = grid.orders
+    symmetric = bool(np.all(orders % 2 == 1))  # the signal turns its sign in half a period
     samples = 2.0 * np.pi * np.arange(max(64, 4 * int(orders[-1]))) / max(64, 4 * int(orders[-1]))
     spacing = samples[1]
     signal = (harmonics @ np.exp(1j * orders[:, None] * samples)).real
@@ -279,6 +284,6 @@ def _swing(grid: Grid, harmonics: Array) -> Array:
 
     def swing(c: Array, values: Array) -> Array:
         highest = extremum(c, values, 1.0)
-        return highest if grid.symmetric else (highest - extremum(c, values, -1.0)) / 2.0
+        return highest if symmetric else (highest - extremum(c, values, -1.0)) / 2.0
 
     return jax.vmap(swing)(harmonics, signal)

@@ -1,0 +1,104 @@
+"""jaxvib optimize."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+
+if TYPE_CHECKING:
+    from optimize import Synthesis
+
+
+@app.command("optimize")
+@click.argument("design", type=click.Path(path_type=Path))
+@click.option("--starts", type=int, help="Random starts, in place of the design file's.")
+@click.option("--seed", type=int, help="Which random starts, in place of the design file's.")
+@click.option(
+    "--resume", type=click.Path(path_type=Path), help="Go on from the search.npz of an earlier search of this design."
+)
+@click.option("--no-verify", is_flag=True, help="Do not check the best machine by its exact motion and by time integration.")
+@shared
+def optimize(design: Path, starts: int | None, seed: int | None, resume: Path | None, no_verify: bool, output: Output) -> None:
+    """Search the machine that DESIGN asks for; --out keeps its scene file, the search, the pictures and the motion it was
+    checked by. Ctrl-C ends the search with the best machine so far; --resume goes on from there."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from optimize import Synthesis, load_design, synthesize
+
+    loaded = load_design(design)
+    given = {"starts": starts, "seed": seed}
+    options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    ) as bar:
+        task = bar.add_task("", total=1.0)
+        best = synthesize(
+            loaded.space,
+            loaded.objective,
+            subject_to=loaded.subject_to,
+            begin=None if resume is None else Synthesis.load(resume),
+            verify=not no_verify,
+            progress=lambda what, share: bar.update(task, description=what, completed=share),
+            **options,
+        )
+    for name, save in (
+        ("search.npz", lambda path: best.save(path)),
+        ("found.toml", lambda path: jv.save_scene(best.scene, path)),
+        ("before_after.png", lambda path: best.plot().savefig(path)),
+        ("convergence.png", lambda path: best.plot_convergence().savefig(path)),
+    ):
+        path = output.file(name)
+        if path is not None:
+            save(path)
+    if best.run is not None:
+        picture, data = output.file("history.png"), output.file("run.npz")
+        if picture is not None and data is not None:
+            best.run.plot().savefig(picture)
+            best.run.save(data)
+    output.done(_document(best), lambda: _text(best), "optimize")
+
+
+def _document(best: Synthesis) -> dict:
+    return {
+        "status": best.status_name,
+        "message": best.message,
+        "objective": best.objective,
+        "before": best.before.as_dict(),
+        "after": best.after.as_dict(),
+        "verified": None if best.verified is None else best.verified.as_dict(),
+        "unverified": best.unverified,
+        "starts": best.starts,
+        "drawn": best.drawn,
+        "converged": best.converged,
+        "same": best.same,
+        "kkt": best.kkt,
+        "table": [row._asdict() for row in best.table],
+        "limits": [limit._asdict() for limit in best.limits],
+        "influences": [each._asdict() for each in best.influences],
+        "machines": [{**each._asdict(), "numbers": list(each.numbers)} for each in best.machines],
+    }
+
+
+def _text(best: Synthesis) -> str:
+    from optimize.result import wanted
+
+    counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
+    rows = best.rows()
+    columns = [k for k in range(len(rows[0])) if k < 3 or any(row[k] for row in rows)]
+    heads = ["", "before", "after", "exact", "verified"]
+    drawn = table(wanted(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
+    checked = "verified: measured on the full equations, integrated until they settled"
+    if best.verified is None:
+        checked = f"not verified: {best.unverified}"
+    return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.said()), checked])

@@ -1,0 +1,86 @@
+"""Jam modes and folds followed from a machine to one that differs a little: a few steps of Newton's method each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.linear import LinearModel
+from jaxvib.steady.jams.folds import branch_slope, rotor_speed_at
+from jaxvib.steady.jams.jam import Jam, jam_at
+
+__all__ = ["follow_fold", "follow_jam"]
+
+_STEPS = 6
+"""Of Newton's method; it converges quadratically from a near machine, and what has not converged is NaN."""
+
+
+def follow_jam(model: LinearModel, mode: int, near: Array) -> Jam:
+    """The jam mode of that number whose load speed is near `near` (scalar, rad/s), at the scene's rotor speed n.
+
+    Newton's method on (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`: beside a resonance at w_r the left side is
+    close to a multiple of |w - w_r|, so that few steps lead far. `jam_modes` looks at the whole branch and takes a hundred
+    times as long; it says which number a mode has, and this does not: modes that exchange numbers on the way are not noticed.
+
+    **Returns** `Jam`, its numbers NaN where the iteration has not converged or ended on a piece of the branch of the other
+    direction. First derivatives are exact.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.equations.linear import linear_model
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> round(float(follow_jam(linear_model(form.scene()), 3, 0.95).omega), 4)
+    0.9721
+    """
+    speed = model.scene.drive.speed
+    still = jax.lax.stop_gradient(model)
+    target = jax.lax.stop_gradient(speed)
+
+    def gap(w: Array) -> Array:
+        torque = rotor_speed_at(still, w) - w
+        return jax.lax.rsqrt(jnp.maximum(torque, 1e-300)) - jax.lax.rsqrt(target - w)
+
+    omega = _newton(gap, near, target)
+    ahead, slope = jax.jvp(lambda w: rotor_speed_at(still, w), (omega,), (jnp.ones_like(omega),))
+    # The step from the root that this is has no length, and the root's derivatives.
+    omega = omega - (rotor_speed_at(model, omega) - speed) / slope
+    met = jnp.abs(ahead - target) < 1e-9 * (target + jnp.abs(slope) * omega)
+    there = met & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
+    jam = jam_at(model, jnp.asarray(mode), jnp.where(there, omega, jnp.nan), speed, jnp.asarray(False))
+    return eqx.tree_at(lambda j: j.stable, jam, there & jam.stable)
+
+
+def follow_fold(model: LinearModel, near: Array) -> tuple[Array, Array]:
+    """Load speed and rotor speed, rad/s, of the fold near the load speed `near` (scalar, rad/s), see `Folds`.
+
+    Newton's method on n'(w)/(n(w) - w)^2 = 0, which is close to linear about a resonance. **Returns** NaN where it has not
+    converged; first derivatives are exact (that of the rotor's speed needs none of the load speed: the branch is flat there).
+    """
+    still = jax.lax.stop_gradient(model)
+
+    def flat(w: Array) -> Array:
+        return branch_slope(still, w) / jnp.maximum(rotor_speed_at(still, w) - w, 1e-300) ** 2
+
+    omega = _newton(flat, near, jnp.asarray(jnp.inf, near.dtype))
+    slope, bend = jax.jvp(lambda w: branch_slope(still, w), (omega,), (jnp.ones_like(omega),))
+    omega = omega - branch_slope(model, omega) / bend
+    met = jnp.abs(slope) < 1e-7 * jnp.abs(bend * omega)
+    omega = jnp.where(met & (omega > 0.0), omega, jnp.nan)
+    return omega, rotor_speed_at(model, omega)
+
+
+def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
+    """Newton's method; no step is longer than a tenth of the unknown, and the unknown stays below `most`."""
+
+    def step(_: int, w: Array) -> Array:
+        value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))
+        reach = 0.1 * w
+        new = w - jnp.clip(jnp.nan_to_num(value / slope), -reach, reach)
+        return jnp.where(new < most, new, 0.5 * (w + most))
+
+    return jax.lax.stop_gradient(jax.lax.fori_loop(0, _STEPS, step, jax.lax.stop_gradient(start)))

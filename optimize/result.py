@@ -1,0 +1,232 @@
+"""What a search found, and what a person reads of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.scene_field import SCENE
+from jaxvib.motion.run import Run
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from optimize.space.numbers import shown_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["Influence", "Limit", "Machine", "Outcome", "Row", "Synthesis", "SynthesisStatus", "amplitude_names", "wanted"]
+
+
+class SynthesisStatus(eqx.Enumeration):
+    """How a search ended; the members are the sentences a user reads."""
+
+    done = "the search ended where no free number can improve the objective"
+    not_converged = "the best design that was found could still be improved: allow more polishing or more iterations"
+    contradictory = "no design in the bounds meets all demands at once"
+    interrupted = "the search was interrupted: this is the best it had"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A machine in numbers, in one jam mode.
+
+    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m,
+    of platform 1 (y1) first, and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not
+    exist.
+    """
+
+    parameters: dict[str, float | list[float]]
+    exists: bool
+    omega: float
+    amplitude: tuple[float, ...]
+    foundation_force: float
+    force_per_amplitude: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same for JSON: freed numbers beside the quantities, None where there is no number."""
+
+        def plain(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        return {
+            **self.parameters,
+            "omega": plain(self.omega),
+            "amplitude": [plain(a) for a in self.amplitude],
+            "foundation_force": plain(self.foundation_force),
+            "force_per_amplitude": plain(self.force_per_amplitude),
+        }
+
+
+class Row(NamedTuple):
+    """A line of the table: `what` in words, its SI `unit`; values `before` and `after`, of the exact motion `exact` and by time
+    integration `time`, NaN where there is none."""
+
+    what: str
+    unit: str
+    before: float
+    after: float
+    exact: float
+    time: float
+
+
+class Limit(NamedTuple):
+    """A demand, something held, or a bound: `what` in words; its `value` and `limit` in SI `unit`; by how much it is `broken`
+    (0: kept), in parts of the limit; whether it is `active`; the `multiplier`, the objective's change where the limit is moved by
+    the whole of itself to where it hinders less (what is held: upward); `gain`, that change in per cent of the objective where
+    the limit is moved by 1 %: negative is an improvement."""
+
+    what: str
+    unit: str
+    value: float
+    limit: float
+    broken: float
+    active: bool
+    multiplier: float
+    gain: float
+
+
+class Influence(NamedTuple):
+    """How much a free number matters: `what` in words; the objective's change in per cent where it is 1 % `less` and `more`,
+    nothing else changed."""
+
+    what: str
+    less: float
+    more: float
+
+
+class Machine(NamedTuple):
+    """One of the different machines that were found: how `often`, the objective's `value`, the free `numbers`, SI."""
+
+    often: int
+    value: float
+    numbers: tuple[float, ...]
+
+
+class Synthesis(Result):
+    """What a search found.
+
+    **Attributes**: `status` a `SynthesisStatus`; `scene` the best design; `before`, `after` its `Outcome` by the jam's equations,
+    `verified` by time integration of the full equations from `run` (both None where that was not done or failed: `unverified`
+    says why); `table` of `Row`: every free number and quantity before and after, exact and in time; `limits` of `Limit`: demands,
+    what is held, and bounds that are active, with what moving each would gain; `influences` of `Influence`; `machines` of
+    `Machine`: the different machines found, best first, and how often; `kkt` the residual of the Karush-Kuhn-Tucker conditions of
+    the best design, relative; `starts` searches made, from `drawn` random designs; `converged` how many of them ended where no
+    free number can improve; `same` how many ended at the best design; `designs` (starts, d) in [0, 1] where each search ended,
+    with their `values` and whether each is `done`; `history` (iterations, starts) of the objective; `objective` and `unit` its
+    name and unit.
+    """
+
+    status: SynthesisStatus
+    scene: Scene = eqx.field(metadata=SCENE)
+    before: Outcome
+    after: Outcome
+    verified: Outcome | None
+    run: Run | None
+    unverified: str
+    starts: int
+    drawn: int
+    converged: int
+    same: int
+    designs: np.ndarray = eqx.field(metadata=in_unit("", "start", "parameter"))
+    values: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    done: np.ndarray = eqx.field(metadata=in_unit("", "start"))
+    history: np.ndarray = eqx.field(metadata=in_unit("", "iteration", "start"))
+    objective: str
+    unit: str
+    kkt: float = math.nan
+    table: tuple[Row, ...] = ()
+    limits: tuple[Limit, ...] = ()
+    influences: tuple[Influence, ...] = ()
+    machines: tuple[Machine, ...] = ()
+
+    def summary(self) -> str:
+        """Before, after and verified, what hinders, what matters, for a person to read."""
+        counted = f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"
+        lines = [f"{wanted(self.objective)}: {self.message}", counted]
+        lines += [" ".join(line) for line in _aligned([["", "before", "after", "exact", "verified"], *self.rows()])]
+        if self.unverified:
+            lines.append(f"  not verified: {self.unverified}")
+        lines += self.said()
+        return "\n".join(line.rstrip() for line in lines)
+
+    def rows(self) -> list[list[str]]:
+        """The table as text, units that a designer reads: what, before, after, of the exact motion, verified in time."""
+        out = []
+        for row in self.table:
+            sizes = [abs(v) for v in row[2:] if math.isfinite(v)]
+            unit, factor = shown_unit(row.unit, max(sizes, default=0.0))
+            values = ["" if math.isnan(v) else f"{v * factor:.5g}" for v in row[2:]]
+            out.append([f"{row.what}, {unit}".rstrip(", "), *values])
+        return out
+
+    def said(self) -> list[str]:
+        """Lines on demands, on what is held and bounds, on influences, and on the machines found."""
+        lines = []
+        for limit in self.limits:
+            unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
+            values = f"{limit.value * factor:.5g} {unit}".rstrip()
+            if limit.broken > 0.0:
+                lines.append(f"  not met: {limit.what}; at best {values}, {100.0 * limit.broken:.3g} % off")
+            elif limit.active:
+                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {limit.gain:+.3g} % of the objective")
+            else:
+                lines.append(f"  met: {limit.what} ({values})")
+        ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
+        for each in ranked[:5]:
+            lines.append(f"  1 % less / more {each.what}: {each.less:+.3g} % / {each.more:+.3g} % of the objective")
+        if len(self.machines) > 1:
+            seen = ", ".join(f"{m.often} x {m.value:.4g}" for m in self.machines[:6])
+            lines.append(f"  {len(self.machines)} different machines: {seen} {self.unit}".rstrip())
+        return lines
+
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Every quantity after the search against before, by ratio on a logarithmic axis.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
+        from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
+
+        shown = []
+        for row in self.table:
+            unit, factor = shown_unit(row.unit, max(abs(row.before), abs(row.after)))
+            shown.append((f"{row.what}, {unit}".rstrip(", "), row.before * factor, row.after * factor))
+        return before_after(shown, title=f"search for {wanted(self.objective)}", ax=ax)
+
+    def plot_convergence(self, *, ax: Axes | None = None) -> Figure:
+        """The objective of every start over the iterations.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
+        from jaxvib.draw.charts import convergence
+
+        best = int(np.argmin(self.values)) if np.any(np.isfinite(self.values)) else 0
+        return convergence(self.history, best=best, label=f"{self.objective}, {self.unit}".rstrip(", "), ax=ax)
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return [
+        ["  " + row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))] for row in rows
+    ]
+
+
+def wanted(objective: str) -> str:
+    """The objective in words."""
+    words = objective.replace("_", " ")
+    return f"greatest {words.removeprefix('negative ')}" if words.startswith("negative ") else f"least {words}"
+
+
+def amplitude_names(scene: Scene) -> list[str]:
+    """Names of the coordinates' amplitudes: that of platform 1 is the coordinate y1's."""
+    names = scene.machine.structure().coordinates
+    if not isinstance(scene.machine, Platforms):
+        return [f"amplitude of {name}" for name in names]
+    return [f"amplitude of platform {k + 1} ({name})" for k, name in enumerate(names)]

@@ -1,0 +1,1 @@
+"""Who searches: many starts at once, a descent on optax, sequential quadratic programming, catalogues by branch and bound."""

@@ -1,0 +1,165 @@
+"""Adam (optax) from many starts at once: along what is held, demands by an augmented Lagrangian."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from jaxvib.numerics.linalg import small_solve
+from jaxvib.runtime.programs import cached
+from optimize.search.problem import Point, Problem, chunked, derive
+
+__all__ = ["STRETCH", "Descended", "descend"]
+
+STRETCH = 25
+"""Steps of the descent between two looks at it from outside."""
+
+_ON_THE_WAY = 0.1
+"""How well what is held must be kept during the descent, where every step corrects what the one before left."""
+
+_UPDATE = 20
+"""Steps after which the multipliers of demands are set anew."""
+
+
+class _Lane(NamedTuple):
+    """One search on its way: the point, Adam's state, how long its steps are, multipliers and weight of the demands, the size
+    that the objective began with, and how many steps it has taken."""
+
+    z: Array
+    values: Array
+    slopes: Array
+    known: tuple[Array, ...]
+    reach: tuple[Array, ...]
+    adam: optax.OptState
+    length: Array
+    multipliers: Array
+    weight: Array
+    worst: Array
+    size: Array
+    count: Array
+
+
+class Descended(NamedTuple):
+    """Where the descent ended, a `Point`, the multipliers of the demands there and the objective on the way (steps, starts)."""
+
+    point: Point
+    multipliers: np.ndarray
+    history: np.ndarray
+
+
+_ADAM = optax.scale_by_adam()
+
+
+def _least(rows: Array, right: Array) -> Array:
+    """The shortest x (d,) with rows (m, d) x = right (m,)."""
+    gram = rows @ rows.T
+    ridge = jnp.finfo(gram.dtype).eps * (1.0 + jnp.trace(gram))
+    return rows.T @ small_solve(gram + ridge * jnp.eye(gram.shape[0]), right)
+
+
+def _along(vector: Array, held: Array, free: Array) -> Array:
+    """The part of `vector` (d,) that moves free numbers only and changes nothing that is held."""
+    vector = vector * free
+    if held.shape[0] == 0:
+        return vector
+    rows = held * free[None, :]
+    return vector - _least(rows, rows @ vector)
+
+
+def _begin(problem: Problem, point: Point, multipliers: Array) -> _Lane:
+    lane = jax.vmap(_ADAM.init)(point.z)
+    n = point.z.shape[0]
+    one = jnp.ones(n)
+    size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
+    worst = jnp.full(n, jnp.inf)
+    return _Lane(*point, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
+
+
+def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
+    m = problem.equalities
+    off, excess = lane.values[1 : 1 + m], lane.values[1 + m :]
+    held = lane.slopes[1 : 1 + m]
+    pull = jnp.maximum(0.0, lane.multipliers + lane.weight * excess)
+    slope = lane.slopes[0] / lane.size + pull @ lane.slopes[1 + m :]
+    free = jnp.ones_like(lane.z)
+    for _ in range(2):
+        down = _along(slope, held, free)
+        free = jnp.where(((lane.z <= 0.0) & (down > 0.0)) | ((lane.z >= 1.0) & (down < 0.0)), 0.0, free)
+    move, adam = _ADAM.update(_along(slope, held, free), lane.adam)
+    step = -rate * _along(move, held, free)
+    if m:
+        wanted = -_least(held, off)
+        stopped = ((lane.z <= 0.0) & (wanted < 0.0)) | ((lane.z >= 1.0) & (wanted > 0.0))
+        step = step - _least(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
+    z = jnp.clip(lane.z + lane.length * step, 0.0, 1.0)
+    near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.reach, strict=True))
+    values, slopes, known, reach = derive(problem, z, near)
+    finite = jnp.all(jnp.isfinite(values)) & jnp.all(jnp.isfinite(slopes))
+    good = finite & jnp.all(jnp.abs(values[1 : 1 + m]) < _ON_THE_WAY) & (rate > 0.0)
+
+    def chosen(new: Array, old: Array) -> Array:
+        return jnp.where(good, new, old)
+
+    new = (z, values, slopes, known, reach)
+    z, values, slopes, known, reach = jax.tree.map(chosen, new, (lane.z, lane.values, lane.slopes, lane.known, lane.reach))
+    length = jnp.where(good, jnp.minimum(1.0, 1.2 * lane.length), 0.5 * lane.length)
+
+    update = (lane.count % _UPDATE == _UPDATE - 1) & (rate > 0.0)
+    excess = values[1 + m :]
+    multipliers = jnp.where(update, jnp.maximum(0.0, lane.multipliers + lane.weight * excess), lane.multipliers)
+    worst = jnp.max(jnp.maximum(excess, 0.0), initial=0.0)
+    slow = update & (worst > 0.5 * lane.worst) & (worst > 1e-6)
+    weight = jnp.where(slow, jnp.minimum(3.0 * lane.weight, 1e4), lane.weight)
+    lane = _Lane(
+        z, values, slopes, known, reach, adam, length, multipliers, weight,
+        jnp.where(update, worst, lane.worst), lane.size, lane.count + 1,
+    )  # fmt: skip
+    return lane, values[0]
+
+
+def _ahead(known: Array, reach: Array, step: Array) -> Array:
+    moved = known + reach @ step
+    return jnp.where(jnp.isfinite(moved) & (jnp.abs(moved / known - 1.0) < 0.2), moved, known)
+
+
+@cached
+def _begun(problem: Problem, point: Point, multipliers: Array) -> _Lane:
+    return _begin(problem, point, multipliers)
+
+
+@cached
+def _stretch(problem: Problem, lanes: _Lane, rates: Array) -> tuple[_Lane, Array]:
+    def step(lanes: _Lane, rate: Array) -> tuple[_Lane, Array]:
+        return jax.vmap(lambda lane: _step(problem, lane, rate))(lanes)
+
+    lanes, history = jax.lax.scan(step, lanes, rates)
+    return lanes, history.T
+
+
+def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Callable[[float, Point], None]) -> Descended:
+    """Adam from every start at once; each step goes along what is held and corrects what the last one left of it.
+
+    Demands are in the gradient by the augmented Lagrangian sum_i (max(0, l_i + w g_i)^2 - l_i^2)/(2 w), the multipliers l_i and
+    the weight w set anew every 20 steps. A step to a design where the objective does not exist is not taken, and that start's
+    steps become half as long. `tell` is given what is done (0 to 1) and the point; an interrupt ends the descent where it is.
+
+    **Returns** `Descended`.
+    """
+    schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
+    rates = np.asarray(schedule(jnp.arange(steps)))
+    rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
+    lanes = chunked(problem.lanes, lambda p, m: _begun(problem, p, m), point, np.zeros((len(point.z), len(problem.demands))))
+    history: list[np.ndarray] = []
+    for k, part in enumerate(rates):
+        each = jnp.asarray(part)
+        lanes, values = chunked(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
+        history.append(values)
+        tell((k + 1) / len(rates), Point(*lanes[:5]))
+    values = np.concatenate(history, axis=1)[:, :steps]
+    return Descended(Point(*lanes[:5]), lanes.multipliers, values.T)

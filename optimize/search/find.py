@@ -1,0 +1,196 @@
+"""From random starts to the best designs: the continuous search, and choices from catalogues by branch and bound."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from optimize.search.descent import descend
+from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, polish
+from optimize.search.problem import Point, Problem, evaluate, looked_up
+
+__all__ = ["Found", "Options", "choose", "find"]
+
+_NODES = 400
+"""Bounds that are looked at before a catalogue is given up on."""
+
+_FEW = 8
+"""Designs that each bound of a catalogue is searched from."""
+
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a search goes, see `synthesize`."""
+
+    starts: int
+    seed: int
+    iterations: int
+    rate: float
+    polishing: int
+    begin: np.ndarray | None = None
+
+
+class Found(NamedTuple):
+    """Where searches ended, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was `interrupted`;
+    the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
+
+    point: Point
+    history: np.ndarray
+    left: np.ndarray
+    violation: np.ndarray
+    optimality: Optimality
+    drawn: int
+    existing: int
+    interrupted: bool
+    bounds: tuple[np.ndarray, np.ndarray]
+    nodes: int = 0
+
+    @property
+    def best(self) -> int:
+        """The number of the best design: the least objective of those that keep all demands, else the least violation."""
+        kept = self.violation < 10.0 * FEASIBLE
+        if np.any(kept):
+            return int(np.argmin(np.where(kept, self.point.values[:, 0], np.inf)))
+        return int(np.argmin(self.violation))
+
+
+def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
+    """Searches from random starts, or from the designs `begin`; None where no design has the objective. An interrupt
+    (KeyboardInterrupt) ends the search with what it has."""
+    tell("drawing starts", 0.0)
+    begin = options.begin
+    if begin is not None:
+        point = evaluate(problem, begin, looked_up(problem, begin))
+        point = point.take(np.flatnonzero(point.exists()))
+        drawn = existing = len(begin)
+    else:
+        starts = draw_starts(problem, options.starts, options.seed, looked_up)
+        point = starts.point if starts.point is not None else starts.nearest
+        drawn, existing = starts.drawn, starts.existing
+    if point is None or len(point.z) == 0:
+        return None
+    history = [point.values[None, :, 0]]
+    last, interrupted = point, False
+
+    def said(what: str, low: float, high: float) -> Callable[[float, Point], None]:
+        def tell_of(share: float, now: Point) -> None:
+            nonlocal last
+            last = now
+            values = now.values[np.isfinite(now.values[:, 0]), 0]
+            tell(f"{what}, best {np.min(values):.4g}" if len(values) else what, low + (high - low) * share)
+
+        return tell_of
+
+    try:
+        descended = descend(problem, point, options.iterations, options.rate, said("descending", 0.1, 0.5))
+        history.append(descended.history)
+        ended = polish(problem, descended.point, options.polishing, said("polishing", 0.5, 0.9))
+    except KeyboardInterrupt:
+        interrupted = True
+        ended = polish(problem, last, 0, lambda *_: None)
+    history.append(ended.history)
+    # Followed jams may have changed their numbers: the whole branch says which they are.
+    point = _of_their_mode(problem, ended.point)
+    violation = np.where(point.exists(), ended.violation, np.inf)
+    bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
+    whole = np.concatenate(history)
+    return Found(point, whole, ended.left, violation, ended.optimality, drawn, existing, interrupted, bounds)
+
+
+def _of_their_mode(problem: Problem, point: Point) -> Point:
+    """The designs, without values where a jam is not of the number that was asked for."""
+    if not problem.keys:
+        return point
+    same = np.ones(len(point.z), bool)
+    for key, ours, whole in zip(problem.keys, point.known, looked_up(problem, point.z), strict=True):
+        near = np.abs(ours / whole - 1.0) < 1e-6
+        there = near if key[1][0] == "jam" else near | ~np.isfinite(whole)
+        same &= np.all(there.reshape(len(same), -1), axis=1)
+    return point._replace(values=np.where(same[:, None], point.values, np.nan))
+
+
+def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
+    """The best design whose chosen numbers have values of their catalogues: branch and bound on the continuous search.
+
+    A bound is the best design with the numbers free between two values of the catalogue; where that is no better than the best
+    choice known, all choices between are left out. It is a local search: what it finds is the best of what its starts lead to.
+    """
+    root = find(problem, options, lambda what, share: tell(what, 0.5 * share))
+    choices = problem.space.choices
+    if root is None or not choices or root.violation[root.best] > 10.0 * FEASIBLE:
+        return root
+    few = _few(root)
+    numbers = problem.space.numbers(few)
+    best: tuple[float, Found] | None = None
+    order = itertools.count()
+    queue = [(float(root.point.values[root.best, 0]), next(order), root, numbers)]
+    nodes = 0
+    while queue and nodes < _NODES:
+        bound, _, node, begun = heapq.heappop(queue)
+        if best is not None and bound >= best[0] - 1e-9 * abs(best[0]):
+            break
+        where = problem.space.within(*node.bounds).numbers(node.point.z[node.best])
+        off = [_away(choice.values, where[choice.start]) for choice in choices]
+        if max(off) < 1e-9:
+            best = (bound, node)
+            continue
+        choice = choices[int(np.argmax(off))]
+        allowed = [v for v in choice.values if node.bounds[0][choice.start] <= v <= node.bounds[1][choice.start]]
+        x = where[choice.start]
+        for part in ([v for v in allowed if v <= x], [v for v in allowed if v > x]):
+            if not part:
+                continue
+            nodes += 1
+            low, high = (b.copy() for b in node.bounds)
+            low[choice.start], high[choice.start] = part[0], part[-1]
+            child = _bounded(problem, low, high, np.concatenate([where[None], begun])[:_FEW], options)
+            if child is None or child.violation[child.best] > 10.0 * FEASIBLE:
+                continue
+            value = float(child.point.values[child.best, 0])
+            if best is None or value < best[0]:
+                tell(f"choosing, best {best[0]:.4g}" if best else "choosing", 0.5 + 0.4 * nodes / (nodes + 20.0))
+                heapq.heappush(queue, (value, next(order), child, begun))
+    if best is None:
+        return None
+    return best[1]._replace(drawn=root.drawn, existing=root.existing, nodes=nodes)
+
+
+def _away(values: tuple[float, ...], x: float) -> float:
+    """How far a number is from the nearest value of its catalogue, relative to it."""
+    nearest = min(values, key=lambda v: abs(v - x))
+    return abs(x - nearest) / max(abs(nearest), 1e-300)
+
+
+def _few(found: Found) -> np.ndarray:
+    """The best designs that differ, (at most 7, d)."""
+    order = np.argsort(np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf))
+    kept: list[np.ndarray] = []
+    for k in order:
+        z = found.point.z[k]
+        if np.isfinite(found.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in kept):
+            kept.append(z)
+    return np.asarray(kept[: _FEW - 1])
+
+
+def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:
+    """The search between narrower bounds, from the designs with these numbers."""
+    space = problem.space.within(low, high)
+    narrow = Problem(space, problem.objective, problem.demands, problem.keys, problem.scales, _FEW)
+    z = np.asarray(space.shares(np.clip(numbers, low, high)))
+    point = evaluate(narrow, z, looked_up(narrow, z))
+    point = point.take(np.flatnonzero(point.exists()))
+    if not len(point.z):
+        return None
+    ended: Polished = polish(narrow, point, max(options.polishing, 20), lambda *_: None)
+    kept = _of_their_mode(narrow, ended.point)
+    violation = np.where(kept.exists(), ended.violation, np.inf)
+    if not np.any(np.isfinite(violation)):
+        return None
+    return Found(kept, ended.history, ended.left, violation, ended.optimality, 0, 0, False, (low, high))

@@ -1,0 +1,250 @@
+"""A search as numbers: values and derivatives of many designs at once, jams followed from one design to the next.
+
+Compiled are only the evaluation of a chunk of designs and a stretch of the descent (`descent`); chunks run side by side on all
+cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.jam import jam_modes
+from optimize.space.space import DesignSpace
+from optimize.wishes.answers import Answers, Key, Recorder, guesses
+from optimize.wishes.quantity import Combined, Demand, Quantity
+
+__all__ = ["Known", "Point", "Problem", "chunked", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
+
+_CHUNK = 64
+"""Designs that are evaluated together on a core."""
+
+Known = tuple[np.ndarray, ...]
+"""Load speeds near which jams are followed, an array with a leading axis over the designs for each key."""
+
+
+class Problem(eqx.Module):
+    """A design space, what is to be small in it, and what is demanded.
+
+    **Attributes**: `space`; `objective`; `demands`; `keys` of what is followed; `scales` (mi,): the demands' units, positive;
+    `lanes` designs are evaluated together.
+    """
+
+    space: DesignSpace
+    objective: Quantity = eqx.field(static=True)
+    demands: tuple[Demand, ...] = eqx.field(static=True)
+    keys: tuple[Key, ...] = eqx.field(static=True)
+    scales: Array
+    lanes: int = eqx.field(static=True, default=_CHUNK)
+
+    @property
+    def equalities(self) -> int:
+        """How many quantities are held."""
+        return len(self.space.held)
+
+    def values(self, z: Array, near: Sequence[Array] | None) -> tuple[Array, tuple[Array, ...]]:
+        """The objective, by how much what is held is off, and the demands' excess, (1 + me + mi,); and the speeds followed."""
+        answers = Answers(self.space.at(z), None if near is None else dict(zip(self.keys, near, strict=True)))
+        values = self.read(answers)
+        return values, tuple(answers.found[key] for key in self.keys)
+
+    def read(self, answers: Answers) -> Array:
+        """The same numbers from what is known of a scene."""
+        objective = jnp.reshape(self.objective.read(answers), (1,))
+        held = self.space.residuals(answers)
+        excess = [demand.excess(answers)[0] for demand in self.demands]
+        return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
+
+    @property
+    def forward_only(self) -> bool:
+        """Whether a quantity has derivatives in forward mode only."""
+        every = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
+        return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
+
+
+class Point(NamedTuple):
+    """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is followed
+    and `reach`, by how much these change with z (s, ..., d)."""
+
+    z: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+    known: Known
+    reach: Known
+
+    def exists(self) -> np.ndarray:
+        """Whether everything has a value and derivatives there (s,)."""
+        return np.all(np.isfinite(self.values), axis=1) & np.all(np.isfinite(self.slopes), axis=(1, 2))
+
+    def where(self, chosen: np.ndarray, other: Point) -> Point:
+        """This point where `chosen`, the other elsewhere."""
+        return jax.tree.map(lambda a, b: np.where(chosen.reshape((-1,) + (1,) * (a.ndim - 1)), a, b), self, other)
+
+    def take(self, index: np.ndarray) -> Point:
+        """The designs of these numbers."""
+        return jax.tree.map(lambda a: a[index], self)
+
+    def put(self, index: np.ndarray, new: Point) -> Point:
+        """The same, with other designs in these places."""
+
+        def one(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+            a = np.array(a)
+            a[index] = b
+            return a
+
+        return jax.tree.map(one, self, new)
+
+    def ahead(self, z: np.ndarray) -> Known:
+        """Where the followed speeds are about at other designs."""
+        step = z - self.z
+        guess = []
+        for k, r in zip(self.known, self.reach, strict=True):
+            moved = k + np.einsum("s...d,sd->s...", r, step)
+            guess.append(np.where(np.isfinite(moved) & (np.abs(moved / k - 1.0) < 0.2), moved, k))
+        return tuple(guess)
+
+
+def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
+    """The search, with what it follows and the scale of each demand: that of its limit, or of its value at the beginning."""
+    blank = Problem(space, objective, tuple(demands), (), jnp.ones(len(demands)))
+    recorder = Recorder()
+    jax.eval_shape(lambda scene: blank.read(Answers(scene, recorder)), space.scene)
+    constants = [abs(d.limit.constant) if isinstance(d.limit, Combined) and not d.limit.parts else 0.0 for d in demands]
+    scales = np.asarray(constants, float)
+    if np.any(scales == 0.0):
+        sides = tuple(q for d in demands for q in (d.quantity, d.limit))
+        found = np.abs(reported(sides, jax.tree.map(lambda leaf: leaf[None], space.scene))[0]).reshape(-1, 2).max(axis=1)
+        scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
+    return Problem(space, objective, tuple(demands), tuple(recorder.keys), jnp.asarray(scales), _lanes(starts))
+
+
+def derive(problem: Problem, z: Array, near: Sequence[Array]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Values, derivatives, followed speeds and their derivatives of one design."""
+
+    def twice(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
+        values, found = problem.values(x, near)
+        return (values, found), (values, found)
+
+    rows = 1 + problem.equalities + len(problem.demands)
+    if z.shape[0] <= 4 * rows or problem.forward_only:
+        (slopes, reach), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
+    else:
+        slopes, (values, found) = jax.jacrev(lambda x: (twice(x)[0][0], twice(x)[1]), has_aux=True)(z)
+        reach = tuple(jnp.zeros((*w.shape, z.shape[0])) for w in found)
+    return values, slopes, found, reach
+
+
+@cached
+def _derived(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
+    return jax.vmap(lambda x, w: derive(problem, x, w))(z, near)
+
+
+@cached
+def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
+    """The load speed of each key for a batch of scenes, from whole branches."""
+
+    def one(scene: Scene) -> tuple[Array, ...]:
+        paths: dict[tuple, Any] = {}
+        for path, _ in keys:
+            if path not in paths:
+                at, several = scene, False
+                for case in path:
+                    at, several = case.scenes(at), several or case.several
+                paths[path] = jax.lax.map(jam_modes, at) if several else jam_modes(at)
+
+        def guess(path: tuple, asked: tuple[str, int]) -> Array:
+            modes = paths[path]
+            return jax.vmap(lambda m: guesses(m, asked))(modes) if modes.omega.ndim > 1 else guesses(modes, asked)
+
+        return tuple(guess(path, asked) for path, asked in keys)
+
+    # One after the other: that compiles in two thirds of the time and takes no longer.
+    return jax.lax.map(one, scenes)
+
+
+@cached
+def _made(space: DesignSpace, numbers: Array) -> Scene:
+    return jax.vmap(space.scene_of)(numbers)
+
+
+def _lanes(count: int) -> int:
+    return min(_CHUNK, 1 << max(count - 1, 0).bit_length())
+
+
+def chunked(size: int, function: Callable[..., Any], *arrays: Any) -> Any:
+    """A function of `size` designs, for many of them: chunks side by side on all cores, the last one filled up."""
+    count = jax.tree.leaves(arrays)[0].shape[0]
+    starts = range(0, count, size)
+
+    def part(start: int) -> Any:
+        index = np.minimum(np.arange(start, start + size), count - 1)
+        out = function(*jax.tree.map(lambda a: jnp.asarray(a[index]), arrays))
+        return jax.tree.map(np.asarray, out)
+
+    first = part(0)  # alone: a program is compiled once
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        rest = list(pool.map(part, starts[1:]))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], first, *rest)
+
+
+def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
+    """Values and derivatives of many designs whose jams are near these speeds."""
+    if len(z) == 0:
+        raise ValueError("no designs")
+    values, slopes, found, reach = chunked(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
+    return Point(z, values, slopes, found, reach)
+
+
+def looked_up(problem: Problem, z: np.ndarray) -> Known:
+    """The speeds of what is followed for many designs, from whole branches; NaN where there is none."""
+    if not problem.keys:
+        return ()
+    numbers = problem.space.numbers(np.asarray(z))
+    return chunked(problem.lanes, lambda scenes: _looked_up(problem.keys, scenes), made(problem, numbers))
+
+
+def made(problem: Problem, numbers: np.ndarray) -> Scene:
+    """The scenes with these free numbers (s, d), SI: arrays with a leading axis, NumPy's."""
+    return chunked(problem.lanes, lambda x: _made(problem.space, x), numbers)
+
+
+def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
+    """What these quantities follow."""
+    recorder = Recorder()
+    jax.eval_shape(lambda scene: [q.read(Answers(scene, recorder)) for q in quantities], scene)
+    return tuple(recorder.keys)
+
+
+@cached
+def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
+    def one(scene: Scene, known: tuple[Array, ...]) -> Array:
+        answers = Answers(scene, dict(zip(keys, known, strict=True)))
+        return jnp.stack([q.read(answers) for q in quantities])
+
+    return jax.vmap(one)(scenes, near)
+
+
+def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | None = None) -> np.ndarray:
+    """Values of quantities (s, q) of some scenes (arrays with a leading axis), NaN where one does not exist; with a `problem`
+    the programs of its search are used as far as they can be."""
+    quantities, leaves = tuple(quantities), jax.tree.leaves(scenes)
+    if not quantities:
+        return np.zeros((leaves[0].shape[0], 0))
+    keys = report_keys(quantities, jax.tree.map(lambda leaf: leaf[0], scenes))
+    known = keys if problem is None or set(keys) - set(problem.keys) else problem.keys
+
+    def part(batch: Scene) -> Array:
+        near = dict(zip(known, _looked_up(known, batch), strict=True)) if known else {}
+        return _reported(quantities, keys, batch, tuple(near[key] for key in keys))
+
+    return chunked(_lanes(leaves[0].shape[0]) if problem is None else problem.lanes, part, scenes)

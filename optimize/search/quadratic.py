@@ -1,0 +1,127 @@
+"""Many small quadratic programs at once, by a primal-dual interior point."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["Solved", "elastic"]
+
+_STEPS = 40
+
+
+class Solved(NamedTuple):
+    """The steps `p` (s, d) and the multipliers of the equalities (s, me), of the demands (s, mi), not negative, and of the bounds
+    (s, d), positive at the upper one."""
+
+    p: np.ndarray
+    held: np.ndarray
+    demands: np.ndarray
+    bounds: np.ndarray
+
+
+def elastic(
+    bend: np.ndarray,
+    slope: np.ndarray,
+    held: tuple[np.ndarray, np.ndarray],
+    demands: tuple[np.ndarray, np.ndarray],
+    box: tuple[np.ndarray, np.ndarray],
+    price: np.ndarray,
+) -> Solved:
+    """Solves, for each s, what is never contradictory because every constraint may be broken at a price:
+
+        min p.B p/2 + g.p + price (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
+
+    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities.
+
+    **Arguments** (s problems): `bend` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
+    `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `price` (s,).
+
+    >>> import numpy as np
+    >>> no = np.zeros((1, 0, 1)), np.zeros((1, 0))
+    >>> one = elastic(np.eye(1)[None], np.array([[-3.0]]), no, (np.ones((1, 1, 1)), np.array([[-1.0]])),
+    ...               (np.array([[-9.0]]), np.array([[9.0]])), np.array([100.0]))
+    >>> one.p.round(6).tolist(), one.demands.round(6).tolist()    # the least of x^2/2 - 3 x where x <= 1
+    ([[1.0]], [[2.0]])
+    """
+    (a_rows, a), (c_rows, c), (low, high) = held, demands, box
+    s, d = slope.shape
+    me, mi = a.shape[1], c.shape[1]
+    n = d + me + mi
+    quadratic = np.zeros((s, n, n))
+    quadratic[:, :d, :d] = bend
+    linear = np.concatenate([slope, np.repeat(price[:, None], me + mi, axis=1)], axis=1)
+    identity = np.broadcast_to(np.eye(d), (s, d, d))
+
+    def row(of_p: np.ndarray, k: int, count: int) -> np.ndarray:
+        """Rows on p, with -1 on the slack of each constraint from the k-th on."""
+        rows = np.zeros((s, of_p.shape[1], n))
+        rows[:, :, :d] = of_p
+        rows[:, np.arange(count), d + k + np.arange(count)] = -1.0
+        return rows
+
+    nothing = np.zeros((s, 0, n))
+    positive = row(np.zeros((s, me + mi, d)), 0, me + mi) if me + mi else nothing
+    rows = np.concatenate(
+        [
+            row(a_rows, 0, me) if me else nothing,
+            row(-a_rows, 0, me) if me else nothing,
+            row(c_rows, me, mi) if mi else nothing,
+            positive,
+            row(identity, 0, 0),
+            row(-identity, 0, 0),
+        ],
+        axis=1,
+    )
+    right = np.concatenate([-a, a, -c, np.zeros((s, me + mi)), high, -low], axis=1)
+    m = rows.shape[1]
+    x = np.zeros((s, n))
+    x[:, d:] = 1.0 + np.concatenate([np.abs(a), np.maximum(c, 0.0)], axis=1)
+    x[:, :d] = np.clip(0.0, low, high)
+    slack = np.maximum(right - np.einsum("smn,sn->sm", rows, x), 1e-2)
+    dual = np.ones((s, m))
+    turned = np.swapaxes(rows, 1, 2)
+    scale = 1.0 + np.abs(linear).max(axis=1)
+    ridge = 1e-13 * np.eye(n)
+
+    for _ in range(_STEPS):
+        stationary = np.einsum("sij,sj->si", quadratic, x) + linear + np.einsum("snm,sm->sn", turned, dual)
+        primal = np.einsum("smn,sn->sm", rows, x) + slack - right
+        gap = np.einsum("sm,sm->s", slack, dual) / m
+        done = (gap < 1e-11 * scale) & (np.abs(stationary).max(axis=1) < 1e-9 * scale) & (np.abs(primal).max(axis=1) < 1e-11)
+        if np.all(done):
+            break
+        weight = dual / slack
+        matrix = quadratic + np.einsum("snm,sm,smk->snk", turned, weight, rows)
+        matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
+
+        def solved(
+            target: np.ndarray,
+            matrix: np.ndarray = matrix,
+            weight: np.ndarray = weight,
+            stationary: np.ndarray = stationary,
+            primal: np.ndarray = primal,
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """The step that brings the products of slacks and duals to `target` more."""
+            rest = -stationary - np.einsum("snm,sm->sn", turned, weight * primal + target / slack)
+            dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
+            ds = -primal - np.einsum("smn,sn->sm", rows, dx)
+            return dx, ds, target / slack - weight * ds
+
+        def longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.minimum(1.0, np.where(step < 0.0, -value / step, np.inf).min(axis=1))
+
+        _, ds, dl = solved(-slack * dual)
+        by_s, by_l = longest(slack, ds), longest(dual, dl)
+        after = np.einsum("sm,sm->s", slack + by_s[:, None] * ds, dual + by_l[:, None] * dl) / m
+        centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
+        dx, ds, dl = solved(centre[:, None] - slack * dual - ds * dl)
+        keep = np.where(done, 0.0, 0.995)
+        by_s, by_l = keep * longest(slack, ds), keep * longest(dual, dl)
+        x = x + by_s[:, None] * dx
+        slack = np.maximum(slack + by_s[:, None] * ds, 1e-300)
+        dual = np.maximum(dual + by_l[:, None] * dl, 1e-300)
+    parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
+    return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])

@@ -1,0 +1,88 @@
+"""What the end of a search says: which limits hinder, which numbers matter, which machines there are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optimize.result import Influence, Limit, Machine
+from optimize.search.find import Found
+from optimize.search.polish import FEASIBLE
+from optimize.search.problem import Problem
+from optimize.space.numbers import shown_unit
+
+__all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
+
+_STEP = 0.01
+"""The relative change that influences are told for."""
+
+
+def limits_of(problem: Problem, found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
+    """Everything held and demanded, and the bounds that are active, of the best design; `sides` (mi, 2) the values of demands and
+    of their limits there."""
+    best, m = found.best, problem.equalities
+    values, duals = found.point.values[best], found.optimality
+    objective = abs(values[0]) if np.isfinite(values[0]) else np.nan
+    space = problem.space.within(*found.bounds)
+    rows: list[Limit] = []
+
+    def gain(multiplier: float) -> float:
+        return float(100.0 * _STEP * multiplier / max(objective, 1e-300))
+
+    for held, off, dual in zip(space.held, values[1 : 1 + m], duals.held[best], strict=True):
+        assert held.value is not None
+        unit, factor = shown_unit(held.quantity.unit, abs(held.value))
+        what = f"{held.quantity.words} held at {held.value * factor:.5g} {unit}".rstrip()
+        broken = abs(off) if abs(off) > 10.0 * FEASIBLE else 0.0
+        value = held.value * (1.0 + off)
+        rows.append(Limit(what, held.quantity.unit, value, held.value, float(broken), True, float(-dual), gain(-dual)))
+    for k, demand in enumerate(problem.demands):
+        excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
+        broken = excess if excess > 10.0 * FEASIBLE else 0.0
+        active = bool(excess > -1e-6)
+        share = -dual * abs(sides[k, 1]) / scale if active else 0.0
+        value, limit = float(sides[k, 0]), float(sides[k, 1])
+        rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(broken), active, float(share), gain(share)))
+    numbers = space.numbers(found.point.z[best])
+    low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.where(space.logs, numbers * np.log(high / low), high - low)
+    for k, (word, unit) in enumerate(problem.space.words()):
+        dual = duals.bounds[best, k]
+        upper = numbers[k] >= high[k] * (1.0 - 1e-9)
+        if low[k] == high[k] or slopes[k] == 0.0 or not (upper or numbers[k] <= low[k] * (1.0 + 1e-9)) or dual == 0.0:
+            continue
+        shown, factor = shown_unit(unit, abs(numbers[k]))
+        what = f"{word} {'at most' if upper else 'at least'} {numbers[k] * factor:.5g} {shown}"
+        share = -abs(dual) * numbers[k] / slopes[k]
+        rows.append(Limit(what, unit, float(numbers[k]), float(numbers[k]), 0.0, True, float(share), gain(share)))
+    return tuple(rows)
+
+
+def neighbours(problem: Problem, found: Found) -> np.ndarray:
+    """The free numbers (1 + 2 d, d), SI, of the best design and of those where one of them is 1 % less, and more."""
+    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    off = np.diag(_STEP * numbers)
+    return numbers + np.concatenate([np.zeros((1, len(numbers))), -off, off])
+
+
+def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
+    """How much each free number matters, from the objective (1 + 2 d,) of the `neighbours`."""
+    d = problem.space.size
+    if not values[0]:
+        return ()
+    change = 100.0 * (values[1:] - values[0]) / abs(values[0])
+    return tuple(Influence(word, float(change[k]), float(change[d + k])) for k, (word, _) in enumerate(problem.space.words()))
+
+
+def machines_of(problem: Problem, found: Found, same: float) -> tuple[Machine, ...]:
+    """The different machines that searches ended at, best first."""
+    values = np.where(found.violation < 10.0 * FEASIBLE, found.point.values[:, 0], np.inf)
+    left = [int(k) for k in np.argsort(values) if np.isfinite(values[k])]
+    space, machines = problem.space.within(*found.bounds), []
+    while left:
+        first = found.point.z[left[0]]
+        near = [k for k in left if np.max(np.abs(found.point.z[k] - first)) < same]
+        numbers = tuple(map(float, space.numbers(first)))
+        machines.append(Machine(len(near), float(values[left[0]]), numbers))
+        left = [k for k in left if k not in set(near)]
+    return tuple(machines)

@@ -1,0 +1,295 @@
+"""The design space: free numbers of a scene, their bounds and ties, catalogues, and quantities that are held."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.units import Number, count, number
+from optimize.space.numbers import Place, changed, names_of, places_of
+from optimize.wishes.answers import Answers
+from optimize.wishes.quantity import Quantity
+
+__all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
+
+Bounds = tuple[Number, Number] | tuple[Number, Number, str]
+"""(low, high), or (low, high, "log" or "even")."""
+
+Source = str | tuple[str, float | Literal["keep"]]
+"""What a number is tied to: the name of another one, with a factor, or "keep" for the ratio that they have."""
+
+
+class Held(eqx.Module):
+    """A quantity that keeps its value during the search; made by `hold`."""
+
+    quantity: Quantity = eqx.field(static=True)
+    value: float | None = eqx.field(static=True)
+
+
+def hold(quantity: Quantity, value: Number | None = None) -> Held:
+    """Holds a quantity at a value, or, without one, at what it is in the scene the search begins with.
+
+    **Arguments**: `quantity` such as `jam_frequency(mode=3)`; `value` in its unit, or text.
+
+    **Returns** `Held`. **Raises** `InputError` for a wrong unit, or a value of 0 (what is held is compared relative to it).
+
+    >>> from optimize import hold, jam_frequency
+    >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
+    'jam_frequency'
+    """
+    if not isinstance(quantity, Quantity):
+        raise InputError("hold", f"is {quantity!r}; it must be a Quantity, for example jam_frequency(mode=3)")
+    if value is None:
+        return Held(quantity, None)
+    held = float(number(value, quantity.unit, f"hold.{quantity.name}"))
+    if held == 0.0:
+        raise InputError(f"hold.{quantity.name}", "is 0; a quantity can be held at a value other than 0 only")
+    return Held(quantity, held)
+
+
+class Tie(NamedTuple):
+    """Numbers that follow others: `target` = `factor` times `source`, entry by entry."""
+
+    target: Place
+    source: Place
+    factor: tuple[float, ...]
+
+
+class Choice(NamedTuple):
+    """A number that may have certain values only, ascending, SI; `start` its place in the design vector."""
+
+    name: str
+    values: tuple[float, ...]
+    start: int
+
+
+class DesignSpace(eqx.Module):
+    """The numbers of a scene that may change, between bounds, and quantities that must keep their value.
+
+    **Arguments**
+
+    - `scene`: the design the search begins with
+    - `free`: name to (low, high), SI or text with units; a name such as "machine.stiffness" frees every entry of an array
+      (each within the bounds), "machine.stiffness[0]" one of them, "loads.drag" the one number all loads share, "drive.speed"
+      the rotor's speed; (low, high, "log") divides the range by ratio, (low, high, "even") evenly
+    - `hold`: quantities that keep their value, made by `optimize.hold`; sums and products too (`total`, `product`)
+    - `ties`: name to what it follows: another number's name (equal), (name, factor), or (name, "keep") for the ratio that both
+      have in the scene
+    - `choices`: name to the values that can be had, such as the springs of a catalogue; "loads.count" to numbers of loads
+
+    Inside, a design is a vector z in [0, 1]^d; ranges over a factor of 10 or more are divided by ratio, others evenly, unless
+    said otherwise.
+
+    **Raises** `InputError` for a name the scene does not have, bounds the wrong way round, a number that is free twice or free
+    and tied, values of a catalogue that no scene can have, or more held quantities than free numbers.
+
+    >>> import jaxvib as jv
+    >>> from optimize import DesignSpace
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("1500 rpm"))
+    >>> space = DesignSpace(scene, free={"machine.stiffness": (1e4, 2e5), "machine.link_stiffness": ("50 N/mm", 5e5)})
+    >>> space.size
+    3
+    >>> DesignSpace(scene, {"machine.stiffness[0]": (1e4, 2e5)}, ties={"machine.stiffness[1]": "machine.stiffness[0]"}).size
+    1
+    """
+
+    scene: Scene
+    low: Array | np.ndarray
+    high: Array | np.ndarray
+    places: tuple[Place, ...] = eqx.field(static=True)
+    logs: tuple[bool, ...] = eqx.field(static=True)
+    ties: tuple[Tie, ...] = eqx.field(static=True)
+    held: tuple[Held, ...]
+    choices: tuple[Choice, ...] = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        scene: Scene,
+        free: Mapping[str, Bounds],
+        hold: Sequence[Held] = (),
+        *,
+        ties: Mapping[str, Source] | None = None,
+        choices: Mapping[str, Sequence[Number]] | None = None,
+    ):
+        chosen, counts = _chosen(scene, choices or {})
+        if not free and not chosen:
+            raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
+        ranges = {name: _bounds(scene, name, bounds) for name, bounds in free.items()}
+        for name, values in chosen.items():
+            if name in ranges:
+                raise InputError(f"choices.{name}", "is free already; name it once, as free or as a choice")
+            wide = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
+            ranges[name] = (places_of(scene, name, "choices"), values[0], values[-1], wide)
+        taken: set = set()
+        for name, (place, *_) in ranges.items():
+            if place.entries & taken:
+                raise InputError(f"free.{name}", "frees a number that is free already; name each one once")
+            taken |= place.entries
+        self.scene = scene
+        self.places = tuple(place for place, *_ in ranges.values())
+        self.low = np.concatenate([np.full(p.size, low) for p, low, _, _ in ranges.values()])
+        self.high = np.concatenate([np.full(p.size, high) for p, _, high, _ in ranges.values()])
+        self.logs = tuple(log for p, _, _, log in ranges.values() for _ in range(p.size))
+        self.ties = _tied(scene, ties or {}, taken)
+        starts = np.cumsum([0, *(p.size for p in self.places)])
+        where = {p.name: int(start) for p, start in zip(self.places, starts, strict=False)}
+        self.choices = tuple(
+            Choice(name, values, where[name] + k)
+            for name, values in chosen.items()
+            for k in range(places_of(scene, name, "choices").size)
+        )
+        self.counts = counts
+        for held in hold:
+            if not isinstance(held, Held):
+                raise InputError("hold", f"has {held!r}; wrap quantities in optimize.hold(...)")
+        self.held = tuple(_with_value(held, scene) for held in hold)
+        if len(self.held) >= self.size:
+            raise InputError(
+                "hold", f"holds {len(self.held)} quantities with {self.size} free numbers; more must be free than held"
+            )
+
+    @property
+    def size(self) -> int:
+        """How many numbers are free."""
+        return sum(place.size for place in self.places)
+
+    def numbers(self, z: Array) -> Array:
+        """The free numbers (..., d), SI, of designs z (..., d) in [0, 1]; NumPy's arrays where z is one."""
+        xp = np if isinstance(z, np.ndarray) else jnp
+        low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
+        log = np.asarray(self.logs)
+        base = xp.where(log, low, 1.0)
+        return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)
+
+    def at(self, z: Array) -> Scene:
+        """The scene of the design z (d,) in [0, 1]."""
+        return self.scene_of(self.numbers(z))
+
+    def scene_of(self, values: Array) -> Scene:
+        """The scene with these free numbers (d,), SI."""
+        scene, start = self.scene, 0
+        for place in self.places:
+            scene = changed(scene, place, values[start : start + place.size])
+            start += place.size
+        for tie in self.ties:
+            scene = changed(scene, tie.target, jnp.asarray(tie.factor) * tie.source.read(scene))
+        return scene
+
+    def where(self, scene: Scene) -> Array:
+        """The design z (d,) of a scene, moved into the bounds where it lies outside."""
+        return self.shares(jnp.concatenate([place.read(scene) for place in self.places]))
+
+    def shares(self, numbers: Array) -> Array:
+        """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
+        xp = np if isinstance(numbers, np.ndarray) else jnp
+        low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
+        value, log, width = xp.clip(numbers, low, high), np.asarray(self.logs), high - low
+        base = xp.where(log, low, 1.0)
+        ratio = xp.where(log & (width > 0.0), high / base, 2.0)
+        even = (value - low) / xp.where(width > 0.0, width, 1.0)
+        return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)
+
+    def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
+        """The free numbers of a scene by name, in SI."""
+        return {p.name: (p.leaf(scene) if p.index is None else p.leaf(scene)[p.index]).tolist() for p in self.places}
+
+    def words(self) -> list[tuple[str, str]]:
+        """What a designer calls each free number, and its unit."""
+        return [(word, place.unit) for place in self.places for word in names_of(self.scene, place)]
+
+    def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
+        """The same space between other bounds (d,), SI; equal ones fix a number."""
+        return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
+
+    def residuals(self, answers: Answers) -> Array:
+        """By how much each held quantity is off, relative to the value it is held at (m,)."""
+        off = [held.quantity.read(answers) / held.value - 1.0 for held in self.held if held.value is not None]
+        return jnp.stack(off) if off else jnp.zeros((0,))
+
+
+def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[Place, float, float, bool]:
+    if isinstance(bounds, Mapping):
+        example = f"{name}.{next(iter(bounds), '')}"
+        raise InputError(f"free.{name}", f'is a table; write the whole name in quotes, for example "{example}"')
+    place = places_of(scene, name, "free")
+    if not isinstance(bounds, (list, tuple)) or len(bounds) not in (2, 3):
+        raise InputError(f"free.{name}", f"is {bounds!r}; give the bounds as (low, high)")
+    low, high = (float(number(b, place.unit, f"free.{name}", low=0.0)) for b in bounds[:2])
+    if not low < high:
+        raise InputError(f"free.{name}", f"has bounds {low:g} and {high:g}; the first must be less than the second")
+    log = low > 0.0 and high / low >= 10.0
+    if len(bounds) == 3:
+        if bounds[2] not in ("log", "even"):
+            raise InputError(f"free.{name}", f"has the scale {bounds[2]!r}; it must be 'log' or 'even'")
+        log = bounds[2] == "log"
+        if log and not low > 0.0:
+            raise InputError(f"free.{name}", "has the scale 'log' and a low bound of 0; give a low bound greater than 0")
+    return place, low, high, log
+
+
+def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
+    """Catalogues by name, ascending without doubles, and numbers of loads."""
+    found: dict[str, tuple[float, ...]] = {}
+    counts: tuple[int, ...] = ()
+    for name, values in choices.items():
+        if not isinstance(values, (list, tuple)) or not values:
+            raise InputError(f"choices.{name}", f"is {values!r}; give a list of values")
+        if name == "loads.count":
+            counts = tuple(sorted({count(v, f"choices.{name}") for v in values}))
+            continue
+        place = places_of(scene, name, "choices")
+        low = 0.0
+        given = sorted({float(number(v, place.unit, f"choices.{name}[{k}]", low=low)) for k, v in enumerate(values)})
+        if len(given) < 2:
+            raise InputError(f"choices.{name}", "has one value; put it into the scene, or give several")
+        found[name] = tuple(given)
+    return found, counts
+
+
+def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ...]:
+    found = []
+    for name, given in ties.items():
+        target = places_of(scene, name, "ties")
+        if target.entries & taken:
+            raise InputError(f"ties.{name}", "is free as well; a number that follows another cannot be free")
+        source_name, factor = (given, 1.0) if isinstance(given, str) else given if len(given) == 2 else (None, None)
+        if not isinstance(source_name, str):
+            raise InputError(f"ties.{name}", f"is {given!r}; give another number's name, or (name, factor)")
+        source = places_of(scene, source_name, f"ties.{name}")
+        if source.entries & target.entries:
+            raise InputError(f"ties.{name}", "is tied to itself; name another number")
+        if source.size not in (1, target.size):
+            raise InputError(f"ties.{name}", f"has {target.size} entries and {source_name} {source.size}; name one of them")
+        if factor == "keep":
+            ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))
+        elif isinstance(factor, (int, float)) and not isinstance(factor, bool) and factor > 0.0:
+            ratio = np.full(target.size, float(factor))
+        else:
+            raise InputError(f"ties.{name}", f"has the factor {factor!r}; give a number greater than 0, or 'keep'")
+        if not np.all(np.isfinite(ratio)):
+            raise InputError(f"ties.{name}", f"keeps its ratio to {source_name}, which is 0 in the scene; give a factor")
+        taken = taken | target.entries
+        found.append(Tie(target, source, tuple(map(float, ratio))))
+    return tuple(found)
+
+
+def _with_value(held: Held, scene: Scene) -> Held:
+    if held.value is not None:
+        return held
+    value = float(held.quantity(scene))
+    if not (np.isfinite(value) and value != 0.0):
+        raise InputError(
+            f"hold.{held.quantity.name}",
+            f"is {value} in the scene the search begins with; give the value it shall be held at",
+        )
+    return Held(held.quantity, value)

@@ -1,0 +1,178 @@
+"""What quantities ask a scene for, each question answered once; jams are followed from a machine that is near."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from functools import cached_property
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.equations.linear import LinearModel, linear_model, natural_frequencies
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.run import Run
+from jaxvib.motion.simulate import simulate
+from jaxvib.steady.jams.follow import follow_fold, follow_jam
+from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.units import traced
+
+__all__ = ["Answers", "Asked", "Case", "Key", "Recorder", "guesses"]
+
+_NO_FOLD = 10.0
+"""Where no fold ends a mode on the side of higher rotor speeds, this times the scene's stands for it."""
+
+_SAMPLES = 4000
+"""States of a run-up that are looked at."""
+
+Asked = tuple[str, int]
+"""What is followed: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
+
+Key = tuple[tuple[Hashable, ...], Asked]
+"""Of which scene (the cases that lead there from the design's own), and what."""
+
+
+class Case(Protocol):
+    """Another scene made of a design's, or several of them: a load case, an operating point, samples of tolerances."""
+
+    def scenes(self, scene: Scene) -> Scene:
+        """The scene in this case; where it stands for several, its arrays have a leading axis."""
+        ...
+
+    @property
+    def several(self) -> bool:
+        """Whether it stands for several scenes."""
+        ...
+
+
+class Recorder:
+    """Stands for what is known and notes what is asked for."""
+
+    def __init__(self) -> None:
+        self.keys: list[Key] = []
+
+    def __getitem__(self, key: Key) -> Array:
+        if key not in self.keys:
+            self.keys.append(key)
+        return jnp.asarray(1.0)
+
+
+class Answers:
+    """What is known of one scene. Questions are answered when they are first asked.
+
+    **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the whole
+    branch is looked at; `found` the load speeds that came out.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        known: Mapping[Key, Array] | Recorder | None = None,
+        path: tuple[Hashable, ...] = (),
+        modes: JamModes | None = None,
+    ):
+        self.scene = scene
+        self.known = known
+        self.path = path
+        self.found: dict[Key, Array] = {}
+        if modes is not None:
+            self.modes = modes
+        self._kept: dict[Hashable, object] = {}
+
+    @cached_property
+    def model(self) -> LinearModel:
+        """The scene's carrier with its loads."""
+        return linear_model(self.scene)
+
+    @cached_property
+    def modes(self) -> JamModes:
+        """All jam modes."""
+        return jam_modes(self.scene)
+
+    def jam(self, mode: int) -> Jam:
+        """The jam mode of that number, NaN where it does not exist."""
+        most = 2 * self.scene.machine.structure().mass.shape[0] + 1
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
+            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+        key: Key = (self.path, ("jam", mode))
+        if key not in self._kept:
+            if self.known is None:
+                jam = self.modes.select(mode, throw=False)
+            else:
+                jam = follow_jam(self.model, mode, self.known[key])
+            self._kept[key] = jam
+            self.found[key] = jam.omega
+        return self._kept[key]  # pyright: ignore[reportReturnType]
+
+    def folds(self, mode: int) -> tuple[Array, Array]:
+        """Rotor speeds, rad/s, of the folds below and above a jam mode on the branch; where there is none, 0 or ten times the scene's."""
+        speeds = []
+        for side in ("below", "above"):
+            key: Key = (self.path, (side, mode))
+            near = guesses(self.modes, (side, mode)) if self.known is None else self.known[key]
+            there = jnp.isfinite(near)
+            omega, speed = follow_fold(self.model, jnp.where(there, near, 1.0))
+            self.found[key] = jnp.where(there, omega, near)
+            slower = (side == "below") == (mode % 2 == 1)
+            speeds.append(jnp.where(there, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))
+        return speeds[0], speeds[1]
+
+    def orbit(self, mode: int) -> Orbit:
+        """The exact motion that continues a jam mode, NaN where there is none."""
+        key = ("orbit", mode)
+        if key not in self._kept:
+            jam = self.jam(mode)
+            if self.known is None and not any(traced(leaf) for leaf in jax.tree.leaves(self.scene)):
+                orbit = jam_orbit(self.scene, mode=mode, throw=False)
+            else:
+                orbit = jam_orbit(self.scene, near=jax.lax.stop_gradient(jam.omega), throw=False)
+                away = (orbit.slope > 0.0) != (mode % 2 == 1)
+                orbit = jax.tree.map(
+                    lambda leaf: jnp.where(away, jnp.nan, leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, orbit
+                )
+            self._kept[key] = orbit
+        return self._kept[key]  # pyright: ignore[reportReturnType]
+
+    def jam_run(self, mode: int) -> Run:
+        """The full equations, integrated from a jam mode for 60 periods of the lowest natural frequency."""
+        lowest = jnp.min(jax.lax.stop_gradient(natural_frequencies(self.scene)))
+        return self._run(("jam", mode), 60.0 * 2.0 * jnp.pi / lowest, start="jam", mode=mode, save="window")
+
+    def keep_run(self, mode: int, run: Run) -> None:
+        """Takes a run that has settled in a jam mode for `jam_run`."""
+        self._kept["jam", mode] = run
+
+    def start_up(self, until: float, spin_up: float) -> Run:
+        """The full equations from rest, the rotor brought up smoothly over the time `spin_up`, s, to the time `until`, s."""
+        return self._run(("start_up", until, spin_up), until, start="spin_up", spin_up=spin_up, samples=_SAMPLES)
+
+    def _run(self, key: Hashable, until: Array | float, **options: Any) -> Run:
+        """A run; derivatives in forward mode."""
+        import diffrax
+
+        if key not in self._kept:
+            known = not any(traced(leaf) for leaf in jax.tree.leaves(self.scene))
+            adjoint = None if known else diffrax.ForwardMode()
+            self._kept[key] = simulate(self.scene, until, estimate=False, adjoint=adjoint, throw=False, **options)
+        return self._kept[key]  # pyright: ignore[reportReturnType]
+
+    def under(self, case: Case) -> tuple[Scene, tuple[Hashable, ...]]:
+        """The scene, or scenes, of a case, and their path."""
+        return case.scenes(self.scene), (*self.path, case)
+
+
+def guesses(modes: JamModes, asked: Asked) -> Array:
+    """The load speed, rad/s, of what is asked of the jam modes of a scene; NaN where there is none."""
+    what, mode = asked
+    omega = modes.select(mode, throw=False).omega
+    if what == "jam":
+        return omega
+    folds = jnp.where(modes.folds.exists, modes.folds.omega, jnp.nan)
+    if what == "below":
+        return jnp.nanmax(jnp.where(folds < omega, folds, jnp.nan), initial=-jnp.inf)
+    return jnp.nanmin(jnp.where(folds > omega, folds, jnp.nan), initial=jnp.inf)

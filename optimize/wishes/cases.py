@@ -1,0 +1,236 @@
+"""One quantity at another operating point, under another load, over tolerances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.units import Number, count
+from optimize.space.numbers import Place, changed, places_of, value_of
+from optimize.wishes.answers import Answers, Key, Recorder
+from optimize.wishes.quantity import Quantity, Tier
+
+__all__ = ["expected", "quantile", "under", "worst"]
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A case: some numbers of the scene have other values."""
+
+    name: str
+    values: tuple[tuple[str, float], ...]
+
+    several = False
+
+    def scenes(self, scene: Scene) -> Scene:
+        """The scene with these values."""
+        for name, value in self.values:
+            place = places_of(scene, name, "under")
+            scene = changed(scene, place, jnp.full(place.size, value))
+        return scene
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A case: many scenes whose numbers are off by a relative error drawn at random, always the same draws."""
+
+    errors: tuple[tuple[str, float], ...]
+    samples: int
+    seed: int
+
+    several = True
+
+    def factors(self, scene: Scene) -> list[tuple[Place, np.ndarray]]:
+        """Of each number the factors (samples, entries): a scrambled Sobol-like even spread, normal, within three deviations.
+
+        Latin hypercube: every number's samples fill the distribution evenly, in an order of their own.
+        """
+        random, out = np.random.default_rng(self.seed), []
+        normal = NormalDist()
+        for name, error in self.errors:
+            place = places_of(scene, name, "tolerance")
+            shares = (np.arange(self.samples) + 0.5) / self.samples
+            deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
+            drawn = np.stack([random.permutation(deviations) for _ in range(place.size)], axis=1)
+            # Half the width is two deviations: 95 of 100 machines are within the tolerance.
+            out.append((place, np.maximum(1.0 + 0.5 * error * drawn, 0.05)))
+        return out
+
+    def scenes(self, scene: Scene) -> Scene:
+        """The scenes, every array with a leading axis."""
+        factors = [(place, jnp.asarray(f)) for place, f in self.factors(scene)]
+
+        def one(*each: Array) -> Scene:
+            made = scene
+            for (place, _), factor in zip(factors, each, strict=True):
+                made = changed(made, place, place.read(made) * factor)
+            return made
+
+        return jax.vmap(one)(*(f for _, f in factors))
+
+
+@dataclass(frozen=True)
+class Under(Quantity):
+    """A quantity in a case."""
+
+    case: Changed = Changed("", ())
+    part: Quantity | None = None
+
+    @property
+    def parts(self) -> tuple[Quantity, ...]:
+        assert self.part is not None
+        return (self.part,)
+
+    @property
+    def words(self) -> str:
+        return self.name
+
+    def read(self, answers: Answers) -> Array:
+        scene, path = answers.under(self.case)
+        inner = Answers(scene, answers.known, path)
+        value = self.parts[0].read(inner)
+        answers.found.update(inner.found)
+        return value
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        return replace(self, part=self.parts[0].at_tier(tier))
+
+
+@dataclass(frozen=True)
+class Robust(Quantity):
+    """A number of the distribution of a quantity over tolerances."""
+
+    case: Sampled = Sampled((), 1, 0)
+    part: Quantity | None = None
+    statistic: str = "expected"
+    level: float = 0.0
+
+    @property
+    def parts(self) -> tuple[Quantity, ...]:
+        assert self.part is not None
+        return (self.part,)
+
+    @property
+    def words(self) -> str:
+        return self.name
+
+    def read(self, answers: Answers) -> Array:
+        scenes, path = answers.under(self.case)
+        known, keys = answers.known, []
+        near: tuple[Array, ...] | None = None
+        if not isinstance(known, Recorder) and known is not None:
+            keys = [key for key in known if key[0][: len(path)] == path]
+            near = tuple(known[key] for key in keys)
+        found: list[Key] = []
+
+        def one(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
+            recorder = known if isinstance(known, Recorder) else None
+            inner = Answers(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
+            value = self.parts[0].read(inner)
+            found[:] = inner.found
+            return value, tuple(inner.found.values())
+
+        values, speeds = jax.vmap(one)(scenes, near)
+        answers.found.update(zip(found, speeds, strict=True))
+        if self.statistic == "expected":
+            return jnp.mean(values)
+        if self.statistic == "worst":
+            return jnp.max(values)
+        if self.statistic == "best":
+            return jnp.min(values)
+        # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
+        return jnp.quantile(values, self.level)
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        return replace(self, part=self.parts[0].at_tier(tier))
+
+
+def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
+    """A quantity at another operating point or under another load: some numbers of the scene have other values.
+
+    **Arguments**: `quantity`; `name` of the case, for tables; `changes` the name of a number, such as "drive.speed" or
+    "machine.mass[0]", to its value, SI or text with a unit.
+
+    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, where it is computed, a name that the scene
+    does not have.
+
+    >>> from optimize import foundation_force, under
+    >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words
+    'foundation force, mode 3 (loaded)'
+    """
+    _require(quantity)
+    if not isinstance(changes, Mapping) or not changes:
+        raise InputError("changes", f"is {changes!r}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
+    values = tuple((key, value_of(key, value)) for key, value in changes.items())
+    return Under(
+        f"{quantity.words} ({name})", quantity.unit, mode=None, of=quantity.of, case=Changed(name, values), part=quantity
+    )
+
+
+def _require(quantity: object) -> None:
+    if not isinstance(quantity, Quantity):
+        raise InputError("quantity", f"is {quantity!r}; it must be a Quantity, for example foundation_force(mode=3)")
+
+
+def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
+    _require(quantity)
+    if not isinstance(tolerances, Mapping) or not tolerances:
+        raise InputError("tolerances", f"is {tolerances!r}; give a dictionary such as {{'machine.stiffness': 0.05}}")
+    for name, value in tolerances.items():
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
+            raise InputError(f"tolerances.{name}", f"is {value!r}; give a share such as 0.05 for 5 %")
+    case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), seed)
+    words = how if how != "quantile" else f"{level:.0%} quantile of"
+    return Robust(
+        f"{words} {quantity.words}", quantity.unit, of=quantity.of, case=case, part=quantity, statistic=how, level=level
+    )
+
+
+def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
+    """The mean of a quantity over machines whose numbers are off.
+
+    **Arguments**: `quantity`; `tolerances` the name of a number or array of the scene to the relative tolerance that 95 of 100
+    machines keep (0.05: 5 %); each entry has an error of its own, normal, no more than one and a half tolerances;
+    `samples` how many machines are drawn, `seed` which (a Latin hypercube).
+
+    **Returns** `Quantity`, NaN where one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
+
+    >>> from optimize import expected, foundation_force
+    >>> expected(foundation_force(mode=3), {"machine.stiffness": 0.05}).words
+    'expected foundation force, mode 3'
+    """
+    return _robust(quantity, tolerances, samples, seed, "expected", 0.0)
+
+
+def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
+    """The largest value of a quantity over machines whose numbers are off, see `expected`; of one that shall be large, take
+    `-worst(-quantity, ...)`.
+
+    >>> from optimize import foundation_force, worst
+    >>> worst(foundation_force(mode=3), {"machine.damping": 0.3}).unit
+    'N'
+    """
+    return _robust(quantity, tolerances, samples, seed, "worst", 0.0)
+
+
+def quantile(
+    quantity: Quantity, level: float, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0
+) -> Quantity:
+    """The value that a share `level` of the machines stays below, see `expected`.
+
+    >>> from optimize import foundation_force, quantile
+    >>> quantile(foundation_force(mode=3), 0.95, {"machine.stiffness": 0.05}).words
+    '95% quantile of foundation force, mode 3'
+    """
+    if isinstance(level, bool) or not isinstance(level, (int, float)) or not 0.0 < level < 1.0 or math.isnan(level):
+        raise InputError("level", f"is {level!r}; it must be greater than 0 and less than 1")
+    return _robust(quantity, tolerances, samples, seed, "quantile", float(level))

@@ -1,0 +1,264 @@
+"""Quantities of a jam: amplitude, phase, force on the foundation, speeds, power, stability."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import light_friction
+from jaxvib.equations.linear import jammed_loads, peak_force
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import relative_amplitude
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.units import count
+from optimize.wishes.answers import Answers
+from optimize.wishes.quantity import Asking, Pair, Quantity, Tier
+
+__all__ = [
+    "amplitude",
+    "between",
+    "fold_margin",
+    "force_per_amplitude",
+    "foundation_force",
+    "jam_frequency",
+    "largest_multiplier",
+    "phase",
+    "power",
+]
+
+
+def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
+    """Whose amplitude is meant: `of`, or, if it is None, platform 1 against 2, and the only platform where there is one.
+
+    **Raises** `InputError` for a platform that is not there.
+    """
+    n = scene.machine.structure().mass.shape[0]
+    if of is None:
+        return (1, 2) if n > 1 else 1
+    platforms = tuple(of) if isinstance(of, (tuple, list)) else (of,)
+    whole = all(isinstance(p, (int, np.integer)) and not isinstance(p, bool) and 1 <= p <= n for p in platforms)
+    if whole and len(platforms) == 1:
+        return platforms[0]
+    if whole and len(platforms) == 2 and platforms[0] != platforms[1]:
+        return platforms[0], platforms[1]
+    raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms of 1 to {n}")
+
+
+def _asking(name: str, unit: str, function: object, mode: int, tier: Tier, text: str, **more: object) -> Quantity:
+    settings = (mode, *more.pop("settings", ()))  # pyright: ignore
+    return Asking(name, unit, function, mode=mode, tier=tier, settings=settings, text=f"{text}, mode {mode}", **more)  # pyright: ignore
+
+
+def _whose(of: Pair) -> str:
+    if of is None:
+        return ""
+    return f" of platform {of}" if isinstance(of, int) else f" of platform {of[0]} against {of[1]}"
+
+
+def _pair(of: Pair) -> Pair:
+    return tuple(of) if isinstance(of, list) else of  # pyright: ignore[reportReturnType]
+
+
+def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
+    """Amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
+
+    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them; `tier` "leading" (of light
+    loads, by algebra), "exact" (the exact periodic motion), "time" (the full equations, integrated for a while from the jam).
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
+    raises `InputError` where the quantity is computed.
+
+    >>> from optimize import amplitude
+    >>> amplitude(mode=3, of=1).unit
+    'm'
+    """
+    of = _pair(of)
+    return _asking("amplitude", "m", _amplitude, mode, tier, f"amplitude{_whose(of)}", of=of, settings=(of,))
+
+
+def _amplitude(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
+    chosen = between(answers.scene, of)
+    if tier == "leading":
+        jam = answers.jam(mode)
+        if isinstance(chosen, int):
+            return jam.amplitude[chosen - 1]
+        return magnitude(jam.displacement[chosen[0] - 1] - jam.displacement[chosen[1] - 1])
+    if tier == "exact":
+        orbit = answers.orbit(mode)
+        return orbit.amplitude[chosen - 1] if isinstance(chosen, int) else orbit.relative_amplitude(*chosen)
+    run = answers.jam_run(mode)
+    return run.amplitude[chosen - 1] if isinstance(chosen, int) else relative_amplitude(run.window, *chosen)
+
+
+def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
+    """By how much two platforms are out of phase in a jam mode, rad: 0 in phase, pi in antiphase; of the exact motion that of
+    their first harmonics.
+
+    **Arguments**: `mode` number of the jam mode; `of` the two platforms; `tier` "leading" or "exact".
+
+    **Returns** `Quantity`, NaN where the mode does not exist. **Raises** `InputError` for what is no pair.
+
+    >>> from optimize import phase
+    >>> (phase(mode=3) > "170 deg").words
+    'phase between platforms 1 and 2, mode 3 at least 170 deg'
+    """
+    of = _pair(of)  # pyright: ignore[reportAssignmentType]
+    if not isinstance(of, tuple) or len(of) != 2:
+        raise InputError("of", f"is {of!r}; a phase is that between two platforms, give a pair such as (1, 2)")
+    text = f"phase between platforms {of[0]} and {of[1]}"
+    return _asking("phase", "rad", _phase, mode, tier, text, of=of, settings=(of,), tiers=("leading", "exact"))
+
+
+def _phase(answers: Answers, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
+    i, j = between(answers.scene, of)  # pyright: ignore[reportGeneralTypeIssues]
+    if tier == "leading":
+        first = answers.jam(mode).displacement
+    else:
+        orbit = answers.orbit(mode)
+        first = orbit.displacement_harmonics[:, orbit.orders.index(1)]
+    turned = first[i - 1] * jnp.conj(first[j - 1])
+    return jnp.arctan2(jnp.abs(turned.imag), turned.real)
+
+
+def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
+    """Force of all supports on the bed in a jam mode, N zero to peak.
+
+    **Arguments**: `mode` number of the jam mode; `harmonic` k: that of the force at k times the loads' speed alone (of the exact
+    motion); `tier` as `amplitude`.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
+    `InputError` where the quantity is computed, a harmonic of another tier than the exact one here.
+
+    >>> from optimize import foundation_force
+    >>> foundation_force(mode=3).unit
+    'N'
+    """
+    if harmonic is None:
+        return _asking("foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,))
+    count(harmonic, "harmonic")
+    text = f"harmonic {harmonic} of the foundation force"
+    tier = "exact" if tier == "leading" else tier
+    return _asking("force_harmonic", "N", _force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
+
+
+def _force(answers: Answers, tier: Tier, mode: int, harmonic: int | None) -> Array:
+    if tier == "leading":
+        return answers.jam(mode).foundation_force
+    if tier == "time":
+        return answers.jam_run(mode).foundation_force
+    orbit = answers.orbit(mode)
+    if harmonic is None:
+        return orbit.foundation_force
+    if harmonic not in orbit.orders:  # the half-turn symmetry leaves odd harmonics only
+        return jnp.zeros_like(orbit.omega)
+    return peak_force(orbit.force_harmonics[:, orbit.orders.index(harmonic)])
+
+
+def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
+    """Foundation force per amplitude in a jam mode, N/m; whose amplitude, and the tiers, as `amplitude`.
+
+    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them; `tier`.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
+    raises `InputError` where the quantity is computed.
+
+    >>> from optimize import force_per_amplitude
+    >>> force_per_amplitude(mode=3).unit
+    'N/m'
+    """
+    of = _pair(of)
+    text = f"force per amplitude{_whose(of)}"
+    return _asking("force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,))
+
+
+def _ratio(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
+    return _force(answers, tier, mode, None) / _amplitude(answers, tier, mode, of)
+
+
+def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
+    """Speed Omega at which the loads jam in a mode, rad/s.
+
+    **Arguments**: `mode` number of the jam mode; `tier` as `amplitude`.
+
+    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
+    `InputError` where the quantity is computed.
+
+    >>> from optimize import jam_frequency
+    >>> jam_frequency(mode=3).unit
+    'rad/s'
+    """
+    return _asking("jam_frequency", "rad/s", _frequency, mode, tier, "jam frequency")
+
+
+def _frequency(answers: Answers, tier: Tier, mode: int) -> Array:
+    if tier == "leading":
+        return answers.jam(mode).omega
+    return answers.orbit(mode).omega if tier == "exact" else answers.jam_run(mode).omega
+
+
+def fold_margin(*, mode: int) -> Quantity:
+    """By how much the rotor's speed may change, up or down, before a jam mode vanishes at a fold, rad/s, to leading order.
+
+        margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
+
+    Where no fold ends the mode, 0 stands for n_low and ten times the rotor's speed for n_high.
+
+    **Arguments**: `mode` number of the jam mode.
+
+    **Returns** `Quantity`, NaN where the mode does not exist.
+
+    >>> from optimize import fold_margin
+    >>> (fold_margin(mode=3) > "60 rpm").words
+    'distance to the fold, mode 3 at least 60 rpm'
+    """
+    return _asking("fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",))
+
+
+def _margin(answers: Answers, tier: Tier, mode: int) -> Array:
+    below, above = answers.folds(mode)
+    n = answers.scene.drive.speed
+    slow, fast = (below, above) if mode % 2 == 1 else (above, below)
+    return jnp.minimum(n - slow, fast - n) + 0.0 * answers.jam(mode).omega
+
+
+def largest_multiplier(*, mode: int) -> Quantity:
+    """The largest modulus of the non-trivial Floquet multipliers of the exact motion: below 1 it is stable.
+
+    **Arguments**: `mode` number of the jam mode. **Returns** `Quantity`, NaN where the mode does not exist.
+
+    >>> from optimize import largest_multiplier
+    >>> (largest_multiplier(mode=3) < 0.99).words
+    'largest multiplier, mode 3 at most 0.99'
+    """
+    return _asking("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
+
+
+def _multiplier(answers: Answers, tier: Tier, mode: int) -> Array:
+    return answers.orbit(mode).multiplier
+
+
+def power(*, mode: int, tier: Tier = "leading") -> Quantity:
+    """Mean power that the loads take from the rotor in a jam mode, W: n sum_j b_W R^2 (n - Omega), and what dry friction takes.
+
+    **Arguments**: `mode` number of the jam mode; `tier` "leading" or "exact".
+
+    **Returns** `Quantity`, NaN where the mode does not exist.
+
+    >>> from optimize import power
+    >>> power(mode=3).unit
+    'W'
+    """
+    return _asking("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
+
+
+def _power(answers: Answers, tier: Tier, mode: int) -> Array:
+    if tier == "exact":
+        return answers.orbit(mode).power
+    scene, loads = answers.scene, jammed_loads(answers.scene)
+    n, omega = scene.drive.speed, answers.jam(mode).omega
+    torque = loads.drag_sum() * (n - omega)
+    if any(effect.has_friction for effect in scene.effects):
+        torque = torque + light_friction(loads, scene.effects, omega, n)
+    return n * torque

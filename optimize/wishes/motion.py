@@ -1,0 +1,79 @@
+"""Quantities of a run-up from rest, by time integration."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.units import Number
+from optimize.wishes.answers import Answers
+from optimize.wishes.quantity import Asking, Quantity, Tier, number_in
+
+__all__ = ["peak_force", "settling_time"]
+
+
+def _times(until: Number, spin_up: Number) -> tuple[float, float]:
+    end, up = number_in(until, "s", "until"), number_in(spin_up, "s", "spin_up")
+    if not 0.0 < up <= end:
+        raise InputError("spin_up", f"is {up:g} s; it must be greater than 0 and at most until, {end:g} s")
+    return end, up
+
+
+def peak_force(*, until: Number, spin_up: Number) -> Quantity:
+    """The largest foundation force while the rotor is brought up from rest, N: the full equations, integrated.
+
+    **Arguments**: `until` s, how long is looked; `spin_up` s, over which the rotor's speed rises smoothly.
+
+    **Returns** `Quantity`; its derivatives are in forward mode. **Raises** `InputError` for a spin-up longer than the run.
+
+    >>> from optimize import peak_force
+    >>> (peak_force(until="20 s", spin_up="5 s") < "2 kN").words
+    'largest foundation force during spin-up at most 2 kN'
+    """
+    text = "largest foundation force during spin-up"
+    return Asking("peak_force", "N", _peak, tier="time", tiers=("time",), text=text, settings=_times(until, spin_up))
+
+
+def _peak(answers: Answers, tier: Tier, until: float, spin_up: float) -> Array:
+    trajectory = answers.start_up(until, spin_up).trajectory
+    assert trajectory is not None
+    return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
+
+
+def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
+    """The time after which a platform's amplitude stays within a share of what it is in the end, s, when the rotor is brought
+    up from rest: the full equations, integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), w the loads' last speed.
+
+    **Arguments**: `until`, `spin_up` as `peak_force`; `within` the share; `of` the platform.
+
+    **Returns** `Quantity`; its derivatives are in forward mode. It is `until` where the motion is still changing then.
+    **Raises** `InputError` for a share that is not between 0 and 1.
+
+    >>> from optimize import settling_time
+    >>> settling_time(until="20 s", spin_up="5 s").unit
+    's'
+    """
+    if not 0.0 < within < 1.0:
+        raise InputError("within", f"is {within!r}; it must be greater than 0 and less than 1")
+    text = f"time until platform {of} settles"
+    settings = (*_times(until, spin_up), float(within), of)
+    return Asking("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)
+
+
+def _settling(answers: Answers, tier: Tier, until: float, spin_up: float, within: float, of: int) -> Array:
+    run = answers.start_up(until, spin_up)
+    assert run.trajectory is not None
+    state, time = run.trajectory.state, run.trajectory.time
+    if of > state.displacement.shape[1]:
+        raise InputError("of", f"is {of}; the machine has platforms 1 to {state.displacement.shape[1]}")
+    y, v = state.displacement[:, of - 1], state.velocity[:, of - 1]
+    size = jnp.sqrt(y**2 + (v / run.omega) ** 2 + jnp.finfo(y.dtype).tiny)
+    last = size.shape[0] // 20
+    off = jnp.abs(size / jnp.mean(size[-last:]) - 1.0) - within
+    # The last sample that is off, and where the line from it to the next one is not any more.
+    index = jnp.arange(off.shape[0])
+    k = jax.lax.stop_gradient(jnp.clip(jnp.max(jnp.where(off > 0.0, index, 0)), 0, off.shape[0] - 2))
+    share = jnp.clip(off[k] / (off[k] - off[k + 1]), 0.0, 1.0)
+    return time[k] + share * (time[k + 1] - time[k])

@@ -1,0 +1,374 @@
+"""Quantities of a scene, their arithmetic, and demands on them."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal, TypeAlias
+
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.jams.jam import JamModes
+from jaxvib.units import Number, number
+from optimize.wishes.answers import Answers
+
+__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "number_in", "walk"]
+
+Pair = int | tuple[int, int] | None
+"""Whose amplitude: a platform's own, or that of one platform relative to another; None: see `between`."""
+
+Tier: TypeAlias = Literal["leading", "exact", "time"]
+"""How a quantity is computed: to leading order of light loads, from the exact periodic motion, or by time integration."""
+
+TIERS: tuple[Tier, ...] = ("leading", "exact", "time")
+
+Operand: TypeAlias = "Quantity | Number"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A number of a scene with a name and a unit; quantities can be added, multiplied, compared.
+
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`),
+    that gives a scalar, differentiable, NaN where the quantity does not exist; `mode` the jam mode it belongs to, if any; `of`
+    whose amplitude it is about, if any.
+
+    What is added or compared must have the same unit, and a text such as "50 N" counts as a quantity: `force < "50 N"`,
+    `0.3 * a / "1 mm" + force / "10 N"`. `+ - * / **` of quantities and numbers are quantities; `<` and `>` make a `Demand`.
+
+    **Raises** `InputError` for what is no function of one or two arguments, and for units that do not go together.
+
+    >>> import jaxvib as jv
+    >>> from optimize import Quantity, foundation_force
+    >>> heaviest = Quantity("heaviest platform", "kg", lambda scene: scene.machine.mass.max())
+    >>> (foundation_force(mode=3) / heaviest < 0.5).words
+    'foundation force, mode 3 / heaviest platform at most 0.5 N/kg'
+    """
+
+    name: str
+    unit: str
+    function: Callable[..., Array] | None = None
+    mode: int | None = None
+    of: Pair = None
+
+    def __post_init__(self) -> None:
+        if type(self) is Quantity and not (callable(self.function) and _arguments(self.function) in (1, 2)):
+            problem = "give a function of a scene, or of a scene and its jam modes"
+            raise InputError(f"quantity {self.name!r}", f"has the function {self.function!r}; {problem}")
+
+    def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
+        """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
+        return self.read(Answers(scene, modes=modes))
+
+    def read(self, answers: Answers) -> Array:
+        """The quantity's value, a scalar in `unit`, from what is known of a scene."""
+        assert self.function is not None
+        if _arguments(self.function) == 1:
+            return jnp.reshape(self.function(answers.scene), ())
+        return jnp.reshape(self.function(answers.scene, answers.modes), ())
+
+    @property
+    def words(self) -> str:
+        """The quantity in words."""
+        return self.name.replace("_", " ")
+
+    @property
+    def parts(self) -> tuple[Quantity, ...]:
+        """The quantities that it is made of."""
+        return ()
+
+    @property
+    def forward_only(self) -> bool:
+        """Whether derivatives are had in forward mode only."""
+        return any(part.forward_only for part in self.parts)
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        """The same quantity computed in another way, where it can be. **Raises** `InputError` for a tier that there is not."""
+        if tier not in TIERS:
+            raise InputError("tier", f"is {tier!r}; it must be one of {', '.join(TIERS)}")
+        return self
+
+    def named(self, name: str) -> Quantity:
+        """The same quantity under another name."""
+        return replace(self, name=name)
+
+    def __add__(self, other: Operand) -> Quantity:
+        return _sum("+", self, other)
+
+    def __radd__(self, other: Operand) -> Quantity:
+        return _sum("+", other, self)
+
+    def __sub__(self, other: Operand) -> Quantity:
+        return _sum("-", self, other)
+
+    def __rsub__(self, other: Operand) -> Quantity:
+        return _sum("-", other, self)
+
+    def __mul__(self, other: Operand) -> Quantity:
+        return _product(self, other)
+
+    def __rmul__(self, other: Operand) -> Quantity:
+        return _product(other, self)
+
+    def __truediv__(self, other: Operand) -> Quantity:
+        return _ratio(self, other)
+
+    def __rtruediv__(self, other: Operand) -> Quantity:
+        return _ratio(other, self)
+
+    def __neg__(self) -> Quantity:
+        return Combined(f"negative {self.name}", self.unit, mode=self.mode, of=self.of, operation="neg", parts=(self,))
+
+    def __pow__(self, power: float) -> Quantity:
+        if not isinstance(power, (int, float)) or isinstance(power, bool):
+            raise InputError(self.name, f"is raised to {power!r}; give a plain number")
+        unit = f"({self.unit})**{power:g}" if self.unit else ""
+        return _made("**", f"({self.words})^{power:g}", unit, self, _constant(float(power), ""))
+
+    def __lt__(self, other: Operand) -> Demand:
+        return Demand.of(self, other, "at most")
+
+    def __gt__(self, other: Operand) -> Demand:
+        return Demand.of(self, other, "at least")
+
+    __le__ = __lt__
+    __ge__ = __gt__
+
+
+@dataclass(frozen=True)
+class Asking(Quantity):
+    """A quantity that knows what to ask: its function gets the `Answers`, the tier and the `settings`."""
+
+    tier: Tier = "leading"
+    settings: tuple[Any, ...] = ()
+    tiers: tuple[Tier, ...] = TIERS
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        if self.tier not in TIERS:
+            raise InputError("tier", f"is {self.tier!r}; it must be one of {', '.join(TIERS)}")
+        if self.tier not in self.tiers:
+            raise InputError("tier", f"is {self.tier!r}; {self.words} is computed as: {', '.join(self.tiers)}")
+
+    def read(self, answers: Answers) -> Array:
+        assert self.function is not None
+        return jnp.reshape(self.function(answers, self.tier, *self.settings), ())
+
+    @property
+    def words(self) -> str:
+        how = {"leading": "", "exact": ", exact", "time": ", in time"}[self.tier]
+        return (self.text or self.name.replace("_", " ")) + (how if len(self.tiers) > 1 else "")
+
+    @property
+    def forward_only(self) -> bool:
+        return self.tier == "time"
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        super().at_tier(tier)
+        return replace(self, tier=tier) if tier in self.tiers else self
+
+    def named(self, name: str) -> Quantity:
+        return replace(self, name=name, text=name)
+
+
+@dataclass(frozen=True)
+class Combined(Quantity):
+    """Arithmetic of quantities."""
+
+    operation: str = "+"
+    parts: tuple[Quantity, ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
+    constant: float = 0.0
+
+    def read(self, answers: Answers) -> Array:
+        values = [part.read(answers) for part in self.parts]
+        match self.operation:
+            case "constant":
+                return jnp.asarray(self.constant, answers.scene.drive.speed.dtype)
+            case "neg":
+                return -values[0]
+            case "+":
+                return values[0] + values[1]
+            case "-":
+                return values[0] - values[1]
+            case "*":
+                return values[0] * values[1]
+            case "/":
+                return values[0] / values[1]
+            case "**":
+                return values[0] ** values[1]
+            case "largest":
+                return jnp.max(jnp.stack(values))
+            case _:
+                return jnp.min(jnp.stack(values))
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        super().at_tier(tier)
+        return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts))
+
+
+@dataclass(frozen=True)
+class Demand:
+    """A quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
+
+    **Attributes**: `quantity`, `limit` quantities of the same unit; `sense` "at most" or "at least".
+    """
+
+    quantity: Quantity
+    limit: Quantity
+    sense: str
+    shown: str
+
+    @classmethod
+    def of(cls, quantity: Quantity, limit: Operand, sense: str) -> Demand:
+        """A demand. **Raises** `InputError` for a limit of another unit."""
+        other = (
+            limit if isinstance(limit, Quantity) else _constant(number_in(limit, quantity.unit, quantity.words), quantity.unit)
+        )
+        if not _same_unit(other.unit, quantity.unit):
+            raise InputError(
+                quantity.words, f"is in {quantity.unit or 'no unit'} and compared with {other.words} in {other.unit}"
+            )
+        shown = limit.strip() if isinstance(limit, str) else other.words
+        return cls(quantity, other, sense, shown)
+
+    @property
+    def words(self) -> str:
+        """The demand as a sentence's part."""
+        return f"{self.quantity.words} {self.sense} {self.shown}"
+
+    def excess(self, answers: Answers) -> tuple[Array, Array]:
+        """By how much the demand is not met, in its unit, negative where there is room; and the limit."""
+        value, limit = self.quantity.read(answers), self.limit.read(answers)
+        return (value - limit if self.sense == "at most" else limit - value), limit
+
+    def __bool__(self) -> bool:
+        problem = "is a demand and neither true nor false; give a range as two demands, force > 10 and force < 50"
+        raise InputError(self.words, problem)
+
+
+def _arguments(function: Callable[..., Any]) -> int:
+    """How many arguments a function must be given; 1 where nobody says."""
+    try:
+        given = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return 1
+    free = [p for p in given if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return len(free)
+
+
+@lru_cache(maxsize=256)
+def _same_unit(one: str, other: str) -> bool:
+    if one == other:
+        return True
+    import pint  # half a second, and most units are written alike
+
+    units = pint.get_application_registry()
+    try:
+        return abs((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless") - 1.0) < 1e-12
+    except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError):
+        return False
+
+
+def number_in(value: Number, unit: str, name: str) -> float:
+    """A number or text in a unit."""
+    return float(number(value, unit, name))
+
+
+def _constant(value: float, unit: str) -> Combined:
+    return Combined(f"{value:.6g} {unit}".strip(), unit, operation="constant", constant=value)
+
+
+def _with_unit(value: Operand, name: str) -> Quantity:
+    """A quantity of what is given: a number has no unit, a text such as "2 mm" its own, in SI."""
+    if isinstance(value, Quantity):
+        return value
+    if isinstance(value, str):
+        import pint
+
+        try:
+            given = pint.get_application_registry().Quantity(value).to_base_units()
+            return replace(_constant(float(given.magnitude), str(given.units)), name=value.strip())
+        except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError) as error:
+            raise InputError(name, f"is combined with {value!r}, which is no number with a unit") from error
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(name, f"is combined with {value!r}; give a quantity, a finite number or text with a unit")
+    return _constant(float(value), "")
+
+
+def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
+    mode = next((part.mode for part in parts if part.mode is not None), None)
+    of = next((part.of for part in parts if part.of is not None), None)
+    return Combined(name, unit, mode=mode, of=of, operation=operation, parts=parts)
+
+
+def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
+    names = [x.words if isinstance(x, Quantity) else repr(x) for x in (one, other)]
+    left, right = _with_unit(one, names[1]), _with_unit(other, names[0])
+    if not _same_unit(left.unit, right.unit):
+        raise InputError(
+            f"{names[0]} {sign} {names[1]}",
+            f"puts together {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
+            f'by "1 {left.unit or right.unit}"',
+        )
+    return _made(sign, f"{left.words} {sign} {right.words}", left.unit, left, right)
+
+
+def _inside(quantity: Quantity) -> str:
+    """Its words, in brackets where they would be misread in a product."""
+    plain = not (isinstance(quantity, Combined) and quantity.operation in "+-")
+    return quantity.words if plain else f"({quantity.words})"
+
+
+def _product(one: Operand, other: Operand) -> Quantity:
+    left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
+    unit = " ".join(u if " " not in u else f"({u})" for u in (left.unit, right.unit) if u)
+    return _made("*", f"{_inside(left)} * {_inside(right)}", unit, left, right)
+
+
+def _ratio(one: Operand, other: Operand) -> Quantity:
+    left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
+    below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
+    if _same_unit(left.unit, right.unit):
+        unit = ""
+    else:
+        unit = left.unit if not right.unit else f"{left.unit or '1'}/{below}"
+    return _made("/", f"{_inside(left)} / {_inside(right)}", unit, left, right)
+
+
+def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
+    if not quantities or not all(isinstance(q, Quantity) for q in quantities):
+        raise InputError(operation, f"has {quantities!r}; give one quantity or several")
+    for each in quantities[1:]:
+        if not _same_unit(each.unit, quantities[0].unit):
+            raise InputError(operation, f"puts together {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
+    name = f"{operation} of ({'; '.join(q.words for q in quantities)})"
+    return _made(operation, name, quantities[0].unit, *quantities)
+
+
+def largest(*quantities: Quantity) -> Quantity:
+    """The largest of some quantities of the same unit, for example of one quantity at several operating points.
+
+    >>> from optimize import foundation_force, largest, under
+    >>> force = foundation_force(mode=3)
+    >>> largest(force, under(force, "slow", {"drive.speed": "1200 rpm"})).unit
+    'N'
+    """
+    return _extreme("largest", quantities)
+
+
+def least(*quantities: Quantity) -> Quantity:
+    """The least of some quantities of the same unit, see `largest`."""
+    return _extreme("least", quantities)
+
+
+def walk(quantity: Quantity) -> Iterator[Quantity]:
+    """The quantity and all that it is made of."""
+    yield quantity
+    for part in quantity.parts:
+        yield from walk(part)
