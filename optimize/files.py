@@ -59,7 +59,8 @@ def load_design(path: str | Path) -> Design:
     `[ties]` what follows what, `[choices]` the values that can be had; every `[[hold]]` a quantity and, unless it shall stay as
     it is, its value; every `[[demand]]` a quantity that is `at_most` or `at_least` a value; `[objective]` the quantity to make
     small, or large with `maximize = true`. A quantity with `tolerances` is taken over machines that are off by these,
-    `statistic = "expected"` or `"worst"`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`.
+    `statistic = "expected"` or `"worst"`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`,
+    `polishing`.
 
     **Arguments**: `path` of a TOML file.
 
@@ -101,7 +102,7 @@ def load_design(path: str | Path) -> Design:
     if not isinstance(more.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {more['maximize']!r}; write true or false, without quotes")
     if more.get("maximize", False):
-        objective = negative(objective)
+        objective = -objective
     search = dict(tables.get("search", {}))
     allowed = ["starts", "seed", "iterations", "rate", "polishing"]
     for name, value in search.items():

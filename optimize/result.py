@@ -79,9 +79,9 @@ class Row(NamedTuple):
 
 class Limit(NamedTuple):
     """A demand, something held, or a bound: `what` in words; its `value` and `limit` in SI `unit`; by how much it is `broken`
-    (0: kept), in parts of the limit; whether it is `active`; the `multiplier`, the objective's change where the limit is moved by
-    the whole of itself to where it hinders less (what is held: upward); `gain`, that change in per cent of the objective where
-    the limit is moved by 1 %: negative is an improvement."""
+    (0: kept), in parts of the limit; whether it is `active`; the `multiplier`, the objective's change where the limit is moved
+    by the whole of itself to where it hinders less (what is held: upward); `gain`, that change in per cent of the objective
+    where the limit is moved by 1 %: negative is an improvement."""
 
     what: str
     unit: str
@@ -113,15 +113,19 @@ class Machine(NamedTuple):
 class Synthesis(Result):
     """What a search found.
 
-    **Attributes**: `status` a `SynthesisStatus`; `scene` the best design; `before`, `after` its `Outcome` by the jam's equations,
-    `verified` by time integration of the full equations from `run` (both None where that was not done or failed: `unverified`
-    says why); `table` of `Row`: every free number and quantity before and after, exact and in time; `limits` of `Limit`: demands,
-    what is held, and bounds that are active, with what moving each would gain; `influences` of `Influence`; `machines` of
-    `Machine`: the different machines found, best first, and how often; `kkt` the residual of the Karush-Kuhn-Tucker conditions of
-    the best design, relative; `starts` searches made, from `drawn` random designs; `converged` how many of them ended where no
-    free number can improve; `same` how many ended at the best design; `designs` (starts, d) in [0, 1] where each search ended,
-    with their `values` and whether each is `done`; `history` (iterations, starts) of the objective; `objective` and `unit` its
-    name and unit.
+    **Attributes**
+
+    - `status` a `SynthesisStatus`; `scene` the best design
+    - `before`, `after` its `Outcome` by the jam's equations, `verified` by time integration of the full equations from `run`
+      (both None where that was not done or failed: `unverified` says why)
+    - `table` of `Row`: every free number and quantity before and after, of the exact motion and in time
+    - `limits` of `Limit`: demands, what is held, and bounds that are active, with what moving each would gain
+    - `influences` of `Influence`: which number matters most; `machines` of `Machine`: the different ones found, how often
+    - `kkt` the residual of the Karush-Kuhn-Tucker conditions of the best design, relative
+    - `starts` searches made, from `drawn` random designs; `converged` how many of them ended where no free number can improve;
+      `same` how many ended at the best design
+    - `designs` (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history`
+      (iterations, starts) of the objective; `objective` and `unit` its name and unit
     """
 
     status: SynthesisStatus

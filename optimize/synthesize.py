@@ -77,8 +77,8 @@ def synthesize(
       best that it has
 
     **Returns** `Synthesis`. **Raises** `InputError` for values that are not allowed, `ComputationError` (status
-    "no_feasible_start" if no design in the bounds has the objective, "contradictory" where no design meets all demands: it names
-    those that are not met, and by how much).
+    "no_feasible_start" if no design in the bounds has the objective, "contradictory" where no design meets all demands: it
+    names those that are not met, and by how much).
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -215,8 +215,8 @@ def _searched(
     if best is None:
         raise ComputationError(
             "no_feasible_start",
-            f"of the random designs in the bounds ({options.starts} starts) none has {objective.words}; widen the bounds or ask "
-            "for another mode",
+            f"of the random designs in the bounds ({options.starts} starts) none has {objective.words}; widen the bounds or "
+            "ask for another mode",
         )
     return best
 

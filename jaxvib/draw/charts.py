@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -136,8 +136,8 @@ def solid_and_dashed(
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Figure:
-    """For each (name, before, after) a bar from 1 to after/before on a logarithmic axis, so that what falls a thousandfold is as
-    plain as what grows so; the values stand beside it. What has no ratio is written only."""
+    """For each (name, before, after) a bar from 1 to after/before on a logarithmic axis, so that what falls a thousandfold is
+    as plain as what grows so; the values stand beside it. What has no ratio is written only."""
     figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)

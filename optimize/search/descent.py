@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ class _Lane(NamedTuple):
     weight: Array
     worst: Array
     size: Array
-    count: Array
+    taken: Array
 
 
 class Descended(NamedTuple):
@@ -72,13 +72,14 @@ def _along(vector: Array, held: Array, free: Array) -> Array:
     return vector - _least(rows, rows @ vector)
 
 
-def _begin(problem: Problem, point: Point, multipliers: Array) -> _Lane:
+def _begin(point: Any, multipliers: Array) -> _Lane:
     lane = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
     one = jnp.ones(n)
     size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
-    return _Lane(*point, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
+    z, values, slopes, known, reach = point
+    return _Lane(z, values, slopes, known, reach, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
 
 
 def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
@@ -92,7 +93,7 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
         down = _along(slope, held, free)
         free = jnp.where(((lane.z <= 0.0) & (down > 0.0)) | ((lane.z >= 1.0) & (down < 0.0)), 0.0, free)
     move, adam = _ADAM.update(_along(slope, held, free), lane.adam)
-    step = -rate * _along(move, held, free)
+    step = -rate * _along(jnp.asarray(move), held, free)
     if m:
         wanted = -_least(held, off)
         stopped = ((lane.z <= 0.0) & (wanted < 0.0)) | ((lane.z >= 1.0) & (wanted > 0.0))
@@ -110,7 +111,7 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     z, values, slopes, known, reach = jax.tree.map(chosen, new, (lane.z, lane.values, lane.slopes, lane.known, lane.reach))
     length = jnp.where(good, jnp.minimum(1.0, 1.2 * lane.length), 0.5 * lane.length)
 
-    update = (lane.count % _UPDATE == _UPDATE - 1) & (rate > 0.0)
+    update = (lane.taken % _UPDATE == _UPDATE - 1) & (rate > 0.0)
     excess = values[1 + m :]
     multipliers = jnp.where(update, jnp.maximum(0.0, lane.multipliers + lane.weight * excess), lane.multipliers)
     worst = jnp.max(jnp.maximum(excess, 0.0), initial=0.0)
@@ -118,7 +119,7 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     weight = jnp.where(slow, jnp.minimum(3.0 * lane.weight, 1e4), lane.weight)
     lane = _Lane(
         z, values, slopes, known, reach, adam, length, multipliers, weight,
-        jnp.where(update, worst, lane.worst), lane.size, lane.count + 1,
+        jnp.where(update, worst, lane.worst), lane.size, lane.taken + 1,
     )  # fmt: skip
     return lane, values[0]
 
@@ -129,8 +130,8 @@ def _ahead(known: Array, reach: Array, step: Array) -> Array:
 
 
 @cached
-def _begun(problem: Problem, point: Point, multipliers: Array) -> _Lane:
-    return _begin(problem, point, multipliers)
+def _begun(point: Point, multipliers: Array) -> _Lane:
+    return _begin(point, multipliers)
 
 
 @cached
@@ -154,7 +155,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
     rates = np.asarray(schedule(jnp.arange(steps)))
     rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
-    lanes = chunked(problem.lanes, lambda p, m: _begun(problem, p, m), point, np.zeros((len(point.z), len(problem.demands))))
+    lanes = chunked(problem.lanes, _begun, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
         each = jnp.asarray(part)

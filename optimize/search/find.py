@@ -38,8 +38,8 @@ class Options:
 
 
 class Found(NamedTuple):
-    """Where searches ended, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was `interrupted`;
-    the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
+    """Where searches ended, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was
+    `interrupted`; the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
 
     point: Point
     history: np.ndarray

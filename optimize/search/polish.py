@@ -26,8 +26,8 @@ _DEAREST = 1e9
 
 
 class Optimality(NamedTuple):
-    """What is known of designs: `multipliers` of what is held (s, me) and of demands (s, mi), in units of the objective per unit
-    of the relative excess; of bounds (s, d), positive at the upper one; the `kkt` residual (s,), relative."""
+    """What is known of designs: `multipliers` of what is held (s, me) and of demands (s, mi), in units of the objective per
+    unit of the relative excess; of bounds (s, d), positive at the upper one; the `kkt` residual (s,), relative."""
 
     held: np.ndarray
     demands: np.ndarray
@@ -36,8 +36,8 @@ class Optimality(NamedTuple):
 
 
 class Polished(NamedTuple):
-    """Where searches ended: the `point`; the objective on the way, `history` (steps, starts); `left`, by how much it could still
-    fall in relation to its value, as slopes and curvatures tell; the greatest `violation`; and its `Optimality`."""
+    """Where searches ended: the `point`; the objective on the way, `history` (steps, starts); `left`, by how much it could
+    still fall in relation to its value, as slopes and curvatures tell; the greatest `violation`; and its `Optimality`."""
 
     point: Point
     history: np.ndarray
@@ -59,15 +59,16 @@ def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def violation(problem: Problem, point: Point) -> np.ndarray:
-    """The greatest relative amount (s,) by which anything held is off or a demand exceeded; infinite where there is no value."""
+    """The greatest relative amount (s,) by which anything held is off or a demand exceeded; infinite where there is no
+    value."""
     m = problem.equalities
     parts = np.concatenate([np.abs(point.values[:, 1 : 1 + m]), np.maximum(point.values[:, 1 + m :], 0.0)], axis=1)
     return np.where(point.exists(), np.max(parts, axis=1, initial=0.0), np.inf)
 
 
 def restored(problem: Problem, point: Point, steps: int, demanded: np.ndarray | None = None) -> Point:
-    """The designs nearest to `point`, to first order, that keep what is held, and demands of which `demanded` (s, mi) is true or
-    that are exceeded, inside the bounds."""
+    """The designs nearest to `point`, to first order, that keep what is held, and demands of which `demanded` (s, mi) is true
+    or that are exceeded, inside the bounds."""
     m, mi = problem.equalities, len(problem.demands)
     if m + mi == 0:
         return point
@@ -209,8 +210,8 @@ def _first_guess(problem: Problem, point: Point) -> np.ndarray:
 
 
 def _curvature(problem: Problem, point: Point, weights: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Second derivatives (s, d, d) of the Lagrangian over the objective's size, not indefinite; only along what constraints that
-    count leave free: across them the linear constraints decide."""
+    """Second derivatives (s, d, d) of the Lagrangian over the objective's size, not indefinite; only along what constraints
+    that count leave free: across them the linear constraints decide."""
     d, m = point.z.shape[1], problem.equalities
     weights = weights.copy()
     weights[:, 0] = 1.0 / size
@@ -271,7 +272,7 @@ def _merit(problem: Problem, point: Point, size: np.ndarray, price: np.ndarray) 
 def optimality(problem: Problem, point: Point) -> Optimality:
     """Multipliers by least squares from the constraints that are active, and how well they balance the objective's slope."""
     m, mi = problem.equalities, len(problem.demands)
-    s, d = point.z.shape
+    s = len(point.z)
     slopes = np.where(np.isfinite(point.slopes), point.slopes, 0.0)
     rows, slope = slopes[:, 1:], slopes[:, 0]
     counts = np.ones((s, m + mi), bool)

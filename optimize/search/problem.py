@@ -29,7 +29,7 @@ __all__ = ["Known", "Point", "Problem", "chunked", "evaluate", "looked_up", "mad
 _CHUNK = 64
 """Designs that are evaluated together on a core."""
 
-Known = tuple[np.ndarray, ...]
+Known = tuple[Any, ...]
 """Load speeds near which jams are followed, an array with a leading axis over the designs for each key."""
 
 
@@ -73,8 +73,8 @@ class Problem(eqx.Module):
 
 
 class Point(NamedTuple):
-    """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is followed
-    and `reach`, by how much these change with z (s, ..., d)."""
+    """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is
+    followed and `reach`, by how much these change with z (s, ..., d)."""
 
     z: np.ndarray
     values: np.ndarray

@@ -12,8 +12,8 @@ _STEPS = 40
 
 
 class Solved(NamedTuple):
-    """The steps `p` (s, d) and the multipliers of the equalities (s, me), of the demands (s, mi), not negative, and of the bounds
-    (s, d), positive at the upper one."""
+    """The steps `p` (s, d) and the multipliers of the equalities (s, me), of the demands (s, mi), not negative, and of the
+    bounds (s, d), positive at the upper one."""
 
     p: np.ndarray
     held: np.ndarray
@@ -102,6 +102,7 @@ def elastic(
             weight: np.ndarray = weight,
             stationary: np.ndarray = stationary,
             primal: np.ndarray = primal,
+            slack: np.ndarray = slack,
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """The step that brings the products of slacks and duals to `target` more."""
             rest = -stationary - np.einsum("snm,sm->sn", turned, weight * primal + target / slack)

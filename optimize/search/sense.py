@@ -17,8 +17,8 @@ _STEP = 0.01
 
 
 def limits_of(problem: Problem, found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
-    """Everything held and demanded, and the bounds that are active, of the best design; `sides` (mi, 2) the values of demands and
-    of their limits there."""
+    """Everything held and demanded, and the bounds that are active, of the best design; `sides` (mi, 2) the values of demands
+    and of their limits there."""
     best, m = found.best, problem.equalities
     values, duals = found.point.values[best], found.optimality
     objective = abs(values[0]) if np.isfinite(values[0]) else np.nan

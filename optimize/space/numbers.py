@@ -27,11 +27,11 @@ _POSITIVE = ("mass", "radius", "speed")
 
 
 class Place(NamedTuple):
-    """Where numbers stand in a scene: `path` of attributes and places in tuples, `index` in an array, None for all of it;
+    """Where numbers stand in a scene: `path` of attributes and places in tuples, `entry` of an array, None for all of it;
     their `name`, `unit` and how many they are, `size`."""
 
     path: tuple[str | int, ...]
-    index: int | None
+    entry: int | None
     name: str
     unit: str
     size: int
@@ -46,18 +46,18 @@ class Place(NamedTuple):
     def read(self, scene: Scene) -> Array:
         """The numbers, (size,)."""
         leaf = self.leaf(scene)
-        return jnp.reshape(leaf if self.index is None else leaf[self.index], (-1,))
+        return jnp.reshape(leaf if self.entry is None else leaf[self.entry], (-1,))
 
     @property
     def entries(self) -> set[tuple[tuple[str | int, ...], int]]:
         """Each number, to be compared with those of other places."""
-        return {(self.path, k) for k in (range(self.size) if self.index is None else (self.index,))}
+        return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
 
 
 def changed(scene: Scene, place: Place, values: Array) -> Scene:
     """The scene with these numbers (size,) in that place."""
     leaf = place.leaf(scene)
-    new = jnp.reshape(values, jnp.shape(leaf)) if place.index is None else leaf.at[place.index].set(values[0])
+    new = jnp.reshape(values, jnp.shape(leaf)) if place.entry is None else leaf.at[place.entry].set(values[0])
     return eqx.tree_at(place.leaf, scene, new)
 
 
@@ -113,7 +113,7 @@ def value_of(name: str, value: Number) -> float:
 def names_of(scene: Scene, place: Place) -> list[str]:
     """What a designer calls each number of a place."""
     *_, owner, last = ("scene", *(p for p in place.path if isinstance(p, str)))
-    which = range(place.size) if place.index is None else (place.index,)
+    which = range(place.size) if place.entry is None else (place.entry,)
     several = np.ndim(place.leaf(scene)) > 0
     loads = {"ball": "ball", "roller": "roller", "pendulum": "pendulum"}.get(scene.loads.kind, "load")
     links = getattr(scene.machine, "links", ())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,6 +18,8 @@ from optimize.wishes.answers import Answers
 from optimize.wishes.quantity import Quantity
 
 __all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
+
+Numbers = TypeVar("Numbers", np.ndarray, Array)
 
 Bounds = tuple[Number, Number] | tuple[Number, Number, str]
 """(low, high), or (low, high, "log" or "even")."""
@@ -163,13 +165,13 @@ class DesignSpace(eqx.Module):
         """How many numbers are free."""
         return sum(place.size for place in self.places)
 
-    def numbers(self, z: Array) -> Array:
+    def numbers(self, z: Numbers) -> Numbers:
         """The free numbers (..., d), SI, of designs z (..., d) in [0, 1]; NumPy's arrays where z is one."""
         xp = np if isinstance(z, np.ndarray) else jnp
         low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
         log = np.asarray(self.logs)
         base = xp.where(log, low, 1.0)
-        return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)
+        return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)  # pyright: ignore
 
     def at(self, z: Array) -> Scene:
         """The scene of the design z (d,) in [0, 1]."""
@@ -189,7 +191,7 @@ class DesignSpace(eqx.Module):
         """The design z (d,) of a scene, moved into the bounds where it lies outside."""
         return self.shares(jnp.concatenate([place.read(scene) for place in self.places]))
 
-    def shares(self, numbers: Array) -> Array:
+    def shares(self, numbers: Numbers) -> Numbers:
         """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
         xp = np if isinstance(numbers, np.ndarray) else jnp
         low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
@@ -197,11 +199,11 @@ class DesignSpace(eqx.Module):
         base = xp.where(log, low, 1.0)
         ratio = xp.where(log & (width > 0.0), high / base, 2.0)
         even = (value - low) / xp.where(width > 0.0, width, 1.0)
-        return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)
+        return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)  # pyright: ignore
 
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
         """The free numbers of a scene by name, in SI."""
-        return {p.name: (p.leaf(scene) if p.index is None else p.leaf(scene)[p.index]).tolist() for p in self.places}
+        return {p.name: (p.leaf(scene) if p.entry is None else p.leaf(scene)[p.entry]).tolist() for p in self.places}
 
     def words(self) -> list[tuple[str, str]]:
         """What a designer calls each free number, and its unit."""

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
 from jaxvib.equations.linear import LinearModel, linear_model, natural_frequencies
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
@@ -30,12 +30,6 @@ _NO_FOLD = 10.0
 _SAMPLES = 4000
 """States of a run-up that are looked at."""
 
-Asked = tuple[str, int]
-"""What is followed: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
-
-Key = tuple[tuple[Hashable, ...], Asked]
-"""Of which scene (the cases that lead there from the design's own), and what."""
-
 
 class Case(Protocol):
     """Another scene made of a design's, or several of them: a load case, an operating point, samples of tolerances."""
@@ -48,6 +42,13 @@ class Case(Protocol):
     def several(self) -> bool:
         """Whether it stands for several scenes."""
         ...
+
+
+Asked = tuple[str, int]
+"""What is followed: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
+
+Key = tuple[tuple[Case, ...], Asked]
+"""Of which scene (the cases that lead there from the design's own), and what."""
 
 
 class Recorder:
@@ -65,15 +66,15 @@ class Recorder:
 class Answers:
     """What is known of one scene. Questions are answered when they are first asked.
 
-    **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the whole
-    branch is looked at; `found` the load speeds that came out.
+    **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the
+    whole branch is looked at; `found` the load speeds that came out.
     """
 
     def __init__(
         self,
         scene: Scene,
         known: Mapping[Key, Array] | Recorder | None = None,
-        path: tuple[Hashable, ...] = (),
+        path: tuple[Case, ...] = (),
         modes: JamModes | None = None,
     ):
         self.scene = scene
@@ -101,16 +102,14 @@ class Answers:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         key: Key = (self.path, ("jam", mode))
         if key not in self._kept:
-            if self.known is None:
-                jam = self.modes.select(mode, throw=False)
-            else:
-                jam = follow_jam(self.model, mode, self.known[key])
+            jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.model, mode, self.known[key])
             self._kept[key] = jam
             self.found[key] = jam.omega
         return self._kept[key]  # pyright: ignore[reportReturnType]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
-        """Rotor speeds, rad/s, of the folds below and above a jam mode on the branch; where there is none, 0 or ten times the scene's."""
+        """Rotor speeds, rad/s, of the folds below and above a jam mode on the branch; where there is none, 0 or ten times the
+        scene's."""
         speeds = []
         for side in ("below", "above"):
             key: Key = (self.path, (side, mode))
@@ -161,7 +160,7 @@ class Answers:
             self._kept[key] = simulate(self.scene, until, estimate=False, adjoint=adjoint, throw=False, **options)
         return self._kept[key]  # pyright: ignore[reportReturnType]
 
-    def under(self, case: Case) -> tuple[Scene, tuple[Hashable, ...]]:
+    def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
         """The scene, or scenes, of a case, and their path."""
         return case.scenes(self.scene), (*self.path, case)
 

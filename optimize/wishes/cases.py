@@ -160,8 +160,8 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     **Arguments**: `quantity`; `name` of the case, for tables; `changes` the name of a number, such as "drive.speed" or
     "machine.mass[0]", to its value, SI or text with a unit.
 
-    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, where it is computed, a name that the scene
-    does not have.
+    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, where it is computed, a name that the
+    scene does not have.
 
     >>> from optimize import foundation_force, under
     >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -14,7 +16,7 @@ from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.units import count
 from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Asking, Pair, Quantity, Tier
+from optimize.wishes.quantity import TIERS, Asking, Pair, Quantity, Tier
 
 __all__ = [
     "amplitude",
@@ -46,9 +48,20 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms of 1 to {n}")
 
 
-def _asking(name: str, unit: str, function: object, mode: int, tier: Tier, text: str, **more: object) -> Quantity:
-    settings = (mode, *more.pop("settings", ()))  # pyright: ignore
-    return Asking(name, unit, function, mode=mode, tier=tier, settings=settings, text=f"{text}, mode {mode}", **more)  # pyright: ignore
+def _asking(
+    name: str,
+    unit: str,
+    function: Callable[..., Array],
+    mode: int,
+    tier: Tier,
+    text: str,
+    *,
+    of: Pair = None,
+    settings: tuple[Pair, ...] = (),
+    tiers: tuple[Tier, ...] = TIERS,
+) -> Quantity:
+    text = f"{text}, mode {mode}"
+    return Asking(name, unit, function, mode, of, tier, (mode, *settings), tiers, text)
 
 
 def _whose(of: Pair) -> str:
@@ -125,8 +138,8 @@ def _phase(answers: Answers, tier: Tier, mode: int, of: tuple[int, int]) -> Arra
 def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
     """Force of all supports on the bed in a jam mode, N zero to peak.
 
-    **Arguments**: `mode` number of the jam mode; `harmonic` k: that of the force at k times the loads' speed alone (of the exact
-    motion); `tier` as `amplitude`.
+    **Arguments**: `mode` number of the jam mode; `harmonic` k: that of the force at k times the loads' speed alone (of the
+    exact motion); `tier` as `amplitude`.
 
     **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
     `InputError` where the quantity is computed, a harmonic of another tier than the exact one here.

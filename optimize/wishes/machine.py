@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import jax
@@ -176,7 +177,7 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
         raise InputError("prices", "is no list of at least two pairs (stiffness, price)")
     stiffness = tuple(number_in(k, "N/m", f"prices[{i}]") for i, (k, _) in enumerate(rows))
     price = tuple(float(p) for _, p in rows)
-    if not all(a < b for a, b in zip(stiffness, stiffness[1:], strict=False)) or not stiffness[0] > 0.0:
+    if not all(a < b for a, b in itertools.pairwise(stiffness)) or not stiffness[0] > 0.0:
         raise InputError("prices", "has stiffnesses that do not ascend from one greater than 0")
     return _asking("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
 

@@ -270,7 +270,7 @@ def _same_unit(one: str, other: str) -> bool:
 
     units = pint.get_application_registry()
     try:
-        return abs((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless") - 1.0) < 1e-12
+        return abs(float((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless")) - 1.0) < 1e-12
     except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError):
         return False
 
@@ -334,10 +334,7 @@ def _product(one: Operand, other: Operand) -> Quantity:
 def _ratio(one: Operand, other: Operand) -> Quantity:
     left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
     below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
-    if _same_unit(left.unit, right.unit):
-        unit = ""
-    else:
-        unit = left.unit if not right.unit else f"{left.unit or '1'}/{below}"
+    unit = "" if _same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
     return _made("/", f"{_inside(left)} / {_inside(right)}", unit, left, right)
 
 
