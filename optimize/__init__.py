@@ -1,6 +1,7 @@
 """Design: what may change, what is wanted, who searches."""
 
 from optimize.files import Design, load_design
+from optimize.pareto import Front, pareto
 from optimize.quantities import (
     Quantity,
     amplitude,
@@ -37,6 +38,7 @@ __all__ = [
     "Demand",
     "Design",
     "DesignSpace",
+    "Front",
     "Held",
     "Outcome",
     "Quantity",
@@ -55,6 +57,7 @@ __all__ = [
     "maximize",
     "minimize",
     "negative",
+    "pareto",
     "peak_force",
     "phase",
     "power",

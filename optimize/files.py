@@ -12,7 +12,9 @@ from jaxvib.machine.files import called, closest, load_scene, read_toml
 from jaxvib.units import count, number
 from optimize import quantities
 from optimize.quantities import Quantity
+from optimize.result import Synthesis
 from optimize.space import DesignSpace, hold
+from optimize.synthesize import synthesize
 from optimize.wishes.quantity import Demand
 
 __all__ = ["TEMPLATE", "Design", "load_design"]
@@ -50,6 +52,10 @@ class Design:
     objective: Quantity
     search: dict[str, Any] = field(default_factory=dict)
     subject_to: tuple[Demand, ...] = ()
+
+    def run(self, **more: Any) -> Synthesis:
+        """`synthesize` of this design; `more` of its arguments in place of those in `search`."""
+        return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})
 
 
 def load_design(path: str | Path) -> Design:

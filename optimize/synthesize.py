@@ -116,7 +116,7 @@ def synthesize(
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
     told = reported((*(q for _, q in named), objective, *sides), batch, problem)
-    limits = limits_of(problem, found, told[1, len(named) + 1 :].reshape(-1, 2))
+    limits = limits_of(problem, demands, found, told[1, len(named) + 1 :].reshape(-1, 2))
     if throw and not kept[best]:
         broken = "; ".join(
             f"{x.what}: at best {x.value:.5g} {x.unit}, {100.0 * x.broken:.3g} % off" for x in limits if x.broken

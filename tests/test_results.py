@@ -33,6 +33,7 @@ from jaxvib.study.capture.capture import _judged
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
+from optimize.pareto import Front
 from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
 
 DATA = pathlib.Path(__file__).parent / "data"
@@ -163,6 +164,7 @@ RESULTS = {
     "Audit": audited,
     "GradientCheck": checked_gradients,
     "Synthesis": synthesis,
+    "Front": lambda: Front(np.array([[1.0, 2.0], [2.0, 1.0]]), ("force", "power"), ("N", "W"), (jv.scene_to_toml(SCENE),) * 2),
 }
 
 SEVERAL_PANELS = [

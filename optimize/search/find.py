@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,9 @@ import numpy as np
 from optimize.search.descent import descend
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, polish
 from optimize.search.problem import Point, Problem, evaluate, looked_up
+from optimize.space.space import DesignSpace
+from optimize.wishes.cases import Robust
+from optimize.wishes.quantity import walk
 
 __all__ = ["Found", "Options", "choose", "find"]
 
@@ -62,6 +65,39 @@ class Found(NamedTuple):
 
 
 def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
+    """Searches from random starts. What takes long (exact motions, integrations, tolerances) is searched to leading order and
+    without tolerances first, and then from the best different machines that this finds and some random ones."""
+    easy = None if options.begin is not None else problem.easy()
+    if easy is None:
+        return _find(problem, options, tell)
+    first = _find(easy, options, lambda what, share: tell(what, 0.5 * share))
+    if first is None:
+        return _find(problem, options, tell)
+    if first.interrupted:
+        options = replace(options, iterations=0, polishing=0)
+    random = np.random.default_rng(options.seed).uniform(size=(2 * _FEW, problem.space.size))
+    begin = np.concatenate([_few(first), random])[: 2 * _FEW if _spread(problem) else _FEW]
+    if not _spread(problem):  # its best machines are near those to leading order
+        begin, options = _few(first), replace(options, iterations=0, polishing=max(options.polishing, 20))
+    narrow = _with_lanes(problem, problem.space)
+    if len(begin) == 0:
+        begin = first.point.z[:_FEW]
+    found = _find(narrow, replace(options, begin=begin), lambda what, share: tell(what, 0.5 + 0.5 * share))
+    return None if found is None else found._replace(drawn=first.drawn, existing=first.existing)
+
+
+def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
+    """The search in another space, for few designs."""
+    return Problem(space, problem.objective, problem.demands, problem.keys, problem.constants, problem.scales, _FEW)
+
+
+def _spread(problem: Problem) -> bool:
+    """Whether tolerances count."""
+    every = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
+    return any(isinstance(part, Robust) for q in every for part in walk(q))
+
+
+def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     """Searches from random starts, or from the designs `begin`; None where no design has the objective. An interrupt
     (KeyboardInterrupt) ends the search with what it has."""
     tell("drawing starts", 0.0)
@@ -89,9 +125,11 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         return tell_of
 
     try:
-        descended = descend(problem, point, options.iterations, options.rate, said("descending", 0.1, 0.5))
-        history.append(descended.history)
-        ended = polish(problem, descended.point, options.polishing, said("polishing", 0.5, 0.9))
+        if options.iterations:
+            descended = descend(problem, point, options.iterations, options.rate, said("descending", 0.1, 0.5))
+            history.append(descended.history)
+            point = descended.point
+        ended = polish(problem, point, options.polishing, said("polishing", 0.5, 0.9))
     except KeyboardInterrupt:
         interrupted = True
         ended = polish(problem, last, 0, lambda *_: None)
@@ -176,13 +214,13 @@ def _few(found: Found) -> np.ndarray:
         z = found.point.z[k]
         if np.isfinite(found.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in kept):
             kept.append(z)
-    return np.asarray(kept[: _FEW - 1])
+    return np.reshape(kept[: _FEW - 1], (-1, found.point.z.shape[1]))
 
 
 def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:
     """The search between narrower bounds, from the designs with these numbers."""
     space = problem.space.within(low, high)
-    narrow = Problem(space, problem.objective, problem.demands, problem.keys, problem.scales, _FEW)
+    narrow = _with_lanes(problem, space)
     z = np.asarray(space.shares(np.clip(numbers, low, high)))
     point = evaluate(narrow, z, looked_up(narrow, z))
     point = point.take(np.flatnonzero(point.exists()))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,9 +21,9 @@ from jax import Array
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
-from optimize.space.space import DesignSpace
+from optimize.space.space import DesignSpace, Held
 from optimize.wishes.answers import Answers, Key, Recorder, guesses
-from optimize.wishes.quantity import Combined, Demand, Quantity
+from optimize.wishes.quantity import Asking, Demand, Quantity, walk
 
 __all__ = ["Known", "Point", "Problem", "chunked", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
 
@@ -36,7 +37,9 @@ Known = tuple[Any, ...]
 class Problem(eqx.Module):
     """A design space, what is to be small in it, and what is demanded.
 
-    **Attributes**: `space`; `objective`; `demands`; `keys` of what is followed; `scales` (mi,): the demands' units, positive;
+    **Attributes**: `space`; `objective`; `demands`, their forms, and
+    `constants` (mi,), their limits where these are numbers; `keys` of what is followed; `scales` (mi,): the demands' units,
+    positive;
     `lanes` designs are evaluated together.
     """
 
@@ -44,7 +47,8 @@ class Problem(eqx.Module):
     objective: Quantity = eqx.field(static=True)
     demands: tuple[Demand, ...] = eqx.field(static=True)
     keys: tuple[Key, ...] = eqx.field(static=True)
-    scales: Array
+    constants: Array | np.ndarray
+    scales: Array | np.ndarray
     lanes: int = eqx.field(static=True, default=_CHUNK)
 
     @property
@@ -62,14 +66,43 @@ class Problem(eqx.Module):
         """The same numbers from what is known of a scene."""
         objective = jnp.reshape(self.objective.read(answers), (1,))
         held = self.space.residuals(answers)
-        excess = [demand.excess(answers)[0] for demand in self.demands]
+        excess = [demand.excess(answers, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
+
+    def easy(self) -> Problem | None:
+        """The search that comes first: to leading order and without tolerances, demands that are not to be had so left out;
+        None where this is it, or where the objective is not to be had so."""
+        objective = self.objective.easy
+        demands = [replace(d, quantity=d.quantity.easy, limit=d.limit.easy) for d in self.demands]
+        held = tuple(Held(h.quantity.easy, h.value) for h in self.space.held)
+        same = objective == self.objective and demands == list(self.demands)
+        if same and all(a.quantity == b.quantity for a, b in zip(held, self.space.held, strict=True)):
+            return None
+        if _hard(objective) or any(_hard(h.quantity) for h in held):
+            return None
+        kept = [k for k, d in enumerate(demands) if not (_hard(d.quantity) or _hard(d.limit))]
+        space = eqx.tree_at(lambda s: s.held, self.space, held)
+        keys = report_keys(
+            [objective, *(h.quantity for h in held), *(q for k in kept for q in _sides(demands[k]))], space.scene
+        )
+        index = np.asarray(kept, int)
+        forms = tuple(demands[k] for k in kept)
+        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes)
 
     @property
     def forward_only(self) -> bool:
         """Whether a quantity has derivatives in forward mode only."""
         every = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
         return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
+
+
+def _sides(demand: Demand) -> tuple[Quantity, Quantity]:
+    return demand.quantity, demand.limit
+
+
+def _hard(quantity: Quantity) -> bool:
+    """Whether some of it is not computed to leading order."""
+    return any(isinstance(q, Asking) and q.tier != "leading" for q in walk(quantity))
 
 
 class Point(NamedTuple):
@@ -116,16 +149,17 @@ class Point(NamedTuple):
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
     """The search, with what it follows and the scale of each demand: that of its limit, or of its value at the beginning."""
-    blank = Problem(space, objective, tuple(demands), (), jnp.ones(len(demands)))
+    forms, ones = tuple(demand.form() for demand in demands), np.ones(len(demands))
+    blank = Problem(space, objective, forms, (), ones, ones)
     recorder = Recorder()
     jax.eval_shape(lambda scene: blank.read(Answers(scene, recorder)), space.scene)
-    constants = [abs(d.limit.constant) if isinstance(d.limit, Combined) and not d.limit.parts else 0.0 for d in demands]
-    scales = np.asarray(constants, float)
+    constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
+    scales = np.abs(constants)
     if np.any(scales == 0.0):
         sides = tuple(q for d in demands for q in (d.quantity, d.limit))
         found = np.abs(reported(sides, jax.tree.map(lambda leaf: leaf[None], space.scene))[0]).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
-    return Problem(space, objective, tuple(demands), tuple(recorder.keys), jnp.asarray(scales), _lanes(starts))
+    return Problem(space, objective, forms, tuple(recorder.keys), constants, scales, _lanes(starts))
 
 
 def derive(problem: Problem, z: Array, near: Sequence[Array]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:

@@ -120,9 +120,10 @@ def elastic(
         centre = (after / np.maximum(gap, 1e-300)) ** 3 * gap
         dx, ds, dl = solved(centre[:, None] - slack * dual - ds * dl)
         keep = np.where(done, 0.0, 0.995)
-        by_s, by_l = keep * longest(slack, ds), keep * longest(dual, dl)
-        x = x + by_s[:, None] * dx
-        slack = np.maximum(slack + by_s[:, None] * ds, 1e-300)
-        dual = np.maximum(dual + by_l[:, None] * dl, 1e-300)
+        # One length for both: the duals' equation holds the quadratic term.
+        by = keep * np.minimum(longest(slack, ds), longest(dual, dl))
+        x = x + by[:, None] * dx
+        slack = np.maximum(slack + by[:, None] * ds, 1e-300)
+        dual = np.maximum(dual + by[:, None] * dl, 1e-300)
     parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
     return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])

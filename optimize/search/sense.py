@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from optimize.result import Influence, Limit, Machine
@@ -9,6 +11,7 @@ from optimize.search.find import Found
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem
 from optimize.space.numbers import shown_unit
+from optimize.wishes.quantity import Demand
 
 __all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
 
@@ -16,7 +19,7 @@ _STEP = 0.01
 """The relative change that influences are told for."""
 
 
-def limits_of(problem: Problem, found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
+def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: np.ndarray) -> tuple[Limit, ...]:
     """Everything held and demanded, and the bounds that are active, of the best design; `sides` (mi, 2) the values of demands
     and of their limits there."""
     best, m = found.best, problem.equalities
@@ -30,12 +33,13 @@ def limits_of(problem: Problem, found: Found, sides: np.ndarray) -> tuple[Limit,
 
     for held, off, dual in zip(space.held, values[1 : 1 + m], duals.held[best], strict=True):
         assert held.value is not None
-        unit, factor = shown_unit(held.quantity.unit, abs(held.value))
-        what = f"{held.quantity.words} held at {held.value * factor:.5g} {unit}".rstrip()
+        at = float(held.value)
+        unit, factor = shown_unit(held.quantity.unit, abs(at))
+        what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
         broken = abs(off) if abs(off) > 10.0 * FEASIBLE else 0.0
-        value = held.value * (1.0 + off)
-        rows.append(Limit(what, held.quantity.unit, value, held.value, float(broken), True, float(-dual), gain(-dual)))
-    for k, demand in enumerate(problem.demands):
+        value = float(at * (1.0 + off))
+        rows.append(Limit(what, held.quantity.unit, value, at, float(broken), True, float(-dual), gain(-dual)))
+    for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
         broken = excess if excess > 10.0 * FEASIBLE else 0.0
         active = bool(excess > -1e-6)

@@ -32,7 +32,7 @@ class Held(eqx.Module):
     """A quantity that keeps its value during the search; made by `hold`."""
 
     quantity: Quantity = eqx.field(static=True)
-    value: float | None = eqx.field(static=True)
+    value: float | np.ndarray | None
 
 
 def hold(quantity: Quantity, value: Number | None = None) -> Held:
@@ -287,11 +287,11 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
 
 def _with_value(held: Held, scene: Scene) -> Held:
     if held.value is not None:
-        return held
+        return Held(held.quantity, np.asarray(held.value))
     value = float(held.quantity(scene))
     if not (np.isfinite(value) and value != 0.0):
         raise InputError(
             f"hold.{held.quantity.name}",
             f"is {value} in the scene the search begins with; give the value it shall be held at",
         )
-    return Held(held.quantity, value)
+    return Held(held.quantity, np.asarray(value))

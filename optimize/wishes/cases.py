@@ -104,6 +104,10 @@ class Under(Quantity):
     def at_tier(self, tier: Tier) -> Quantity:
         return replace(self, part=self.parts[0].at_tier(tier))
 
+    @property
+    def easy(self) -> Quantity:
+        return replace(self, part=self.parts[0].easy)
+
 
 @dataclass(frozen=True)
 class Robust(Quantity):
@@ -152,6 +156,10 @@ class Robust(Quantity):
 
     def at_tier(self, tier: Tier) -> Quantity:
         return replace(self, part=self.parts[0].at_tier(tier))
+
+    @property
+    def easy(self) -> Quantity:
+        return self.parts[0].easy
 
 
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:

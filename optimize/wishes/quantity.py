@@ -94,6 +94,12 @@ class Quantity:
             raise InputError("tier", f"is {tier!r}; it must be one of {', '.join(TIERS)}")
         return self
 
+    @property
+    def easy(self) -> Quantity:
+        """What is searched first in its place, since it takes less time and its best machines are near: to leading order,
+        without tolerances."""
+        return self
+
     def named(self, name: str) -> Quantity:
         """The same quantity under another name."""
         return replace(self, name=name)
@@ -173,6 +179,10 @@ class Asking(Quantity):
         super().at_tier(tier)
         return replace(self, tier=tier) if tier in self.tiers else self
 
+    @property
+    def easy(self) -> Quantity:
+        return self.at_tier("leading")
+
     def named(self, name: str) -> Quantity:
         return replace(self, name=name, text=name)
 
@@ -211,6 +221,10 @@ class Combined(Quantity):
         super().at_tier(tier)
         return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts))
 
+    @property
+    def easy(self) -> Quantity:
+        return replace(self, parts=tuple(part.easy for part in self.parts))
+
 
 @dataclass(frozen=True)
 class Demand:
@@ -242,10 +256,23 @@ class Demand:
         """The demand as a sentence's part."""
         return f"{self.quantity.words} {self.sense} {self.shown}"
 
-    def excess(self, answers: Answers) -> tuple[Array, Array]:
-        """By how much the demand is not met, in its unit, negative where there is room; and the limit."""
-        value, limit = self.quantity.read(answers), self.limit.read(answers)
-        return (value - limit if self.sense == "at most" else limit - value), limit
+    @property
+    def constant(self) -> float | None:
+        """The limit, where it is a number."""
+        limit = self.limit
+        return limit.constant if isinstance(limit, Combined) and limit.operation == "constant" else None
+
+    def form(self) -> Demand:
+        """The same demand without its words and, where that is a number, its limit: those of one form share programs."""
+        limit = self.limit if self.constant is None else Combined("", "", operation="constant")
+        return replace(self, limit=limit, shown="")
+
+    def excess(self, answers: Answers, constant: Array) -> Array:
+        """By how much the demand is not met, in its unit, negative where there is room; `constant` is its limit where that is a
+        number."""
+        value = self.quantity.read(answers)
+        limit = constant if self.constant is not None else self.limit.read(answers)
+        return value - limit if self.sense == "at most" else limit - value
 
     def __bool__(self) -> bool:
         problem = "is a demand and neither true nor false; give a range as two demands, force > 10 and force < 50"

@@ -232,6 +232,18 @@ def test_design_file_is_read(tmp_path):
     assert [h.quantity.name for h in design.space.held] == ["jam_frequency", "support_frequency_squared"]
     np.testing.assert_allclose(design.space.held[0].value, 570 * np.pi / 30)
     assert design.search == {"starts": 256, "seed": 0}
+    more = (
+        TEMPLATE.replace("# tolerances", "tolerances")
+        .replace("# statistic", "statistic")
+        .replace("# [[demand]] ", "[[demand]]  ")
+    )
+    for name in ('quantity = "amplitude"', "mode = 3", "of = [1, 2]", "at_least", "tier"):
+        more = more.replace(f"# {name}", name)
+    more = more.replace("# [choices]", "[choices]").replace('# "loads.count"', '"loads.count"')
+    (tmp_path / "design.toml").write_text(more)
+    design = load_design(tmp_path / "design.toml")
+    assert [d.words for d in design.subject_to] == ["amplitude of platform 1 against 2, mode 3, exact at least 2 mm"]
+    assert design.space.counts == (2, 3, 4) and design.objective.words.startswith("worst force per amplitude")
     every = TEMPLATE.replace("# iterations", "iterations").replace("# rate", "rate").replace("# polishing", "polishing")
     (tmp_path / "design.toml").write_text(every)
     search = load_design(tmp_path / "design.toml").search
@@ -257,11 +269,17 @@ def test_design_file_is_read(tmp_path):
         (("# rate = 0.05", "rate = 0"), "search.rate is 0; it must be greater than 0"),
         (("# rate = 0.05", 'rate = "fast"'), "search.rate is 'fast'"),
         (("[free]", "[free"), "is no TOML file"),
+        (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\n[objective]'), "demand[0] has no limit"),
+        (("[objective]", '[[demand]]\nquantity = "power"\nmode = 3\nat_most = "3 kg"\n[objective]'), "is not in W"),
+        (("[objective]", "[ties]\nx = 3\n[objective]"), "ties.x is no number of this scene"),
+        (("[objective]", '[choices]\n"loads.drag" = 3\n[objective]'), "give a list of values"),
+        (("# tolerances", "tolerances"), "objective.statistic is 'worts'"),
     ],
 )
 def test_wrong_design_files_are_said_in_one_sentence(tmp_path, change, says):
     (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
-    (tmp_path / "design.toml").write_text(TEMPLATE.replace(*change))
+    text = TEMPLATE.replace(*change).replace('# statistic = "worst"', 'statistic = "worts"')
+    (tmp_path / "design.toml").write_text(text)
     with pytest.raises(jv.InputError) as caught:
         load_design(tmp_path / "design.toml")
     assert says in str(caught.value)

@@ -1,0 +1,107 @@
+"""Trade-offs of two quantities, with the machine behind each point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.errors import ComputationError
+from jaxvib.machine.files import scene_from_toml, scene_to_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.units import count
+from optimize.result import Synthesis
+from optimize.space import DesignSpace
+from optimize.synthesize import synthesize
+from optimize.wishes.quantity import Demand, Quantity
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["Front", "pareto"]
+
+
+class Front(Result):
+    """Machines of which none is better in one quantity without being worse in the other.
+
+    **Attributes** (P machines): `values` (P, 2) of the two quantities; `names`, `units` of these; `machines` the scenes as the
+    texts of scene files; `scene(k)` is one of them.
+    """
+
+    status = Computed.done
+
+    values: np.ndarray = eqx.field(metadata=in_unit("", "machine", "quantity"))
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    machines: tuple[str, ...]
+
+    def scene(self, k: int) -> Scene:
+        """The machine behind a point."""
+        return scene_from_toml(self.machines[k])
+
+    def summary(self) -> str:
+        """A line a machine."""
+        head = " against ".join(f"{n}, {u}".rstrip(", ") for n, u in zip(self.names, self.units, strict=True))
+        return "\n".join([head, *(f"  {a:.5g}  {b:.5g}" for a, b in self.values)])
+
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The front. **Returns** a matplotlib figure, that of the axes `ax` where they are given."""
+        from jaxvib.draw.style import COLORS, panels
+
+        figure, (axis,) = panels(1, size=(5.5, 4.0), ax=ax)
+        axis.plot(self.values[:, 1], self.values[:, 0], "o-", color=COLORS[0])
+        axis.set_xlabel(f"{self.names[1]}, {self.units[1]}".rstrip(", "))
+        axis.set_ylabel(f"{self.names[0]}, {self.units[0]}".rstrip(", "))
+        return figure
+
+
+def pareto(
+    space: DesignSpace,
+    first: Quantity,
+    second: Quantity,
+    *,
+    points: int = 9,
+    subject_to: Sequence[Demand] = (),
+    starts: int = 32,
+    seed: int = 0,
+) -> Front:
+    """The trade-off of two quantities that both shall be small: the least of the first for each of some limits on the second.
+
+    The limits are spread evenly from the second's least value to what it is where the first is least. Each point is a search
+    of its own; all of them share their programs.
+
+    **Arguments**: `points` at most so many machines, the rest as `synthesize`.
+
+    **Returns** `Front`, machines with the least `first` first. **Raises** as `synthesize`.
+    """
+    count(points, "points", low=2)
+
+    def search(objective: Quantity, demands: Sequence[Demand]) -> Synthesis:
+        return synthesize(space, objective, subject_to=demands, starts=starts, seed=seed, verify=False)
+
+    def both(found: Synthesis) -> tuple[float, float]:
+        return float(first(found.scene)), float(second(found.scene))
+
+    given = list(subject_to)
+    ends = [search(first, given), search(second, given)]
+    (_, worst), (_, least) = (both(end) for end in ends)
+    found = [ends[0]]
+    for limit in np.linspace(worst, least, points)[1:]:
+        try:
+            found.append(search(first, [*given, second < float(limit)]))
+        except ComputationError:  # the least value itself may be out of reach by a rounding
+            continue
+    values = np.asarray([both(each) for each in found])
+    kept = [k for k in range(len(values)) if not np.any(np.all(values < values[k] * (1.0 - 1e-9 * np.sign(values[k])), axis=1))]
+    return Front(
+        values=values[kept],
+        names=(first.words, second.words),
+        units=(first.unit, second.unit),
+        machines=tuple(scene_to_toml(found[k].scene) for k in kept),
+    )

@@ -1,0 +1,129 @@
+"""Designs that are often asked for, each in one call: a space, an objective, demands."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.platforms import Platforms
+from jaxvib.machine.scene import Scene
+from jaxvib.units import Number, count
+from optimize.files import Design
+from optimize.quantities import (
+    Quantity,
+    amplitude,
+    fold_margin,
+    force_per_amplitude,
+    jam_frequency,
+    support_frequency_squared,
+    total_mass,
+)
+from optimize.result import Synthesis
+from optimize.space import DesignSpace, hold
+from optimize.synthesize import synthesize
+
+__all__ = ["anti_resonance", "antiphase", "lightest_exciter", "retune", "widest_range"]
+
+
+def _platforms(scene: Scene, least: int) -> Platforms:
+    if not isinstance(scene, Scene) or not isinstance(scene.machine, Platforms):
+        raise InputError("scene", "has no machine of platforms; this recipe is for those")
+    if scene.machine.mass.shape[0] < least:
+        raise InputError("scene", f"has {scene.machine.mass.shape[0]} platforms; this recipe needs {least}")
+    return scene.machine
+
+
+def _springs(machine: Platforms, range_: float, kinds: tuple[str, ...]) -> dict[str, tuple[Number, Number]]:
+    """Every spring there is, free within a factor of what it is."""
+    found: dict[str, tuple[Number, Number]] = {}
+    for kind in kinds:
+        for k, value in enumerate(np.asarray(getattr(machine, kind))):
+            if value > 0.0:
+                found[f"machine.{kind}[{k}]"] = (float(value / range_), float(value * range_))
+    if not found:
+        raise InputError("scene", "has no springs that could be changed")
+    return found
+
+
+def antiphase(scene: Scene, *, mode: int = 3, range_: float = 5.0) -> Design:
+    """The antiphase machine of two masses: least foundation force per relative amplitude, the jam's frequency and the stiffness
+    budget of the supports kept, all springs free within a factor `range_`.
+
+    **Returns** `Design`; `design.run()` searches. **Raises** `InputError` for a machine of fewer platforms.
+
+    >>> import jaxvib as jv
+    >>> from optimize.recipes import antiphase
+    >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+    ...                       link_stiffness=2e5, link_damping=60.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed("1500 rpm"))
+    >>> antiphase(scene).space.size
+    3
+
+    Source: the antiphase paper, section 5.1.
+    """
+    machine = _platforms(scene, 2)
+    free = _springs(machine, range_, ("stiffness", "link_stiffness"))
+    space = DesignSpace(scene, free, [hold(jam_frequency(mode=mode)), hold(support_frequency_squared())])
+    return Design(space, force_per_amplitude(mode=mode))
+
+
+def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
+    """The anti-resonance machine of three masses: least amplitude of the middle platform (2) per amplitude of the outer ones (1
+    against 3), the links' springs free, the jam's frequency kept. Without damping the middle one rests at k12/M1 = k23/M3 =
+    w^2.
+
+    **Returns** `Design`. **Raises** `InputError` for a machine of fewer platforms.
+
+    Source: Filimonikhin et al., cited in the antiphase paper as [21].
+    """
+    machine = _platforms(scene, 3)
+    free = _springs(machine, range_, ("link_stiffness",))
+    space = DesignSpace(scene, free, [hold(jam_frequency(mode=mode))])
+    ratio = amplitude(mode=mode, of=2) / amplitude(mode=mode, of=(1, 3))
+    return Design(space, ratio.named("middle amplitude per outer amplitude"))
+
+
+def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
+    """Which one spring of an existing machine to exchange: for every spring the best machine that differs in it alone.
+
+    **Arguments**: `objective` what shall be small; `range_` the factor by which a spring may differ; `starts` of each search.
+
+    **Returns** the springs' names with what was found, the best first. **Raises** as `synthesize`.
+    """
+    machine = _platforms(scene, 1)
+    free = _springs(machine, range_, ("stiffness", "link_stiffness"))
+    found = []
+    for name, bounds in free.items():
+        best = synthesize(DesignSpace(scene, {name: bounds}), objective, starts=starts, verify=False)
+        found.append((name, best))
+    return sorted(found, key=lambda each: float(each[1].values.min()))
+
+
+def lightest_exciter(scene: Scene, least: Number, *, mode: int, of: int | tuple[int, int] | None = None) -> Design:
+    """The lightest loads that shake a platform by the amplitude `least` (m or text): their mass is free, from a tenth to ten
+    times what it is; the track's radius stays.
+
+    **Returns** `Design`.
+    """
+    machine = _platforms(scene, 1)
+    del machine
+    mass = np.asarray(scene.loads.mass)
+    if mass.ndim:
+        raise InputError("loads.mass", "differs from load to load; this recipe is for loads that share every number")
+    space = DesignSpace(scene, {"loads.mass": (float(mass) / 10.0, float(mass) * 10.0)})
+    return Design(space, total_mass(), subject_to=(amplitude(mode=mode, of=of) > least,))
+
+
+def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[int, int] | None = None) -> Design:
+    """The springs with which a jam mode lasts over the widest range of rotor speeds about the present one: the greatest
+    distance to the fold, at a share `keep` of the present amplitude at least.
+
+    **Returns** `Design`. **Raises** `InputError` for a share that is not between 0 and 1.
+    """
+    count(mode, "mode")
+    if not 0.0 < keep <= 1.0:
+        raise InputError("keep", f"is {keep!r}; it must be greater than 0 and at most 1")
+    machine = _platforms(scene, 1)
+    space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
+    whose = amplitude(mode=mode, of=of)
+    return Design(space, -fold_margin(mode=mode), subject_to=(whose > keep * float(whose(scene)),))

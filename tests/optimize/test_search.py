@@ -1,0 +1,201 @@
+"""Searches under demands, on quantities whose answers are known by hand, and on machines."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published, scene
+
+import jaxvib as jv
+from optimize import (
+    DesignSpace,
+    Quantity,
+    Synthesis,
+    amplitude,
+    expected,
+    force_per_amplitude,
+    hold,
+    jam_frequency,
+    product,
+    support_frequency_squared,
+    synthesize,
+    total,
+    worst,
+)
+from optimize.search.quadratic import elastic
+
+SCENE = scene("two_mass", speed=120.0)
+"""Stiffness (5e4, 3e4) N/m of the supports, 2e5 N/m of the link."""
+
+FREE = {"machine.stiffness": (1e4, 9e4, "even")}
+NEAREST = Quantity("distance", "N^2/m^2", lambda s: jnp.sum((s.machine.stiffness - jnp.array([6e4, 5e4])) ** 2))
+FIRST = Quantity("first", "N/m", lambda s: s.machine.stiffness[0])
+SUM = total("machine.stiffness")
+
+
+def found(space, objective, **more):
+    return synthesize(space, objective, **{"starts": 4, "iterations": 25, "polishing": 12, "verify": False, **more})
+
+
+def test_quadratic_programs_meet_their_conditions():
+    random = np.random.default_rng(0)
+    s, d, me, mi = 40, 4, 1, 3
+    root = random.normal(size=(s, d, d))
+    bend = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(d)
+    slope = 3.0 * random.normal(size=(s, d))
+    held, demands = (random.normal(size=(s, m, d)) for m in (me, mi))
+    off, excess = 0.1 * random.normal(size=(s, me)), random.normal(size=(s, mi)) - 0.5
+    low, high = -np.ones((s, d)), np.ones((s, d))
+    price = np.full(s, 1e4)
+    one = elastic(bend, slope, (held, off), (demands, excess), (low, high), price)
+    p = one.p
+    gradient = np.einsum("sij,sj->si", bend, p) + slope + one.bounds
+    gradient += np.einsum("sm,smd->sd", one.held, held) + np.einsum("sm,smd->sd", one.demands, demands)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-7 * price[0])
+    left = np.einsum("smd,sd->sm", demands, p) + excess
+    possible = np.max(np.abs(one.held), axis=1) < 5e3
+    assert possible.sum() > 30
+    np.testing.assert_allclose(np.einsum("smd,sd->sm", held, p)[possible], -off[possible], atol=1e-7)
+    kept = possible & (np.max(one.demands, axis=1) < 5e3)
+    assert kept.sum() > 20 and np.all(left[kept] < 1e-7)
+    np.testing.assert_allclose((one.demands * left)[kept], 0.0, atol=1e-6)
+    assert np.all(one.demands >= 0.0) and np.all(p >= low) and np.all(p <= high)
+
+
+def test_multipliers_are_those_computed_by_hand():
+    """min (k1 - 6)^2 + (k2 - 5)^2 where k1 + k2 <= 9, k1 <= 4.5 (1e4 N/m): both k 4.5, multipliers 1 and 2."""
+    best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "90 N/mm", FIRST < 4.5e4])
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [4.5e4, 4.5e4], rtol=1e-7)
+    assert best.status_name == "done" and best.converged == best.same == 4 and best.kkt < 1e-8
+    budget, first = best.limits
+    # d objective / d limit = - multiplier; the whole limit is 9, or 4.5.
+    np.testing.assert_allclose([budget.multiplier, first.multiplier], [-1e8 * 9.0, -2e8 * 4.5], rtol=1e-6)
+    assert budget.active and first.active and budget.gain < 0.0
+    lines = "\n".join(best.said())
+    assert "at its limit: sum of all support stiffnesses at most 90 N/mm (90 N/mm)" in lines
+    assert [row.what for row in best.table[:2]] == ["stiffness of support 1", "stiffness of support 2"]
+    assert best.rows()[0] == ["stiffness of support 1, N/mm", "50", "45", "", ""]
+
+
+def test_a_demand_that_does_not_hinder_has_no_multiplier():
+    best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "150 N/mm"])
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [6e4, 5e4], rtol=1e-6)
+    assert not best.limits[0].active and best.limits[0].multiplier == 0.0
+
+
+def test_contradictory_demands_are_named_with_what_is_missing():
+    space, demands = DesignSpace(SCENE, FREE), [SUM > "120 N/mm", FIRST < 2e4]
+    best = found(space, NEAREST, subject_to=demands, throw=False)  # 2e4 + 9e4 at most
+    assert best.status_name == "contradictory" and best.same == 0
+    broken = [limit for limit in best.limits if limit.broken > 0.0]
+    total_off = sum(limit.broken * abs(limit.limit) for limit in broken)
+    np.testing.assert_allclose(total_off, 1e4, rtol=1e-4)
+    assert "not met" in "\n".join(best.said())
+    with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
+        found(space, NEAREST, subject_to=demands)
+
+
+def test_bounds_that_hinder_are_told():
+    best = found(DesignSpace(SCENE, {"machine.stiffness": (1e4, 5.5e4)}), NEAREST)
+    (limit,) = best.limits  # k1 at 5.5; the objective falls by 2 (6 - 5.5) for each 1e4 N/m
+    assert limit.what == "stiffness of support 1 at most 55 N/mm"
+    np.testing.assert_allclose(limit.multiplier, -1e8 * 5.5, rtol=1e-5)
+
+
+def test_what_is_held_is_held_exactly():
+    least = Quantity("sum of squares", "", lambda s: jnp.sum((s.machine.stiffness / 1e4) ** 2))
+    best = found(DesignSpace(SCENE, FREE, [hold(product("machine.stiffness"))]), least)
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], np.full(2, np.sqrt(15e8)), rtol=1e-6)
+    best = found(DesignSpace(SCENE, FREE, [hold(SUM, "70 N/mm")]), least)
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [3.5e4, 3.5e4], rtol=1e-9)
+    np.testing.assert_allclose(np.sum(best.after.parameters["machine.stiffness"]), 7e4, rtol=1e-12)
+
+
+def test_ties_make_numbers_follow_others():
+    ties = {
+        "machine.stiffness[1]": ("machine.stiffness[0]", 0.5),
+        "machine.link_stiffness": ("machine.stiffness[0]", "keep"),
+        "machine.damping[1]": "machine.damping[0]",
+    }
+    space = DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4)}, ties=ties)
+    best = found(space, NEAREST)
+    k = best.scene.machine.stiffness
+    np.testing.assert_allclose(k, [(6e4 + 0.5 * 5e4) / 1.25, 0.5 * (6e4 + 0.5 * 5e4) / 1.25], rtol=1e-7)
+    np.testing.assert_allclose(best.scene.machine.link_stiffness, 4.0 * k[0], rtol=1e-12)
+    np.testing.assert_array_equal(best.scene.machine.damping, [40.0, 40.0])
+
+
+def test_catalogues_give_the_best_of_all_choices():
+    springs = [1e4, 1.5e4, 2.2e4, 3.3e4, 4.7e4, 6.8e4]
+    twisted = Quantity("twisted", "", lambda s: _twisted(s.machine.stiffness / 1e4, s.machine.link_stiffness[0] / 1e5))
+
+    def _twisted(k, link):
+        return (k[0] * k[1] - 6.0) ** 2 + (k[0] - 2.0 * k[1]) ** 2 + (link - k[0] / 3.0) ** 2
+
+    space = DesignSpace(SCENE, {"machine.link_stiffness": (5e4, 3e5)}, choices={"machine.stiffness": springs})
+    best = found(space, twisted, subject_to=[SUM < 8e4])
+    tried = {}
+    for pair in itertools.product(springs, springs):
+        if sum(pair) <= 8e4:
+            k = np.asarray(pair) / 1e4
+            tried[pair] = float(_twisted(k, np.clip(k[0] / 3.0, 0.5, 3.0)))
+    least = min(tried, key=lambda pair: tried[pair])
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], least, rtol=1e-12)
+    np.testing.assert_allclose(best.values.min(), tried[least], rtol=1e-9)
+    several = DesignSpace(SCENE, FREE, choices={"loads.count": [2, 3, 5]})
+    mass = Quantity("mass", "kg", lambda s: NEAREST(s) / 1e8 + (s.loads.mass * s.loads.count - 3.8) ** 2)
+    assert found(several, mass).scene.loads.count == 5
+
+
+def test_an_interrupt_keeps_the_best_and_a_search_goes_on_from_it(tmp_path):
+    space = DesignSpace(SCENE, FREE)
+
+    def stop(what, share):
+        if what.startswith("polishing"):
+            raise KeyboardInterrupt
+
+    first = found(space, NEAREST, progress=stop)
+    assert first.status_name == "interrupted" and np.isfinite(first.values.min())
+    again = found(space, NEAREST, begin=Synthesis.load(first.save(tmp_path / "search")))
+    assert again.status_name == "done" and again.starts == 4 and again.values.min() < 1e-3
+    with pytest.raises(jv.InputError, match="this space has 1"):
+        found(DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4)}), NEAREST, begin=first)
+
+
+def antiphase(damping):
+    form = published(damping=damping, natural=(0.2, 0.4))
+    held = [hold(jam_frequency(mode=3), 1.0), hold(support_frequency_squared(), 2 / 9)]
+    return DesignSpace(form.scene(), {"machine.stiffness": (0.01, 0.3), "machine.link_stiffness": (0.1, 1.0)}, held)
+
+
+def test_a_demand_on_a_machine_costs_what_its_multiplier_says():
+    """The multiplier of a demand, against searches with the limit moved to either side."""
+    space = antiphase(1e-2)
+    stiff = Quantity("k1", "N/m", lambda s: s.machine.stiffness[0])
+    limit = 0.102  # 0.1053 is where the search would end
+    at = [found(space, force_per_amplitude(mode=3), starts=8, subject_to=[stiff < limit * f]) for f in (0.999, 1.0, 1.001)]
+    told = at[1].limits[-1]
+    assert told.active and at[1].kkt < 1e-6
+    measured = (at[2].values.min() - at[0].values.min()) / 0.002
+    np.testing.assert_allclose(told.multiplier, measured, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_exact_designs_begin_at_those_to_leading_order():
+    exact = force_per_amplitude(mode=3, tier="exact")
+    best = found(antiphase(1e-2), exact, starts=8, subject_to=[amplitude(mode=3, tier="exact") > 0.01])
+    before = force_per_amplitude(mode=3, tier="exact")(found(antiphase(1e-2), force_per_amplitude(mode=3), starts=8).scene)
+    assert best.status_name == "done" and best.values.min() < float(before) * (1.0 + 1e-9)
+
+
+@pytest.mark.slow
+def test_a_robust_design_is_better_on_machines_it_has_not_seen():
+    off = {"machine.stiffness": 0.05}
+    force = force_per_amplitude(mode=3)
+    space = antiphase(1e-2)
+    nominal = found(space, force, starts=8)
+    robust = found(space, expected(force, off, samples=32), starts=8)
+    unseen = expected(force, off, samples=4000, seed=1)
+    assert float(unseen(robust.scene)) <= float(unseen(nominal.scene)) * (1.0 + 1e-6)
+    assert worst(force, off).words.startswith("worst")
