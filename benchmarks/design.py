@@ -74,10 +74,7 @@ def speed() -> None:
     middle = time.process_time()
     synthesize(space, FORCE, starts=1000, iterations=500, polishing=0, verify=False)
     busy = time.process_time() - middle
-    print(
-        f"1000 starts x 500 steps, antiphase, leading order: first {first:.1f} s, again {again:.2f} s ({busy:.1f} s of
-        processor)"
-    )
+    print(f"1000 starts x 500 steps, leading order: first {first:.1f} s, again {again:.2f} s ({busy:.1f} s of processor)")
 
 
 def rule() -> None:
@@ -95,10 +92,8 @@ def published() -> None:
         theirs = _published(n)
         best = synthesize(space_of(1e-2, n), FORCE, starts=64, verify=False)
         row = [float(q(s)) for q in (FORCE, exact) for s in (theirs, best.scene)]
-        print(
-            f"  {n}: {row[0]:.4e} -> {row[1]:.4e} ({row[0] / row[1]:.2f} x); exact {row[2]:.4e} -> {row[3]:.4e};
-            {ratio(best):.4f}"
-        )
+        gain, leading, exactly = row[0] / row[1], f"{row[0]:.4e} -> {row[1]:.4e}", f"{row[2]:.4e} -> {row[3]:.4e}"
+        print(f"  {n}: {leading} ({gain:.2f} x); exact {exactly}; {ratio(best):.4f}")
     more = {**FREE, "machine.mass": (0.3, 3.0), "machine.damping": (2e-3, 0.1), "drive.speed": (1.5, 5.0)}
     best = synthesize(space_of(1e-2, 3.0, more), FORCE, starts=64, iterations=300, polishing=30, verify=False)
     print("  mass ratio, damping, speed free too:")
