@@ -151,7 +151,7 @@ def exact() -> None:
 
 def robust() -> None:
     off = {"machine.stiffness": 0.05, "machine.damping": 0.3}
-    free = {"machine.stiffness": (5e3, 1e5), "machine.link_stiffness": (5e4, 5e5)}
+    free = {"machine.stiffness": (5e3, 1e5), "machine.link_stiffness": (5e4, 5e5), "machine.mass": (80.0, 200.0)}
     space = DesignSpace(_practical(), free, [hold(jam_frequency(mode=3)), hold(support_frequency_squared())])
     nominal = synthesize(space, FORCE, starts=32, verify=False)
     wish = expected(FORCE, off, samples=256)
