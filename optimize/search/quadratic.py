@@ -8,7 +8,7 @@ import numpy as np
 
 __all__ = ["Solved", "elastic"]
 
-_STEPS = 40
+_STEPS = 60
 
 
 class Solved(NamedTuple):
@@ -33,7 +33,8 @@ def elastic(
 
         min p.B p/2 + g.p + price (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
 
-    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities.
+    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers are known to about
+    a millionth of the price at worst.
 
     **Arguments** (s problems): `bend` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
     `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `price` (s,).
@@ -76,20 +77,31 @@ def elastic(
     )
     right = np.concatenate([-a, a, -c, np.zeros((s, me + mi)), high, -low], axis=1)
     m = rows.shape[1]
+    # Begin in the middle of the box, where all products of slacks and duals are alike and the prices are about paid.
     x = np.zeros((s, n))
-    x[:, d:] = 1.0 + np.concatenate([np.abs(a), np.maximum(c, 0.0)], axis=1)
-    x[:, :d] = np.clip(0.0, low, high)
-    slack = np.maximum(right - np.einsum("smn,sn->sm", rows, x), 1e-2)
-    dual = np.ones((s, m))
+    x[:, :d] = (low + high) / 2.0
+    broken = np.concatenate(
+        [np.einsum("smd,sd->sm", a_rows, x[:, :d]) + a, np.einsum("smd,sd->sm", c_rows, x[:, :d]) + c], axis=1
+    )
+    wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
+    x[:, d:] = wide[:, None]
+    slack = np.maximum(right - np.einsum("smn,sn->sm", rows, x), 1e-12)
+    dual = (price * wide / 3.0)[:, None] / slack
     turned = np.swapaxes(rows, 1, 2)
     scale = 1.0 + np.abs(linear).max(axis=1)
     ridge = 1e-13 * np.eye(n)
 
+    best, least = (x, dual), np.full(s, np.inf)
     for _ in range(_STEPS):
         stationary = np.einsum("sij,sj->si", quadratic, x) + linear + np.einsum("snm,sm->sn", turned, dual)
         primal = np.einsum("smn,sn->sm", rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
-        done = (gap < 1e-11 * scale) & (np.abs(stationary).max(axis=1) < 1e-9 * scale) & (np.abs(primal).max(axis=1) < 1e-11)
+        # Rounding may spoil a point that was good already: the best one counts.
+        off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
+        better = off < least
+        least = np.where(better, off, least)
+        best = tuple(np.where(better[:, None], new, old) for new, old in zip((x, dual), best, strict=True))
+        done = least < 1e-11
         if np.all(done):
             break
         weight = dual / slack
@@ -125,5 +137,6 @@ def elastic(
         x = x + by[:, None] * dx
         slack = np.maximum(slack + by[:, None] * ds, 1e-300)
         dual = np.maximum(dual + by[:, None] * dl, 1e-300)
+    x, dual = best
     parts = np.split(dual, np.cumsum([me, me, mi, me + mi, d]), axis=1)
     return Solved(np.clip(x[:, :d], low, high), parts[0] - parts[1], parts[2], parts[4] - parts[5])
