@@ -33,8 +33,8 @@ def elastic(
 
         min p.B p/2 + g.p + price (sum |A p + a| + sum max(0, C p + c)),     low <= p <= high
 
-    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers are known to about
-    a millionth of the price at worst.
+    Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992) on the slacks of all inequalities. Multipliers are known to
+    about a millionth of the price at worst.
 
     **Arguments** (s problems): `bend` B (s, d, d), not indefinite; `slope` g (s, d); `held` A (s, me, d) and a (s, me);
     `demands` C (s, mi, d) and c (s, mi); `box` low and high (s, d); `price` (s,).
