@@ -42,9 +42,34 @@ PATIENCE = 60.0
 """Seconds that no answer may take."""
 
 WORDS = (
-    "nan inf -inf 1e400 -1 0 1e-320 true false \"\" [] {} [[]] \"1 m\" \"-3 rpm\" \"1e9 kg/s\" 99999999999999999999 'x' null 0x10 1_0 "
-    "1979-05-27 [1, 2, 3] {a=1} \\u0000 é \"\"\" [machine] [loads] [effects] kind = count ="
-).split(" ")
+    "nan",
+    "inf",
+    "1e400",
+    "-1",
+    "0",
+    "1e-320",
+    "true",
+    '""',
+    "[]",
+    "{}",
+    "[[]]",
+    '"1 m"',
+    '"-3 rpm"',
+    '"1 (m"',
+    "99999999999999999999",
+    "'x'",
+    "0x10",
+    "1_0",
+    "1979-05-27",
+    "[1, 2]",
+    "{a=1}",
+    "\\u0000",
+    "é",
+    '"""',
+    "[machine]",
+    "kind =",
+    "=",
+)
 
 
 def mutated(text: str, rng: np.random.Generator) -> str:
@@ -192,7 +217,11 @@ def ask_gradient(scene: jv.Scene, rng: np.random.Generator) -> str:
     found = np.concatenate([slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness])
     jam = modes.select(k)
     right = light_force_slope(scene, float(jam.omega), 1e-6)
-    return "right" if relative(found, right) < 1e-4 else f"wrong: gradient {found}, differences {right}, slope {float(jam.slope):.1e}"
+    return (
+        "right"
+        if relative(found, right) < 1e-4
+        else f"wrong: gradient {found}, differences {right}, slope {float(jam.slope):.1e}"
+    )
 
 
 QUESTIONS: dict[str, Callable[[jv.Scene, np.random.Generator], str]] = {

@@ -206,6 +206,7 @@ def steps_chart(
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    return figure
 
 
 class StressMark(NamedTuple):
@@ -258,5 +259,5 @@ def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Figu
     handles = [Line2D([], [], ls="", color="black", **look) for look in looks]
     handles += [Patch(color=COLORS[k % len(COLORS)]) for k in range(len(dtypes))]
     names = ["true", "claimed", "bound", "named status", "FAILED", *dtypes]
-    axes.legend(handles, names, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(names), fontsize=8)
+    axes.legend(handles, names, loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=4, fontsize=8)
     return figure

@@ -149,7 +149,7 @@ def _slopes_again(scene: Scene) -> Reference:
         now = dataclasses.replace(p, stiffness=p.stiffness + change)
         return orbit_rotor_speed(now, omega * (1.0 + step if k == 2 else 1.0), start, speed)[0]
 
-    h = 1e-4
+    h = 2e-5
     slope = [(rotor_speed(k, h) - rotor_speed(k, -h)) / (2.0 * h) for k in range(3)]
     return Reference([-omega * slope[0] / slope[2], -omega * slope[1] / slope[2]], unknown=1e-6)
 

@@ -149,6 +149,19 @@ def _excess(p: Plain, omega: float, speed: float) -> float:
         return np.inf
 
 
+def _excesses(p: Plain, omega: np.ndarray, speed: float) -> np.ndarray:
+    """The same at many load speeds, in one call of LAPACK where no matrix is singular."""
+    w = omega[:, None, None]
+    column = np.zeros((p.mass.shape[0], 1))
+    column[p.at] = 1.0
+    try:
+        answer = np.linalg.solve(p.stiffness - w**2 * p.whole_mass + 1j * w * p.damping, column)[:, p.at, 0]
+    except np.linalg.LinAlgError:
+        return np.array([_excess(p, each, speed) for each in omega])
+    torque = -(omega**4) * np.sum(p.m * p.radius) ** 2 * answer.imag / 2.0
+    return omega + torque / np.sum(p.drag * p.radius**2) - speed
+
+
 def light_modes(p: Plain, speed: float) -> np.ndarray:
     """All load speeds at which light loads jam at the rotor speed, ascending, rad/s: roots between points that crowd at the
     resonances down to their rounding, and folds."""
@@ -159,7 +172,7 @@ def light_modes(p: Plain, speed: float) -> np.ndarray:
         [np.linspace(1e-3, 1.001, 4000) * speed, *(w * (1.0 + s * away) for w in resonances for s in (-1, 1))]
     )
     points = np.unique(points[(points > 0.0) & (points <= 1.001 * speed)])
-    excess = np.array([_excess(p, w, speed) for w in points])
+    excess = _excesses(p, points, speed)
     points, excess = points[np.isfinite(excess)], excess[np.isfinite(excess)]
 
     def signed(w: float, sign: float) -> float:
