@@ -59,6 +59,7 @@ from jaxvib.motion.analysis.regime import Regime, RegimeName, regime
 from jaxvib.motion.ensemble import Ensemble, ensemble
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, EnvelopeStatus
+from jaxvib.motion.growth import Growth, GrowthStatus, growth
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -74,6 +75,10 @@ from jaxvib.study.accuracy.work_precision import work_precision
 
 # What effects are worth
 from jaxvib.study.audit.audit import Audit, AuditStatus, audit
+
+# Hard cases
+from jaxvib.study.stress.result import Stress, StressStatus
+from jaxvib.study.stress.run import stress
 
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
@@ -191,6 +196,9 @@ __all__ = [
     "Ensemble",
     "Regime",
     "RegimeName",
+    "growth",
+    "Growth",
+    "GrowthStatus",
     # What accuracy costs
     "work_precision",
     "compare_tiers",
@@ -204,6 +212,10 @@ __all__ = [
     "audit",
     "Audit",
     "AuditStatus",
+    # Hard cases
+    "stress",
+    "Stress",
+    "StressStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import tokenize
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
@@ -64,6 +65,10 @@ FIELD_UNITS = {
 """The unit of each number of a scene that a design may free or hold."""
 
 
+_UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
+"""What pint, which reads a unit as Python, raises beside its own errors for a text that is none."""
+
+
 def _unit_name(unit: str) -> str:
     return unit or "no unit"
 
@@ -111,7 +116,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         try:
             given: Any = value if parts is None else pint.get_application_registry().Quantity(float(parts[1]), parts[2])
             magnitude = given.m_as(unit or "dimensionless")
-        except (pint.PintError, AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError) as error:
+        except (pint.PintError, *_UNREADABLE) as error:
             raise wrong from error
         hertz = sum(power for name, power in given.unit_items() if name.endswith("hertz"))
         return magnitude * (2.0 * math.pi) ** hertz if "rad" in unit else magnitude

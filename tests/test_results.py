@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 import pathlib
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
+from jaxvib.motion.growth import Growth, GrowthStatus
 from jaxvib.motion.run import RunStatus
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed, failure, member, sentence, status_name, status_names
@@ -33,6 +35,8 @@ from jaxvib.study.capture.capture import _judged
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
+from jaxvib.study.stress.case import StressRow
+from jaxvib.study.stress.result import stress_of
 from optimize.pareto import Front
 from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
 
@@ -153,6 +157,8 @@ RESULTS = {
         starts=np.asarray(4),
         turns=np.asarray(2000),
     ),
+    "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
+    "Stress": lambda: stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)]),
     "Tiers": tiers,
     "HarmonicConvergence": lambda: HarmonicConvergence(
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])

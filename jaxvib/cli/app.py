@@ -109,6 +109,7 @@ _HOMES = {
     "capture": "capture",
     "cost": "cost",
     "identify": "identify",
+    "stress": "stress",
     "whirl": "whirl",
     "criterion": "criterion",
     "modes": "modes",
@@ -159,8 +160,8 @@ def run(arguments: list[str]) -> int:
     """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
     wants_json = "--json" in arguments
     try:
-        app.main(args=arguments, prog_name="jaxvib", standalone_mode=False)
-        return 0
+        # a command that computed all it was asked, and found a failure, exits by itself with its code
+        return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False) or 0
     except InputError as error:
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": str(error)})
     except ComputationError as error:

@@ -10,7 +10,15 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["modes_chart", "multiplier_chart", "phase_circles", "points_chart", "signals_chart", "speeds_chart"]
+__all__ = [
+    "growth_chart",
+    "modes_chart",
+    "multiplier_chart",
+    "phase_circles",
+    "points_chart",
+    "signals_chart",
+    "speeds_chart",
+]
 
 
 def modes_chart(
@@ -147,4 +155,18 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Figu
     axis.set_aspect("equal")
     axis.set_xlabel("real part")
     axis.set_ylabel("imaginary part")
+    return figure
+
+
+def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Figure:
+    """Rates of growth (n,) 1/s of stretches that end at `time` (n,) s; the exponent with its standard error."""
+    figure, (axes,) = panels(1, ax=ax)
+    axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each stretch")
+    half = time[time.size // 2 :]
+    axes.fill_between(half[[0, -1]], exponent - uncertainty, exponent + uncertainty, color=COLORS[1], alpha=0.3, lw=0.0)
+    axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], label="exponent")
+    axes.axhline(0.0, color="black", lw=0.8)
+    axes.set_xlabel("time, s")
+    axes.set_ylabel("growth of disturbances, 1/s")
+    axes.legend()
     return figure

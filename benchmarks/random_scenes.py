@@ -1,0 +1,293 @@
+"""Random scenes and mutated files: is every answer right, a named status, or one sentence about the input?
+
+    python benchmarks/random_scenes.py --scenes 500 --files 5000 --out out
+
+Scenes are drawn from a few kinds, so that few programs are compiled, with numbers over many decades. Of each are asked
+
+- `jam_modes`: torques balance by the dense complex algebra of `jaxvib.study.stress.plain`, to 1e-8
+- `jam_orbit` of the first mode there is: its state is carried over one turn by SciPy and comes back, to 1e-6
+- `simulate`: the state at the end agrees with SciPy's, to the claimed error and 1e-6
+- the gradient of the foundation force by the stiffnesses agrees with differences, to 1e-4
+
+A mutated file is a template or a record whose characters, numbers, lines or words are changed; reading it ends in a scene or
+in an `InputError`. Everything else, warnings and more than 60 s included, is a failure, printed with the seed that repeats it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import pathlib
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+import jaxvib as jv
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.results.status import status_name
+from jaxvib.study.stress.asked import away, end_of_run, light_force_slope, state_of
+from jaxvib.study.stress.asked import compared_state as compared
+from jaxvib.study.stress.motions import run_out
+from jaxvib.study.stress.plain import light_modes, light_speed, plain
+
+jv.prepare_cpu()
+
+PATIENCE = 60.0
+"""Seconds that no answer may take."""
+
+WORDS = (
+    "nan",
+    "inf",
+    "1e400",
+    "-1",
+    "0",
+    "1e-320",
+    "true",
+    '""',
+    "[]",
+    "{}",
+    "[[]]",
+    '"1 m"',
+    '"-3 rpm"',
+    '"1 (m"',
+    "99999999999999999999",
+    "'x'",
+    "0x10",
+    "1_0",
+    "1979-05-27",
+    "[1, 2]",
+    "{a=1}",
+    "\\u0000",
+    "é",
+    '"""',
+    "[machine]",
+    "kind =",
+    "=",
+)
+
+
+def mutated(text: str, rng: np.random.Generator) -> str:
+    """A text with one to four changes of characters, numbers, lines or words."""
+    for _ in range(rng.integers(1, 5)):
+        lines = text.split("\n")
+        k = int(rng.integers(len(lines)))
+        words = lines[k].split(" ")
+        where = int(rng.integers(len(words)))
+        kind = int(rng.integers(7))
+        if kind == 0 and text:
+            at = int(rng.integers(len(text)))
+            text = text[:at] + chr(int(rng.integers(0, 256))) + text[at + 1 :]
+            continue
+        if kind == 1 and text:
+            at = int(rng.integers(len(text)))
+            text = text[:at] + text[at + int(rng.integers(1, 6)) :]
+            continue
+        if kind == 2:
+            lines[k] = ""
+        elif kind == 3:
+            lines.insert(int(rng.integers(len(lines))), lines[k])
+        elif kind == 4:
+            words[where] = str(rng.choice(WORDS))
+            lines[k] = " ".join(words)
+        elif kind == 5:
+            words[where] = f"{10.0 ** rng.uniform(-30, 30):.3g}"
+            lines[k] = " ".join(words)
+        else:
+            words[where] = words[where] + str(rng.choice(WORDS))
+            lines[k] = " ".join(words)
+        text = "\n".join(lines)
+    return text
+
+
+def record(rng: np.random.Generator) -> str:
+    """A recorded swing as a CSV file."""
+    times = np.arange(0.0, 6.0, 0.05)
+    angle = 20.0 * np.exp(-0.05 * times) * np.cos(6.0 * times) + 0.01 * rng.normal(size=times.size)
+    return "time, angle\n" + "\n".join(f"{t:.3f}, {a:.4f}" for t, a in zip(times, angle, strict=True))
+
+
+def read_file(seed: int, folder: pathlib.Path, texts: dict[str, str]) -> str:
+    """How reading one mutated file ends."""
+    rng = np.random.default_rng([seed, 2])
+    names = [*texts, "record"]
+    name = names[int(rng.integers(len(names)))]
+    if name == "record":
+        path = folder / "record.csv"
+        path.write_text(mutated(record(rng), rng), encoding="utf-8", errors="surrogatepass")
+        jv.read_record(path)
+    else:
+        path = folder / "scene.toml"
+        path.write_text(mutated(texts[name], rng), encoding="utf-8", errors="surrogatepass")
+        jv.load_scene(path)
+    return "read"
+
+
+def drawn(rng: np.random.Generator) -> jv.Scene:
+    """A random machine of one or two platforms with one to three equal loads."""
+
+    def number(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    size, count = number(1e-3, 1e4), int(rng.integers(1, 4))
+    natural, ratio = number(3.0, 300.0), number(1e-4, 0.3)
+    if rng.uniform() < 0.5:
+        machine = jv.one_mass(mass=size, stiffness=size * natural**2, damping=2.0 * ratio * size * natural)
+    else:
+        masses = (size, size * number(0.2, 5.0))
+        machine = jv.two_mass(
+            mass=masses,
+            stiffness=[m * (natural * number(0.3, 3.0)) ** 2 for m in masses],
+            damping=[2.0 * ratio * m * natural for m in masses],
+            link_stiffness=size * (natural * number(0.3, 3.0)) ** 2,
+            link_damping=2.0 * ratio * size * natural,
+        )
+    mass, speed = size * number(1e-6, 0.1) / count, natural * number(0.5, 5.0)
+    loads = jv.balls(count=count, mass=mass, radius=number(1e-3, 1.0), drag=mass * natural * number(1e-4, 10.0))
+    return jv.Scene(machine, loads, jv.ConstantSpeed(speed))
+
+
+def relative(found: np.ndarray, right: np.ndarray) -> float:
+    return float(np.max(np.abs(np.asarray(found) - right)) / np.max(np.abs(right)))
+
+
+def ask_modes(scene: jv.Scene, rng: np.random.Generator) -> str:
+    modes, p, speed = jv.jam_modes(scene), plain(scene), float(scene.drive.speed)
+    for k in modes.mode_numbers():
+        jam = modes.select(k)
+        n, moved, force = light_speed(p, float(jam.omega))
+        if status_name(jam.status) != "found":
+            continue
+        # a steep branch makes of the last digit of Omega more in n
+        if abs(n - speed) > 1e-8 * speed * (1.0 + abs(float(jam.slope)) * float(jam.omega) / speed * 1e-6):
+            return f"wrong: torques of mode {k} do not balance by {n / speed - 1.0:.1e}"
+        if relative(jam.amplitude, np.abs(moved)) > 1e-7 or abs(float(jam.foundation_force) / force - 1.0) > 1e-6:
+            return f"wrong: amplitude of mode {k}"
+    missing = light_modes(p, speed)
+    found = np.asarray(modes.omega)[np.asarray(modes.exists)]
+    lost = [w for w in missing if not np.any(np.abs(found / w - 1.0) < 1e-6)]
+    return f"wrong: modes at {lost} are missing, found {found}" if lost else "right"
+
+
+def ask_orbit(scene: jv.Scene, rng: np.random.Generator) -> str:
+    modes = jv.jam_modes(scene).mode_numbers()
+    if not modes:
+        return "named: no mode"
+    orbit = jv.jam_orbit(scene, mode=modes[0], throw=False)
+    if status_name(orbit.status) != "found":
+        return f"named: {status_name(orbit.status)}"
+    q, v, (phi,), (rate,) = orbit.at(0.0)
+    y = np.concatenate([np.asarray(x, float) for x in (q, v, phi, rate)])
+    out = run_out(plain(scene), y, 2.0 * np.pi / float(orbit.omega))
+    nd, n = len(orbit.units), scene.loads.count
+    end = out.state.copy()
+    end[2 * nd : 2 * nd + n] -= 2.0 * np.pi
+    scale = np.array([out.displacement] * nd + [out.velocity] * nd + [1.0] * n + [float(orbit.omega)] * n)
+    miss = float(np.max(np.abs(end - y) / scale)) / max(1.0, float(orbit.multiplier))
+    return "right" if miss < 1e-6 else f"wrong: the motion comes back but for {miss:.1e}"
+
+
+def ask_run(scene: jv.Scene, rng: np.random.Generator) -> str:
+    p = plain(scene)
+    fastest = max(float(scene.drive.speed), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
+    until, y = 40.0 / fastest, away(scene, displacement=1.0, rate=0.3)
+    run = jv.simulate(scene, until, start=state_of(scene, y), save="window", throw=False)
+    if status_name(run.status) != "done":
+        return f"named: {status_name(run.status)}"
+    right = compared(scene, run_out(p, y, until))
+    error = float(np.max(np.abs(end_of_run(run) - np.asarray(right.values)) / np.asarray(right.scale)))
+    return "right" if error <= max(float(run.error), 1e-9) else f"wrong: error {error:.1e}, claimed {float(run.error):.1e}"
+
+
+def ask_gradient(scene: jv.Scene, rng: np.random.Generator) -> str:
+    import equinox as eqx
+
+    modes = jv.jam_modes(scene)
+    numbers = [k for k in modes.mode_numbers() if status_name(modes.select(k).status) == "found"]
+    if not numbers:
+        return "named: no mode"
+    k = numbers[0]
+    slopes = eqx.filter_grad(lambda s: jv.jam_modes(s).select(k, throw=False).foundation_force)(scene).machine
+    machine = scene.machine
+    found = np.concatenate([slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness])
+    jam = modes.select(k)
+    right = light_force_slope(scene, float(jam.omega), 1e-6)
+    return (
+        "right"
+        if relative(found, right) < 1e-4
+        else f"wrong: gradient {found}, differences {right}, slope {float(jam.slope):.1e}"
+    )
+
+
+QUESTIONS: dict[str, Callable[[jv.Scene, np.random.Generator], str]] = {
+    "modes": ask_modes,
+    "gradient": ask_gradient,
+    "orbit": ask_orbit,
+    "run": ask_run,
+}
+
+
+def ended(ask: Callable[[], str]) -> str:
+    """How a question ends, failures by their last line."""
+    begun = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            found = ask()
+    except jv.InputError:
+        found = "named: refused"
+    except jv.ComputationError as error:
+        found = f"named: {error.status}"
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        found = f"failed: {type(error).__name__}: {str(error)[:200]} ({pathlib.Path(place.filename).name}:{place.lineno})"
+    if time.perf_counter() - begun > PATIENCE:
+        found = f"failed: {time.perf_counter() - begun:.0f} s"
+    return found
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--scenes", type=int, default=500)
+    options.add_argument("--files", type=int, default=5000)
+    options.add_argument("--first", type=int, default=0, help="number of the first one")
+    options.add_argument("--questions", nargs="*", default=list(QUESTIONS), choices=list(QUESTIONS))
+    options.add_argument("--minutes", type=float, default=1e9, help="after which no more scenes are drawn")
+    options.add_argument("--out", type=pathlib.Path)
+    given = options.parse_args()
+    jv.use_cache()
+    counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    bad: list[str] = []
+
+    def note(question: str, seed: int, found: str) -> None:
+        counts[question][found.split(":")[0] if not found.startswith("named") else found] += 1
+        if found.startswith(("wrong", "failed")):
+            bad.append(f"{question}, number {seed}: {found}")
+            print(bad[-1], flush=True)
+
+    texts = {kind: text for kind, text in TEMPLATES.items() if kind != "design"}
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(given.first, given.first + given.files):
+            note("file", seed, ended(lambda: read_file(seed, pathlib.Path(folder), texts)))  # noqa: B023
+    begun = time.perf_counter()
+    for seed in range(given.first, given.first + given.scenes):
+        if time.perf_counter() - begun > 60.0 * given.minutes:
+            break
+        for question in given.questions:
+            rng = np.random.default_rng([seed, 1])
+            note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
+    for question, found in counts.items():
+        print(f"{question}: " + ", ".join(f"{number} {name}" for name, number in found.most_common()))
+    if given.out is not None:
+        given.out.mkdir(parents=True, exist_ok=True)
+        (given.out / "random_scenes.json").write_text(json.dumps({"counts": counts, "bad": bad}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main()

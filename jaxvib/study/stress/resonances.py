@@ -1,0 +1,239 @@
+"""Hard cases of jams: folds, damping that is none or too much, natural frequencies that coincide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.loads import balls
+from jaxvib.machine.platforms import three_mass
+from jaxvib.machine.scene import Scene
+from jaxvib.results.status import status_name
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.study.stress.asked import away, final_state, light_force_slope, mode_speeds, mode_speeds_again, published
+from jaxvib.study.stress.case import Answer, Case, Reference
+from jaxvib.study.stress.motions import orbit_speed
+from jaxvib.study.stress.plain import light_modes, light_speed, plain
+
+__all__ = ["CASES"]
+
+_LIGHT_FOLD, _EXACT_FOLD = 5.18285890976257, 5.2028247151614755
+"""Rotor speeds of the third fold of the published machine, of light loads and of a load of eps = 0.05: where the questions
+are asked. What is right there the references find for themselves."""
+
+
+def _exact(modes: tuple[int, ...]) -> tuple[Callable[[Scene], Answer], Callable[[Scene], Reference]]:
+    """Load speeds of exact jams near the third fold, and by shooting on both sides of it."""
+
+    def answer(scene: Scene) -> Answer:
+        orbits = [jam_orbit(scene, mode=mode, throw=False) for mode in modes]
+        names = [status_name(orbit.status) for orbit in orbits]
+        other = [name for name in names if name != "found"]
+        speeds = np.sort([float(orbit.omega) for orbit in orbits])
+        return Answer(speeds, max(float(orbit.error) for orbit in orbits), other[0] if other else "")
+
+    def reference(scene: Scene) -> Reference:
+        p = plain(scene)
+        speed, moved, _ = light_speed(p, 1.0022684)
+        start = np.concatenate([moved.imag, 1.0022684 * moved.real, [0.0, 1.0022684]])
+        # slopes are 30 to 30,000 times as steep as the accuracy of shooting, 1e-13, is good for
+        return Reference(orbit_speed(p, 1.0022684 - 1e-3, 1.0022684 + 1e-3, start, speed), unknown=1e-9)
+
+    return answer, reference
+
+
+def _force_slopes(scene: Scene) -> Answer:
+    """Derivatives of the foundation force of the slowest jam by the logarithm of each stiffness, by reverse mode."""
+    mode = jam_modes(scene).mode_numbers()[0]
+
+    def force(s: Scene) -> jnp.ndarray:
+        return jam_modes(s).select(mode, throw=False).foundation_force
+
+    slopes, machine = eqx.filter_grad(force)(scene).machine, scene.machine
+    supports, links = slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness  # pyright: ignore
+    return Answer(jnp.concatenate([supports, links]))
+
+
+def _force_slopes_again(scene: Scene) -> Reference:
+    slowest = light_modes(plain(scene), float(scene.drive.speed))[0]
+    return Reference(light_force_slope(scene, slowest), unknown=1e-8)
+
+
+def _bed_only(speed: float = 3.0) -> Scene:
+    """The published machine with a link that is not there: only the exciter's platform can move."""
+    return published(speed, link_natural=0.0, link_damping=0.0)
+
+
+def _alike(link: float) -> Scene:
+    """Three platforms of one natural frequency, joined by links of the stiffness `link`, N/m."""
+    machine = three_mass(
+        mass=(2.0, 1.0, 2.0),
+        stiffness=(2e4, 2e4, 2e4),  # with the load 2 kg each
+        damping=(4.0, 4.0, 4.0),
+        link_stiffness=(link, 0.0, link),
+        link_damping=(0.0, 0.0, 0.0),
+        exciter=2,
+    )
+    return Scene(machine, balls(count=1, mass=1.0, radius=0.01, drag=30.0), ConstantSpeed(200.0))
+
+
+def _frequencies(scene: Scene) -> Answer:
+    """Natural frequencies, and the derivative of the sum of their squares by each stiffness."""
+
+    def total(s: Scene) -> jnp.ndarray:
+        return jnp.sum(natural_frequencies(s) ** 2)
+
+    slopes = eqx.filter_grad(total)(scene).machine
+    found = natural_frequencies(scene)
+    return Answer(jnp.concatenate([found / 100.0, slopes.stiffness, slopes.link_stiffness]))
+
+
+def _frequencies_again(scene: Scene) -> Reference:
+    """By a symmetric eigenproblem; the sum of squares is the trace of M^-1 K, whose derivatives are inverse masses."""
+    p = plain(scene)
+    mass = np.diag(p.whole_mass)
+    root = np.sqrt(mass)
+    found = np.sqrt(np.linalg.eigvalsh(p.stiffness / root[:, None] / root))
+    links = [sum(1.0 / mass[end - 1] for end in pair) for pair in scene.machine.links]  # pyright: ignore
+    return Reference(np.concatenate([found / 100.0, 1.0 / mass, np.array(links)]))
+
+
+_RUN, _RUN_AGAIN = final_state(40.0, lambda scene: away(scene, displacement=1.0))
+
+CASES = (
+    *(
+        Case(
+            f"light fold, 1e-8 {side}",
+            hard="two modes merge: the load speed has an infinite slope, and 8 digits of the rotor's speed decide over both",
+            quantity="load speeds of all jam modes",
+            against="roots of n(Omega) by Brent's method",
+            scene=lambda sign=sign: published(_LIGHT_FOLD * (1.0 + sign * 1e-8)),
+            answer=mode_speeds,
+            reference=mode_speeds_again,
+            within=(1e-9, 1e-3),
+            named=((), ("at_fold",)),
+        )
+        for side, sign in (("below", -1.0), ("above", 1.0))
+    ),
+    *(
+        Case(
+            f"exact fold, 1e-8 {side}",
+            hard="two periodic motions merge: Newton's method has a singular matrix there",
+            quantity="load speeds of the exact jams 3 and 4",
+            against="shooting with SciPy at 9 load speeds, interpolated",
+            scene=lambda sign=sign: published(_EXACT_FOLD * (1.0 + sign * 1e-8), eps=0.05),
+            answer=_exact((3, 4))[0],
+            reference=_exact((3, 4))[1],
+            within=(1e-8, 1e-3),
+            named=(() if sign < 0.0 else ("absent", "not_converged"), ("at_fold", "absent", "not_converged")),
+        )
+        for side, sign in (("below", -1.0), ("above", 1.0))
+    ),
+    Case(
+        "no damping at all",
+        hard="the vibration has no bound at a resonance, and no torque away from it",
+        quantity="load speeds of all jam modes",
+        against="roots of n(Omega) by Brent's method",
+        scene=lambda: published(damping=(0.0, 0.0), link_damping=0.0),
+        answer=mode_speeds,
+        reference=mode_speeds_again,
+        within=(1e-9, 1e-3),
+        named=(("unbounded",), ("unbounded",)),
+    ),
+    Case(
+        "damping 1e-8 of critical",
+        hard="peaks 1e-8 wide and 1e8 high, which no even grid sees",
+        quantity="load speeds of all jam modes",
+        against="roots of n(Omega) between points that crowd to 1e-15 of the resonances",
+        scene=lambda: published(damping=(1e-8, 1e-8), link_damping=1e-8),
+        answer=mode_speeds,
+        reference=mode_speeds_again,
+        within=(1e-9, 1e-3),
+    ),
+    Case(
+        "overdamped, modes",
+        hard="no resonance is left: folds vanish, and one mode remains",
+        quantity="load speeds of all jam modes",
+        against="roots of n(Omega) by Brent's method",
+        scene=lambda: published(damping=(5.0, 5.0), link_damping=5.0),
+        answer=mode_speeds,
+        reference=mode_speeds_again,
+        within=(1e-9, 1e-3),
+    ),
+    Case(
+        "overdamped, run",
+        hard="decay rates 2e4 apart make the equations stiff",
+        quantity="state at the end of a run",
+        against="SciPy's DOP853 on the plain equations",
+        scene=lambda: published(damping=(50.0, 50.0), link_damping=50.0, eps=0.05),
+        answer=_RUN,
+        reference=_RUN_AGAIN,
+        within=(1e-6, 1e-2),
+    ),
+    Case(
+        "n1 = n2 exactly, gradient",
+        hard="the platforms' own frequencies coincide, where the formula of the criterion paper divides 0 by 0",
+        quantity="derivatives of the foundation force of the slowest jam by each stiffness",
+        against="differences of dense complex algebra",
+        scene=published,
+        answer=_force_slopes,
+        reference=_force_slopes_again,
+        within=(1e-6, 2e-2),
+    ),
+    Case(
+        "link of stiffness 0",
+        hard="a platform that nothing shakes: a resonance that no load feels",
+        quantity="load speeds of all jam modes",
+        against="roots of n(Omega) by Brent's method",
+        scene=_bed_only,
+        answer=mode_speeds,
+        reference=mode_speeds_again,
+        within=(1e-9, 1e-3),
+    ),
+    Case(
+        "link of 1e-9, gradient",
+        hard="two natural frequencies 1e-9 apart",
+        quantity="derivatives of the foundation force of the slowest jam by each stiffness",
+        against="differences of dense complex algebra",
+        scene=lambda: published(0.6, link_natural=1e-5, link_damping=0.0),
+        answer=_force_slopes,
+        reference=_force_slopes_again,
+        within=(1e-5, 5e-2),
+    ),
+    Case(
+        "three platforms alike, no links",
+        hard="a threefold natural frequency: derivatives of single ones do not exist, that of their sum does",
+        quantity="natural frequencies, and derivatives of the sum of their squares",
+        against="a symmetric eigenproblem, and the trace of M^-1 K",
+        scene=lambda: _alike(0.0),
+        answer=_frequencies,
+        reference=_frequencies_again,
+        within=(1e-12, 1e-5),
+    ),
+    Case(
+        "three platforms alike, weak links",
+        hard="three natural frequencies 1e-9 apart, derivatives of each grow as the inverse of that",
+        quantity="natural frequencies, and derivatives of the sum of their squares",
+        against="a symmetric eigenproblem, and the trace of M^-1 K",
+        scene=lambda: _alike(2e-5),
+        answer=_frequencies,
+        reference=_frequencies_again,
+        within=(1e-6, 1e-2),
+    ),
+    Case(
+        "three platforms alike, jams",
+        hard="three resonances at one speed, of which the load feels one",
+        quantity="load speeds of all jam modes",
+        against="roots of n(Omega) by Brent's method",
+        scene=lambda: _alike(0.0),
+        answer=mode_speeds,
+        reference=mode_speeds_again,
+        within=(1e-9, 1e-3),
+    ),
+)
