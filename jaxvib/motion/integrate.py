@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import diffrax
@@ -42,11 +43,19 @@ class StepControl(eqx.Module):
 
 @cached
 def natural_units(scene: Scene) -> State:
-    """Natural units of the state: the loads' unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed."""
+    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed.
+
+    S is the loads' unbalance, or the rotor's own where that is larger.
+    """
     carrier, loads = scene.machine.carrier(), scene.loads
     across, up, *_ = loads.position(*loads.rest())
     unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
-    length = loads.count * unbalance / jnp.mean(jnp.diagonal(carrier.mass))
+    unbalances = [loads.count * unbalance]
+    for effect in scene.effects:
+        own = effect.imbalance(jnp.zeros_like(unbalance))
+        if own is not None:
+            unbalances.append(jnp.sqrt(sum(x**2 for x in own.static)))
+    length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
     rotor = None if scene.drive.ideal else (one, speed)
