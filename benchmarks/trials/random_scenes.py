@@ -1,6 +1,6 @@
 """Random scenes and mutated files: is every answer right, a named status, or one sentence about the input?
 
-    python benchmarks/random_scenes.py --scenes 500 --files 5000 --out out
+    python benchmarks/trials/random_scenes.py --scenes 500 --files 5000 --out out
 
 Scenes are drawn from a few kinds, so that few programs are compiled, with numbers over many decades. Of each are asked
 

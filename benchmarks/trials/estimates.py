@@ -1,6 +1,6 @@
 """How often a run's estimated error is below its true one, and how often an accuracy that was asked for is broken silently.
 
-    python benchmarks/estimates.py --scenes 30 --out out
+    python benchmarks/trials/estimates.py --scenes 30 --out out
 
 Random scenes of each kind below, in float64 and float32, to a random tolerance and to a random accuracy. The true error is the
 distance, as `Run.error` measures it, from a run in float64 to the tolerance 1e-14, compared at the very times that the run
