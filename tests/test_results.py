@@ -173,24 +173,12 @@ RESULTS = {
     "Front": lambda: Front(np.array([[1.0, 2.0], [2.0, 1.0]]), ("force", "power"), ("N", "W"), (jv.scene_to_toml(SCENE),) * 2),
 }
 
+# fmt: off
 SEVERAL_PANELS = [
-    "TorusTables",
-    "Run",
-    "Envelope",
-    "JamModes",
-    "Jam",
-    "Branches",
-    "ExactBranches",
-    "Orbit",
-    "CriterionMap",
-    "BalancedStates",
-    "Swing",
-    "Identified",
-    "RunUps",
-    "Capture",
-    "Cost",
-    "Audit",
+    "TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
+    "BalancedStates", "Swing", "Identified", "RunUps", "Capture", "Cost", "Audit",
 ]
+# fmt: on
 
 
 @pytest.fixture(scope="module", params=list(RESULTS))

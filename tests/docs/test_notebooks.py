@@ -40,6 +40,6 @@ def test_notebook_runs_and_shows_what_it_showed(path):
     assert figures(fresh) == figures(kept) > 0
     # Words must be the same; numbers may differ in the digits that another processor rounds otherwise.
     assert NUMBER.sub("#", printed(fresh)) == NUMBER.sub("#", printed(kept))
-    settled = [float(x) for x in NUMBER.findall(re.search(r"  after:.*?N/m\n.*?N/m", printed(fresh), re.S)[0])]
-    before = [float(x) for x in NUMBER.findall(re.search(r"  after:.*?N/m\n.*?N/m", printed(kept), re.S)[0])]
+    table = re.compile(r"  jam frequency, .*?  force per amplitude[^\n]*", re.S)
+    settled, before = ([float(x) for x in NUMBER.findall(table.search(printed(shown))[0])] for shown in (fresh, kept))
     assert settled == pytest.approx(before, rel=1e-3)

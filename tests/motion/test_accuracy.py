@@ -98,7 +98,7 @@ def test_accuracy_looks_at_numbers():
 
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
 def test_the_estimate_is_above_the_error_where_a_stop_bends_the_motion(double):
-    """Two runs whose steps miss the same touch are nearer to each other than to the truth: see benchmarks/trials/estimates.py."""
+    """Two runs whose steps miss the same touch are nearer to each other than to the truth (benchmarks/trials/estimates.py)."""
     rng = np.random.default_rng(0)
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0)
     asked = dict(save="window", max_steps=2**17)
