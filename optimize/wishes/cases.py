@@ -50,10 +50,8 @@ class Sampled:
     several = True
 
     def factors(self, scene: Scene) -> list[tuple[Place, np.ndarray]]:
-        """Of each number the factors (samples, entries): a scrambled Sobol-like even spread, normal, within three deviations.
-
-        Latin hypercube: every number's samples fill the distribution evenly, in an order of their own.
-        """
+        """Of each number the factors (samples, entries), normal, within three deviations: a Latin hypercube, in which every
+        number's samples fill the distribution evenly, in an order of their own."""
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
         for name, error in self.errors:
@@ -79,10 +77,9 @@ class Sampled:
 
 
 @dataclass(frozen=True)
-class Under(Quantity):
-    """A quantity in a case."""
+class _OfPart(Quantity):
+    """A quantity made of one other, its `part`."""
 
-    case: Changed = Changed("", ())
     part: Quantity | None = None
 
     @property
@@ -93,6 +90,16 @@ class Under(Quantity):
     @property
     def words(self) -> str:
         return self.name
+
+    def at_tier(self, tier: Tier) -> Quantity:
+        return replace(self, part=self.parts[0].at_tier(tier))
+
+
+@dataclass(frozen=True)
+class Under(_OfPart):
+    """A quantity in a case."""
+
+    case: Changed = Changed("", ())
 
     def read(self, answers: Answers) -> Array:
         scene, path = answers.under(self.case)
@@ -101,31 +108,18 @@ class Under(Quantity):
         answers.found.update(inner.found)
         return value
 
-    def at_tier(self, tier: Tier) -> Quantity:
-        return replace(self, part=self.parts[0].at_tier(tier))
-
     @property
     def easy(self) -> Quantity:
         return replace(self, part=self.parts[0].easy)
 
 
 @dataclass(frozen=True)
-class Robust(Quantity):
+class Robust(_OfPart):
     """A number of the distribution of a quantity over tolerances."""
 
     case: Sampled = Sampled((), 1, 0)
-    part: Quantity | None = None
     statistic: str = "expected"
     level: float = 0.0
-
-    @property
-    def parts(self) -> tuple[Quantity, ...]:
-        assert self.part is not None
-        return (self.part,)
-
-    @property
-    def words(self) -> str:
-        return self.name
 
     def read(self, answers: Answers) -> Array:
         scenes, path = answers.under(self.case)
@@ -149,13 +143,8 @@ class Robust(Quantity):
             return jnp.mean(values)
         if self.statistic == "worst":
             return jnp.max(values)
-        if self.statistic == "best":
-            return jnp.min(values)
         # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
         return jnp.quantile(values, self.level)
-
-    def at_tier(self, tier: Tier) -> Quantity:
-        return replace(self, part=self.parts[0].at_tier(tier))
 
     @property
     def easy(self) -> Quantity:

@@ -218,6 +218,8 @@ def _jam_modes(scene: Scene) -> JamModes:
 
 
 def jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+    """The jam of mode `number` whose loads turn at `omega` rad/s, at a rotor speed (rad/s) at which it exists, all scalars;
+    `at_fold` whether it lies at its fold. Its status is never `absent`: who asks knows that it is there."""
     displacement = model.displacement(omega)
     # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
     radius = jammed_loads(model.scene).unbalance() / jnp.min(jnp.diagonal(model.mass))

@@ -284,8 +284,8 @@ def _judged(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: f
 
 
 def _implicit(route: ImplicitRoute, put: Callable[[Array], Scene], nothing: Array) -> Array:
-    x = jnp.atleast_1d(jax.lax.stop_gradient(jnp.asarray(route.solution(put(nothing)))))
-    shape = jnp.shape(route.solution(put(nothing)))
+    solved = jnp.asarray(route.solution(put(nothing)))
+    x, shape = jnp.atleast_1d(solved), solved.shape
 
     def residual(p: Array, x: Array) -> Array:
         return jnp.atleast_1d(route.residual(put(p), x.reshape(shape)))
