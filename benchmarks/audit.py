@@ -25,7 +25,7 @@ jax.config.update("jax_enable_x64", True)
 
 from parts.common import machine_line  # noqa: E402
 
-from jaxvib.cli.audit import audit_text  # noqa: E402
+from jaxvib.cli.study.audit import audit_text  # noqa: E402
 from jaxvib.study.audit.numbers import gravity_share  # noqa: E402
 from jaxvib.study.capture.capture import thrown_state  # noqa: E402
 from jaxvib.study.capture.published_torus import published_torus  # noqa: E402

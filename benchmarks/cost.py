@@ -27,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 
 from parts.common import machine_line, published  # noqa: E402
 
-from jaxvib.cli.cost import cost_document, cost_table  # noqa: E402
+from jaxvib.cli.study.cost import cost_document, cost_table  # noqa: E402
 from jaxvib.study.accuracy.cost import WANTED  # noqa: E402
 from jaxvib.study.maps.published_rotor import published_rotor  # noqa: E402
 

@@ -10,6 +10,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 
 FLOORS = (
     ("jaxvib.cli",),
+    ("jaxvib.sweeps", "jaxvib.report"),
     ("jaxvib.study", "optimize"),
     ("jaxvib.motion",),
     ("jaxvib.steady",),

@@ -105,11 +105,11 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
-    "audit": "audit",
-    "capture": "capture",
-    "cost": "cost",
-    "identify": "identify",
-    "stress": "stress",
+    "audit": "study.audit",
+    "capture": "study.capture",
+    "cost": "study.cost",
+    "identify": "study.identify",
+    "stress": "study.stress",
     "whirl": "whirl",
     "criterion": "criterion",
     "modes": "modes",

@@ -1,0 +1,1 @@
+"""Commands of the studies: many questions about one scene, a record, or a catalogue."""
