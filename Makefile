@@ -6,7 +6,7 @@ OUT ?= out/demo
 JAXVIB = $(BIN)/jaxvib
 EXAMPLE = examples/antiphase
 
-.PHONY: demo test test-slow test-versions check bench-guard clean
+.PHONY: demo test test-slow test-versions check docs bench-guard clean
 
 demo: $(VENV)/installed
 	@echo "--- how the first drawing can jam"
@@ -41,6 +41,11 @@ check: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# The documentation as pages that open from the disk; a warning is an error.
+docs: $(VENV)/installed-docs
+	$(BIN)/mkdocs build --strict --quiet
+	@echo out/site/index.html
+
 # Ratios of times beside recorded ones: fails where something became three times slower.
 bench-guard: $(VENV)/installed-bench
 	$(BIN)/python benchmarks/guard.py
@@ -56,6 +61,10 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --editable '.[test,dev]'
+	@touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --editable '.[test,docs]'
 	@touch $@
 
 $(VENV)/installed-bench: $(VENV)/installed

@@ -1,0 +1,78 @@
+"""What mkdocs runs: a page of the reference for each group of public names, and formulas as MathML, without a script."""
+
+import ast
+import html
+import pathlib
+import re
+
+import latex2mathml.converter
+from mkdocs.structure.files import File
+
+ROOT = pathlib.Path(__file__).parents[1]
+OPTIMIZE = "Design: the package `optimize`"
+INCLUDED = {"contributing.md": "CONTRIBUTING.md", "engine.md": "jaxvib/ode/README.md", "changelog.md": "CHANGELOG.md"}
+"""Pages that stand elsewhere in the project."""
+
+
+def public_groups():
+    """{title: {public name: dotted path of its home}}: the groups of `jaxvib/__init__.pyi`, and `optimize`."""
+    text = (ROOT / "jaxvib" / "__init__.pyi").read_text(encoding="utf-8")
+    homes = _homes(text)
+    groups, title = {}, ""
+    for line in text[text.index("__all__") :].splitlines():
+        if found := re.fullmatch(r"    # (.*)", line):
+            title = found[1]
+        elif found := re.fullmatch(r'    "(\w+)",', line):
+            groups.setdefault(title, {})[found[1]] = homes.get(found[1], f"jaxvib.{found[1]}")
+    groups[OPTIMIZE] = _homes((ROOT / "optimize" / "__init__.py").read_text(encoding="utf-8"))
+    return {title: {name: home for name, home in names.items() if not name.startswith("__")} for title, names in groups.items()}
+
+
+def _homes(text):
+    """{name: module.name} of all `from module import name`."""
+    found = {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.ImportFrom):
+            found |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def address(title):
+    """The file of a group's page."""
+    return "reference/" + re.sub(r"\W+", "_", title.lower()).strip("_") + ".md"
+
+
+def on_config(config):
+    """The reference stands in the navigation."""
+    for entry in config.nav:
+        if isinstance(entry, dict) and "Reference" in entry:
+            entry["Reference"] = [{title.replace("`", ""): address(title)} for title in public_groups()]
+    return config
+
+
+def on_files(files, config):
+    """The pages of the reference, which are written nowhere else, and those that stand elsewhere."""
+    for page, source in INCLUDED.items():
+        text = (ROOT / source).read_text(encoding="utf-8").replace("](jaxvib/ode/README.md)", "](engine.md)")
+        files.append(File.generated(config, page, content=text))
+    for title, names in public_groups().items():
+        package = "optimize" if title == OPTIMIZE else "jaxvib"
+        parts = [f"# {title}\n"]
+        for name, home in sorted(names.items(), key=lambda item: item[0].lower()) if package == "optimize" else names.items():
+            parts.append(f"::: {home}\n    options:\n      heading: {package}.{name}\n      toc_label: {name}\n")
+        files.append(File.generated(config, address(title), content="\n".join(parts)))
+    return files
+
+
+_MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>([.,;:)]*)', flags=re.S)
+
+
+def on_page_content(content, **_):
+    r"""\( ... \) and \[ ... \] as MathML, which browsers draw by themselves."""
+
+    def drawn(found):
+        display = "block" if found[1] == "div" else "inline"
+        formula = latex2mathml.converter.convert(html.unescape(found[2]), display=display)
+        return f'<span class="formula">{formula}{found[3]}</span>'  # with the comma behind it, on one line
+
+    return _MATH.sub(drawn, content)

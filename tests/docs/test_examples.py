@@ -1,0 +1,54 @@
+"""The examples of README and documentation run as they stand."""
+
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import jax
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def examples():
+    """{the text of an example: where it stands first}."""
+    found = {}
+    for page in PAGES:
+        for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S)):
+            found.setdefault(block, f"{page.stem}-{number}")
+    return found
+
+
+EXAMPLES = examples()
+
+
+def test_readme_has_examples():
+    assert "README-0" in EXAMPLES.values()
+
+
+@pytest.mark.parametrize("block", EXAMPLES, ids=EXAMPLES.values())
+def test_example_runs(block, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    if EXAMPLES[block] == "README-0":
+        run_alone(block)
+    else:
+        exec(compile(block, EXAMPLES[block], "exec"), {})
+
+
+def run_alone(block):
+    """In a process of its own, as a user's script: jaxvib prepares JAX by itself. As strict as `conftest.py` is."""
+    clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    clean |= {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir), "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    words = [sys.executable, "-W", "error", "-c", block]
+    done = subprocess.run(words, env=clean, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+
+
+def test_links_of_the_readme_lead_to_files():
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", README.read_text(encoding="utf-8")):
+        assert target.startswith("http") or (ROOT / target).exists(), target
