@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import functools
 import json
 import pathlib
 import tempfile
@@ -25,6 +26,7 @@ import traceback
 import warnings
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -204,15 +206,19 @@ def ask_run(scene: jv.Scene, rng: np.random.Generator) -> str:
     return "right" if error <= max(float(run.error), 1e-9) else f"wrong: error {error:.1e}, claimed {float(run.error):.1e}"
 
 
-def ask_gradient(scene: jv.Scene, rng: np.random.Generator) -> str:
-    import equinox as eqx
+@functools.cache
+def force_gradient(mode: int) -> Callable[[jv.Scene], jv.Scene]:
+    """Derivatives of the foundation force in a mode by all numbers, compiled once for each kind of scene."""
+    return eqx.filter_jit(eqx.filter_grad(lambda s: jv.jam_modes(s).select(mode, throw=False).foundation_force))
 
+
+def ask_gradient(scene: jv.Scene, rng: np.random.Generator) -> str:
     modes = jv.jam_modes(scene)
     numbers = [k for k in modes.mode_numbers() if status_name(modes.select(k).status) == "found"]
     if not numbers:
         return "named: no mode"
     k = numbers[0]
-    slopes = eqx.filter_grad(lambda s: jv.jam_modes(s).select(k, throw=False).foundation_force)(scene).machine
+    slopes = force_gradient(k)(scene).machine
     machine = scene.machine
     found = np.concatenate([slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness])
     jam = modes.select(k)
@@ -257,7 +263,7 @@ def main() -> None:
     options.add_argument("--files", type=int, default=5000)
     options.add_argument("--first", type=int, default=0, help="number of the first one")
     options.add_argument("--questions", nargs="*", default=list(QUESTIONS), choices=list(QUESTIONS))
-    options.add_argument("--minutes", type=float, default=1e9, help="after which no more scenes are drawn")
+    options.add_argument("--minutes", type=float, default=1e9, help="after which nothing more is asked")
     options.add_argument("--out", type=pathlib.Path)
     given = options.parse_args()
     jv.use_cache()
@@ -270,22 +276,30 @@ def main() -> None:
             bad.append(f"{question}, number {seed}: {found}")
             print(bad[-1], flush=True)
 
+    def write() -> None:
+        if given.out is not None:
+            given.out.mkdir(parents=True, exist_ok=True)
+            found = {"first": given.first, "counts": counts, "bad": bad}
+            (given.out / "random_scenes.json").write_text(json.dumps(found, indent=1) + "\n")
+
     texts = {kind: text for kind, text in TEMPLATES.items() if kind != "design"}
-    with tempfile.TemporaryDirectory() as folder:
-        for seed in range(given.first, given.first + given.files):
-            note("file", seed, ended(lambda: read_file(seed, pathlib.Path(folder), texts)))  # noqa: B023
+    files = -(-given.files // max(given.scenes, 1))  # with each scene, so that both advance
     begun = time.perf_counter()
-    for seed in range(given.first, given.first + given.scenes):
-        if time.perf_counter() - begun > 60.0 * given.minutes:
-            break
-        for question in given.questions:
-            rng = np.random.default_rng([seed, 1])
-            note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(max(given.scenes, 1)):
+            if time.perf_counter() - begun > 60.0 * given.minutes:
+                break
+            for seed in range(given.first + k * files, given.first + min((k + 1) * files, given.files)):
+                note("file", seed, ended(lambda: read_file(seed, pathlib.Path(folder), texts)))  # noqa: B023
+            seed = given.first + k
+            for question in given.questions if given.scenes else ():
+                rng = np.random.default_rng([seed, 1])
+                note(question, seed, ended(lambda: QUESTIONS[question](drawn(rng), rng)))  # noqa: B023
+            if k % 50 == 49:
+                write()
     for question, found in counts.items():
         print(f"{question}: " + ", ".join(f"{number} {name}" for name, number in found.most_common()))
-    if given.out is not None:
-        given.out.mkdir(parents=True, exist_ok=True)
-        (given.out / "random_scenes.json").write_text(json.dumps({"counts": counts, "bad": bad}, indent=1) + "\n")
+    write()
 
 
 if __name__ == "__main__":

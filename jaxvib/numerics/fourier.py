@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 __all__ = ["Grid", "grid_of"]
@@ -37,12 +38,17 @@ class Grid(NamedTuple):
     synthesis: np.ndarray
 
 
-@functools.lru_cache(maxsize=64)
 def grid_of(points: int, symmetric: bool) -> Grid:
     """The grid of `points` on half a period where the motion has the half-turn symmetry, else on the whole of it.
 
-    `points` is made even for half a period and odd for a whole one, which keeps the highest harmonic of e whole.
+    `points` is made even for half a period and odd for a whole one, which keeps the highest harmonic of e whole. Each precision
+    that JAX is switched to has a grid of its own: JAX remembers an array with the precision in which it met it first.
     """
+    return _grid_of(points, symmetric, bool(jax.config.read("jax_enable_x64")))
+
+
+@functools.lru_cache(maxsize=64)
+def _grid_of(points: int, symmetric: bool, double: bool) -> Grid:
     m = points + points % 2 if symmetric else points + 1 - points % 2
     turn = np.pi if symmetric else 2.0 * np.pi
     theta = turn * np.arange(m) / m

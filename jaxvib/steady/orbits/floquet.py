@@ -145,7 +145,7 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     begin = tuple(start(n) for n in sizes)
 
     def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        at = coefficients((k + _NODES) * h)
+        at = coefficients((k + nodes) * h)
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
         def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -159,7 +159,7 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
         rates = jax.lax.fori_loop(0, len(_NODES), stage, rates)
         return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
 
-    rows, weights = jnp.asarray(_ROWS, dtype=omega.dtype), jnp.asarray(_WEIGHTS, dtype=omega.dtype)
+    nodes, rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_NODES, _ROWS, _WEIGHTS))
     end = jax.lax.fori_loop(0, steps, step, begin)
     flip = np.concatenate([np.full(2 * nd, -1.0 if model.half_turn else 1.0), np.ones(2 * count)])
     monodromy = flip[:, None, None] * end[0]

@@ -31,6 +31,12 @@ _POINTS = (16, 32, 64, 128)
 _SEARCH, _LANES = 800, 100
 """Points of the exact branch that are looked at where the leading order does not lead to a mode, and of them at once."""
 
+_PARTS = 32
+"""Into so many parts cubics divide what lies between two of these points."""
+
+_NEAR_FOLD = 1e-6
+"""Relative distance of the rotor's speed from a fold, so far as the cubics say, below which the fold itself is looked for."""
+
 _FAR = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
@@ -220,20 +226,47 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     there = main < turn.size
     cuts = np.where(there, omega[padded[main]], np.inf)
     modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
+    crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
+    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD * target]
+    close = []
+    for k in near:
+        around = np.clip([k - _PARTS, k + _PARTS], 0, omega.size - 1)
+        if _ends_before(scene, omega[around[0]], omega[around[1]], target):
+            crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
+        else:
+            close.append(k)
     found: dict[int, float] = {}
-    for k in np.flatnonzero((speed[1:] - target) * (speed[:-1] - target) <= 0.0):
+    for k in np.flatnonzero(crossed):
         part = (target - speed[k]) / (speed[k + 1] - speed[k])
         found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
     # So close to a fold that it lies between two points: both of its modes are about there.
-    for k in turn[np.abs(speed[turn] - target) < 1e-6 * target]:
+    for k in close:
         for side in (k - 1, k + 1):
             found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
     return found
 
 
+def _ends_before(scene: Scene, low: float, high: float, target: float) -> bool:
+    """Whether the exact branch turns back, between the load speeds `low` and `high`, before it comes to the rotor speed `target`.
+
+    The fold is looked at through ever smaller windows; that its slope is 0 says where it is, to rounding.
+    """
+    rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+    for _ in range(2):
+        omega = np.linspace(low, high, _SEARCH)
+        speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
+        (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
+        if turns.size != 1:
+            return False
+        low, high = omega[turns[0]], omega[turns[0] + 1]
+    ends, rises = slice(turns[0], turns[0] + 2), slope[turns[0]] > 0.0
+    fold = _between(omega[ends], speed[ends], slope[ends])[1]
+    return bool(np.max(fold) < target * (1.0 - rounding) if rises else np.min(fold) > target * (1.0 + rounding))
+
+
 def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the cubics through (x, y) with these slopes, 32 an interval."""
-    t, h = np.arange(32) / 32, np.diff(x)[:, None]
+    """Points of the cubics through (x, y) with these slopes, `_PARTS` an interval."""
+    t, h = np.arange(_PARTS) / _PARTS, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
     cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
     return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
