@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 
 __all__ = ["Grid", "grid_of"]
@@ -44,7 +44,7 @@ def grid_of(points: int, symmetric: bool) -> Grid:
     `points` is made even for half a period and odd for a whole one, which keeps the highest harmonic of e whole. Each precision
     that JAX is switched to has a grid of its own: JAX remembers an array with the precision in which it met it first.
     """
-    return _grid_of(points, symmetric, bool(jax.config.read("jax_enable_x64")))
+    return _grid_of(points, symmetric, jnp.result_type(float).itemsize == 8)
 
 
 @functools.lru_cache(maxsize=64)
