@@ -231,7 +231,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     close = []
     for k in near:
         around = np.clip([k - _PARTS, k + _PARTS], 0, omega.size - 1)
-        if _ends_before(scene, omega[around[0]], omega[around[1]], target):
+        if _ends_before(scene, *map(float, omega[around]), target):
             crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
         else:
             close.append(k)
@@ -246,22 +246,22 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     return found
 
 
-def _ends_before(scene: Scene, low: float, high: float, target: float) -> bool:
-    """Whether the exact branch turns back, between the load speeds `low` and `high`, before it comes to the rotor speed `target`.
+def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
+    """Whether the exact branch turns back, between two load speeds, before it comes to the rotor speed `target`.
 
     The fold is looked at through ever smaller windows; that its slope is 0 says where it is, to rounding.
     """
+    omega = np.linspace(low, high, _SEARCH)
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
+    (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
+    if turns.size != 1:
+        return False
+    ends = slice(turns[0], turns[0] + 2)
+    if looks > 1:
+        return _ends_before(scene, *map(float, omega[ends]), target, looks - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    for _ in range(2):
-        omega = np.linspace(low, high, _SEARCH)
-        speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
-        (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
-        if turns.size != 1:
-            return False
-        low, high = omega[turns[0]], omega[turns[0] + 1]
-    ends, rises = slice(turns[0], turns[0] + 2), slope[turns[0]] > 0.0
     fold = _between(omega[ends], speed[ends], slope[ends])[1]
-    return bool(np.max(fold) < target * (1.0 - rounding) if rises else np.min(fold) > target * (1.0 + rounding))
+    return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
 
 
 def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.machine.dimensionless import Dimensionless
@@ -18,7 +19,7 @@ from jaxvib.results.status import status_name, status_names
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.stress.case import Answer, Reference
 from jaxvib.study.stress.motions import Outcome, run_out
-from jaxvib.study.stress.plain import light_modes, light_speed, plain
+from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = [
     "away",
@@ -60,7 +61,7 @@ def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.
     """
 
     def force(values: np.ndarray) -> float:
-        nd = scene.machine.stiffness.shape[0]  # pyright: ignore[reportAttributeAccessIssue]
+        nd = platforms(scene).stiffness.shape[0]
         changed = eqx.tree_at(_stiffnesses, scene, (values[:nd], values[nd:]))
         p = plain(changed)
         roots = light_modes(p, float(scene.drive.speed))
@@ -79,9 +80,9 @@ def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.
     return np.array([(4.0 * slope(k, step) - slope(k, 2.0 * step)) / 3.0 for k in range(whole.size)])
 
 
-def _stiffnesses(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    machine = scene.machine
-    return machine.stiffness, machine.link_stiffness  # pyright: ignore[reportAttributeAccessIssue]
+def _stiffnesses(scene: Scene) -> tuple[Array, Array]:
+    machine = platforms(scene)
+    return machine.stiffness, machine.link_stiffness
 
 
 def state_of(scene: Scene, y: np.ndarray) -> State:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxvib.machine.drive import ConstantSpeed, RunUp
-from jaxvib.machine.effects.base import Gravity
+from jaxvib.machine.drive import ConstantSpeed, Drive, RunUp
+from jaxvib.machine.effects.base import Effect, Gravity
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.supports import Stop
@@ -18,7 +18,7 @@ from jaxvib.motion.steps import Tolerance
 from jaxvib.study.stress.asked import away, compared_state, final_state
 from jaxvib.study.stress.case import Case, Reference
 from jaxvib.study.stress.motions import Event, by_events, natural_sizes
-from jaxvib.study.stress.plain import plain
+from jaxvib.study.stress.plain import figure, plain
 
 __all__ = ["CASES", "stop_law"]
 
@@ -30,7 +30,7 @@ def stop_law(until: float, start: Start) -> Callable[[Scene], Reference]:
 
     def reference(scene: Scene) -> Reference:
         p, stop = plain(scene), next(e for e in scene.effects if e.kind == "stop")
-        k, c, gap = (float(x) for x in (stop.stiffness, stop.damping, stop.gap))  # pyright: ignore
+        k, c, gap = (figure(stop, name) for name in ("stiffness", "damping", "gap"))
 
         def beyond(t: float, y: np.ndarray) -> float:
             return y[0] - gap
@@ -62,8 +62,8 @@ def _contact(until: float, start: Start) -> Callable[[Scene], Reference]:
 
     def reference(scene: Scene) -> Reference:
         p, effect = plain(scene), next(e for e in scene.effects if e.kind == "load_contact")
-        own, radius = float(scene.loads.own_radius), float(scene.loads.radius)  # pyright: ignore
-        k, c = float(effect.stiffness), float(effect.damping)  # pyright: ignore
+        own, radius = (figure(scene.loads, name) for name in ("own_radius", "radius"))
+        k, c = figure(effect, "stiffness"), figure(effect, "damping")
 
         def gap(y: np.ndarray, pair: int) -> tuple[float, float, float]:
             """Distance beyond 2 r, its rate, and its slope by the angle between the two."""
@@ -111,8 +111,8 @@ def _dry(until: float, start: Start) -> Callable[[Scene], Reference]:
 
     def reference(scene: Scene) -> Reference:
         p, effect = plain(scene), next(e for e in scene.effects if e.kind == "dry_friction")
-        lever = 0.5 * float(effect.coefficient) * float(effect.diameter)  # pyright: ignore
-        g = float(p.effects["gravity"].g) if "gravity" in p.effects else 0.0  # pyright: ignore
+        lever = 0.5 * figure(effect, "coefficient") * figure(effect, "diameter")
+        g = figure(p.effects["gravity"], "g") if "gravity" in p.effects else 0.0
         m, radius = float(p.m[0]), float(p.radius[0])
 
         def load(y: np.ndarray, a: float) -> float:
@@ -168,10 +168,10 @@ def _dry(until: float, start: Start) -> Callable[[Scene], Reference]:
     return reference
 
 
-def _one(*effects: object, drive: object = None, drag: float = 0.5) -> Scene:
+def _one(*effects: Effect, drive: Drive | None = None, drag: float = 0.5) -> Scene:
     machine = one_mass(mass=50.0, stiffness=4e4, damping=100.0)
     loads = pendulums(count=1, mass=2.0, radius=0.1, drag=drag)
-    return Scene(machine, loads, ConstantSpeed(60.0) if drive is None else drive, effects)  # pyright: ignore
+    return Scene(machine, loads, ConstantSpeed(60.0) if drive is None else drive, effects)
 
 
 def _two_balls(stiffness: float, damping: float) -> Scene:
@@ -199,12 +199,12 @@ def _hanging(angle: float, rate: float = 0.0) -> Start:
     return start
 
 
-def _friction(coefficient: float, speed: float, width: float = 1e-4, drive: object = None) -> Scene:
+def _friction(coefficient: float, speed: float, width: float = 1e-4, drive: Drive | None = None) -> Scene:
     """A pendulum of 1 kg on 0.1 m whose bearing of 40 mm holds mu2 g/5 N m, on a platform that hardly gives way."""
     machine = one_mass(mass=200.0, stiffness=2e6, damping=1e4)
     loads = pendulums(count=1, mass=1.0, radius=0.1, drag=0.02)
     effects = (Gravity(), DryFriction(coefficient, diameter=0.04, width=width))
-    return Scene(machine, loads, ConstantSpeed(speed) if drive is None else drive, effects)  # pyright: ignore
+    return Scene(machine, loads, ConstantSpeed(speed) if drive is None else drive, effects)
 
 
 _FINE = (Tolerance(1e-10), None)

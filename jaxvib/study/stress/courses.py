@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from jaxvib.machine.drive import ConstantSpeed, DCMotor, RunUp
+from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, RunUp
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 from jaxvib.machine.loads import pendulums
@@ -24,7 +24,7 @@ from jaxvib.study.stress.asked import away, final_state, published, state_of
 from jaxvib.study.stress.bends import stop_law
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import orbit_rotor_speed, orbit_speed
-from jaxvib.study.stress.plain import Plain, light_speed, plain
+from jaxvib.study.stress.plain import Plain, light_speed, plain, platforms
 
 __all__ = ["CASES"]
 
@@ -75,10 +75,10 @@ def _conserved(scene: Scene) -> Answer:
     return Answer([_energy(plain(scene), np.array(y))], None, "" if status == "done" else status)
 
 
-def _passing(drive: object) -> Scene:
+def _passing(drive: Drive) -> Scene:
     machine = one_mass(mass=50.0, stiffness=4e4, damping=100.0)
     loads = pendulums(count=1, mass=0.5, radius=0.1, drag=0.5)
-    return Scene(machine, loads, drive, (StaticImbalance(0.02),))  # pyright: ignore
+    return Scene(machine, loads, drive, (StaticImbalance(0.02),))
 
 
 def _hanging(scene: Scene) -> np.ndarray:
@@ -127,7 +127,7 @@ def _slopes(scene: Scene) -> Answer:
     """Derivatives of the load speed at the end of a long run by the logarithm of each support's stiffness."""
 
     def omega(factor: jax.Array) -> jax.Array:
-        now = eqx.tree_at(lambda s: s.machine.stiffness, scene, scene.machine.stiffness * factor)  # pyright: ignore
+        now = eqx.tree_at(lambda s: platforms(s).stiffness, scene, platforms(scene).stiffness * factor)
         forward = diffrax.ForwardMode()
         run = simulate(now, 1500.0, start="jam", mode=3, save="window", adjoint=forward, max_steps=2**16, throw=False)
         return run.omega

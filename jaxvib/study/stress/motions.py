@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from jaxvib.study.stress.plain import Plain, root
+from jaxvib.study.stress.plain import Plain, figure, root
 
 __all__ = ["Event", "Outcome", "by_events", "natural_sizes", "orbit_rotor_speed", "orbit_speed", "run_out"]
 
@@ -50,7 +50,7 @@ def natural_sizes(p: Plain) -> np.ndarray:
     displacements, that times the rotor's speed for velocities, 1 rad, the rotor's speed."""
     nd, n = p.mass.shape[0], p.m.size
     length = np.sum(p.m * p.radius) / np.sum(p.whole_mass)
-    speed = float(p.drive.speed)  # pyright: ignore[reportAttributeAccessIssue]
+    speed = figure(p.drive, "speed")
     motor = [1.0, speed] if getattr(p.drive, "kind", "") == "dc_motor" else []
     return np.array([length] * nd + [length * speed] * nd + [1.0] * n + [speed] * n + motor)
 
@@ -167,7 +167,7 @@ def orbit_speed(p: Plain, low: float, high: float, start: np.ndarray, speed: flo
         speed, start = orbit_rotor_speed(p, float(w), start, speed)
         speeds.append(speed)
     curve = np.polynomial.chebyshev.Chebyshev.fit(omega, speeds, nodes - 1, domain=[low, high])
-    wanted, slope, grid = float(p.drive.speed), curve.deriv(), np.linspace(low, high, 201)  # pyright: ignore
+    wanted, slope, grid = figure(p.drive, "speed"), curve.deriv(), np.linspace(low, high, 201)
     turns = [root(slope, a, b) for a, b in itertools.pairwise(grid) if slope(a) * slope(b) < 0.0]
     ends = np.unique([low, *turns, high])
     pairs = [(a, b) for a, b in itertools.pairwise(ends) if (curve(a) - wanted) * (curve(b) - wanted) < 0.0]

@@ -19,7 +19,18 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Plain", "light_modes", "light_speed", "plain", "root"]
+__all__ = ["Plain", "figure", "light_modes", "light_speed", "plain", "platforms", "root"]
+
+
+def figure(part: object, name: str) -> float:
+    """A number of a load, an effect or a drive by its name: references know parts by what they are called, not by class."""
+    return float(getattr(part, name))
+
+
+def platforms(scene: Scene) -> Platforms:
+    """The scene's machine, which has to be one of platforms."""
+    assert isinstance(scene.machine, Platforms)
+    return scene.machine
 
 
 @dataclass(frozen=True)
@@ -49,11 +60,11 @@ class Plain:
     def rotor(self, t: float, y: np.ndarray) -> tuple[float, float, float]:
         """The rotor's angle, speed and acceleration (0 where a motor's is an unknown)."""
         drive = self.drive
-        kind, speed = drive.kind, float(drive.speed)  # pyright: ignore[reportAttributeAccessIssue]
+        kind, speed = drive.kind, figure(drive, "speed")
         if kind == "constant_speed":
             return speed * t, speed, 0.0
         if kind == "run_up":
-            rate = float(drive.acceleration)  # pyright: ignore[reportAttributeAccessIssue]
+            rate = figure(drive, "acceleration")
             end = speed / rate
             return (0.5 * rate * t**2, rate * t, rate) if t < end else (speed * (t - 0.5 * end), speed, 0.0)
         return float(y[-2]), float(y[-1]), 0.0
@@ -79,21 +90,21 @@ class Plain:
         torque = self.drag * self.radius**2 * (speed - rate)
         right[nd : nd + n] = torque
         if "gravity" in self.effects:
-            right[nd : nd + n] -= own * float(self.effects["gravity"].g) * np.cos(phi)  # pyright: ignore
+            right[nd : nd + n] -= own * figure(self.effects["gravity"], "g") * np.cos(phi)
         if "cubic_support" in self.effects:
-            right[0] -= float(self.effects["cubic_support"].stiffness) * q[0] ** 3  # pyright: ignore
+            right[0] -= figure(self.effects["cubic_support"], "stiffness") * q[0] ** 3
         thrown = self.effects.get("static_imbalance")
         if thrown is not None:
-            where = angle + float(thrown.angle)  # pyright: ignore[reportAttributeAccessIssue]
-            moment = float(thrown.moment)  # pyright: ignore[reportAttributeAccessIssue]
+            where = angle + figure(thrown, "angle")
+            moment = figure(thrown, "moment")
             right[self.at] += moment * (np.sin(where) * speed**2 - np.cos(where) * change)
             if motor:
                 matrix[self.at, -1] = matrix[-1, self.at] = moment * np.cos(where)
         if motor:
             drive = self.drive
-            matrix[-1, -1] = float(drive.inertia)  # pyright: ignore[reportAttributeAccessIssue]
-            stall = float(drive.stall_torque)  # pyright: ignore[reportAttributeAccessIssue]
-            right[-1] = stall * (1.0 - speed / float(drive.speed)) - np.sum(torque)  # pyright: ignore
+            matrix[-1, -1] = figure(drive, "inertia")
+            stall = figure(drive, "stall_torque")
+            right[-1] = stall * (1.0 - speed / figure(drive, "speed")) - np.sum(torque)
         return matrix, right
 
     def field(self, t: float, y: np.ndarray, press: float = 0.0) -> np.ndarray:
@@ -108,8 +119,8 @@ class Plain:
 
 def plain(scene: Scene) -> Plain:
     """The scene's numbers in float64, as they are in its dtype."""
-    machine, loads = scene.machine, scene.loads
-    assert isinstance(machine, Platforms) and isinstance(loads, CircularLoads)
+    machine, loads = platforms(scene), scene.loads
+    assert isinstance(loads, CircularLoads)
 
     def get(value: object) -> np.ndarray:
         return np.asarray(value, float)

@@ -19,7 +19,7 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.study.stress.asked import away, final_state, light_force_slope, mode_speeds, mode_speeds_again, published
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import orbit_speed
-from jaxvib.study.stress.plain import light_modes, light_speed, plain
+from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = ["CASES"]
 
@@ -55,8 +55,8 @@ def _force_slopes(scene: Scene) -> Answer:
     def force(s: Scene) -> jnp.ndarray:
         return jam_modes(s).select(mode, throw=False).foundation_force
 
-    slopes, machine = eqx.filter_grad(force)(scene).machine, scene.machine
-    supports, links = slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness  # pyright: ignore
+    slopes, machine = platforms(eqx.filter_grad(force)(scene)), platforms(scene)
+    supports, links = slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness
     return Answer(jnp.concatenate([supports, links]))
 
 
@@ -89,7 +89,7 @@ def _frequencies(scene: Scene) -> Answer:
     def total(s: Scene) -> jnp.ndarray:
         return jnp.sum(natural_frequencies(s) ** 2)
 
-    slopes = eqx.filter_grad(total)(scene).machine
+    slopes = platforms(eqx.filter_grad(total)(scene))
     found = natural_frequencies(scene)
     return Answer(jnp.concatenate([found / 100.0, slopes.stiffness, slopes.link_stiffness]))
 
@@ -100,7 +100,7 @@ def _frequencies_again(scene: Scene) -> Reference:
     mass = np.diag(p.whole_mass)
     root = np.sqrt(mass)
     found = np.sqrt(np.linalg.eigvalsh(p.stiffness / root[:, None] / root))
-    links = [sum(1.0 / mass[end - 1] for end in pair) for pair in scene.machine.links]  # pyright: ignore
+    links = [sum(1.0 / mass[end - 1] for end in pair) for pair in platforms(scene).links]
     return Reference(np.concatenate([found / 100.0, 1.0 / mass, np.array(links)]))
 
 

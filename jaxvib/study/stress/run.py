@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
+import jax.numpy as jnp
 
 import jaxvib.study.stress
 from jaxvib.errors import ComputationError, InputError
@@ -55,7 +55,7 @@ def stress(only: Sequence[str] = (), *, precisions: Sequence[Precision] = PRECIS
     for precision in precisions:
         if precision not in PRECISIONS:
             raise InputError("precisions", f"is {precision!r}; it must be 'float64' or 'float32'")
-    own = PRECISIONS[0] if jax.config.jax_enable_x64 else PRECISIONS[1]  # pyright: ignore[reportAttributeAccessIssue]
+    own = PRECISIONS[0] if _is_double() else PRECISIONS[1]
     tell = report or (lambda row: None)
     others = {precision: _child(precision, cases) for precision in precisions if precision != own}
     rows: list[StressRow] = []
@@ -85,10 +85,13 @@ def _names() -> str:
     return "; ".join(case.name for case in CATALOGUE)
 
 
+def _is_double() -> bool:
+    return jnp.result_type(float).itemsize == 8
+
+
 def outcome(case: Case) -> StressRow:
     """How a case ends in the precision that JAX computes in."""
-    double = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
-    dtype: Precision = "float64" if double else "float32"
+    dtype: Precision = "float64" if _is_double() else "float32"
     scene, begun = case.scene(), time.perf_counter()
     answer: Answer | Exception
     try:

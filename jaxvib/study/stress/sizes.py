@@ -25,7 +25,7 @@ from jaxvib.study.stress.asked import (
 )
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import run_out
-from jaxvib.study.stress.plain import light_modes, light_speed, plain
+from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = ["CASES", "begun"]
 
@@ -51,7 +51,8 @@ def _orbit(scene: Scene) -> Answer:
     """Load speed, and amplitudes in natural units, of the exact jam 3."""
     orbit = jam_orbit(scene, mode=3, throw=False)
     name = status_name(orbit.status)
-    unit = float(scene.loads.unbalance()) / float(scene.machine.mass[1])  # pyright: ignore[reportAttributeAccessIssue]
+    p = plain(scene)
+    unit = np.sum(p.m * p.radius) / float(platforms(scene).mass[1])
     values = np.concatenate([[orbit.omega], orbit.amplitude / unit])
     return Answer(values, None, "" if name == "found" else name)  # its error is that of harmonics, rounding is not in it
 
@@ -61,6 +62,7 @@ def _light_again(scene: Scene) -> Reference:
     p, speed = plain(scene), float(scene.drive.speed)
     omega = light_modes(p, speed)[0]
     _, moved, _ = light_speed(p, omega)
+    p = plain(scene)
     unit = np.sum(p.m * p.radius) / p.mass[1, 1]
     return Reference(np.concatenate([[omega], np.abs(moved) / unit]), unknown=1e-7)
 
@@ -117,7 +119,7 @@ def _sized_run(time: float) -> tuple[Callable[[Scene], Answer], Callable[[Scene]
 
 
 def _undragged() -> Scene:
-    return eqx.tree_at(lambda s: s.loads.drag, published(eps=0.05), jnp.zeros(()))  # pyright: ignore
+    return eqx.tree_at(lambda s: s.loads.drag, published(eps=0.05), jnp.zeros(()))
 
 
 def _no_drag(scene: Scene) -> Answer:
