@@ -36,6 +36,9 @@ _SMALL = 1e-3
 _SAFETY = 3.0
 """Differences within so many times what finite differences may be off say nothing."""
 
+_LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
+"""Changes are as large as the largest one above this share of it; below this share of the quantity itself they are rounding."""
+
 
 class GradientStatus(eqx.Enumeration):
     """What came of a check; the members are the sentences a user reads."""
@@ -44,6 +47,7 @@ class GradientStatus(eqx.Enumeration):
     differ = "derivatives differ from finite differences by more than was asked for and these may be off"
     noisy = "no derivative differs, but finite differences are too noisy to tell to the tolerance that was asked for"
     not_finite = "a derivative, or the quantity beside the point, is not a finite number"
+    chaotic = "the quantity changes as much however little a number does: nearby motions part, and no derivative means anything"
 
 
 class ImplicitRoute(NamedTuple):
@@ -100,7 +104,7 @@ class GradientCheck(Result):
 
     def require(self) -> GradientCheck:
         """Itself where every derivative agrees. **Raises** `ComputationError` with the summary elsewhere: `differ`, `noisy`,
-        `not_finite`."""
+        `not_finite`, `chaotic`."""
         if not bool(self.status == GradientStatus.agree):
             raise ComputationError(self.status_name, self.summary())
         return self
@@ -135,7 +139,9 @@ def check_gradients(
     are extrapolated once, E. Best is the step where E agrees best with those at the next larger and the next smaller one; the
     larger of both differences is what E may be off, the noise: truncation at large steps, rounding (eps |q|/h at least) and
     the quantity's own tolerance at small ones. A derivative differs where it is away from E by more than `tolerance` and three
-    times the noise.
+    times the noise. Where steps of 1e-5 to 1e-7 change the quantity about as much as the largest does, and a derivative claims
+    that the smallest step alone would change it as much, disturbances have grown by more than 1e5 on the way: the status is
+    `chaotic`, whatever the routes agree on. `growth` tells after which time a run comes to that.
 
     **Arguments**
 
@@ -186,8 +192,9 @@ def check_gradients(
     difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolated(row, float(value)) for row in sweep), strict=True))
     scale, routed = _scale(difference), np.stack(list(gradient.values()))
     away = np.abs(routed - difference)
+    parts = any(_parts(row, slopes, float(value)) for row, slopes in zip(sweep, routed.T, strict=True))
     return GradientCheck(
-        status=member(GradientStatus, _judged(away, noise, scale, tolerance)),
+        status=member(GradientStatus, "chaotic" if parts else _judged(away, noise, scale, tolerance)),
         value=float(value),
         numbers=tuple(each.name for each in numbers),
         at=at,
@@ -267,6 +274,17 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
         return math.nan, math.nan, math.nan
     k = int(np.nanargmin(noise))
     return float(inner[k]), float(noise[k]), _STEPS[k + 1]
+
+
+def _parts(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
+    """Whether the quantity changes as much at small steps as at large ones, and derivatives (r,) say that it would.
+
+    Noise of a quantity changes it at small steps too, and leaves its derivatives alone; a wrong derivative leaves the quantity.
+    """
+    changed = 2.0 * np.abs(central) * np.asarray(_STEPS)
+    most, small = float(np.max(changed)), float(np.median(changed[-5:]))
+    claimed = np.abs(slopes) * 2.0 * _STEPS[-1]
+    return small > max(_LARGE * most, _TINY * abs(value)) and bool(np.any(claimed > _LARGE * most))
 
 
 def _scale(difference: np.ndarray) -> np.ndarray:

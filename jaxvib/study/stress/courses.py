@@ -20,6 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.growth import growth
 from jaxvib.motion.simulate import simulate
 from jaxvib.results.status import status_name
+from jaxvib.study.accuracy.gradient_check import check_gradients
 from jaxvib.study.stress.asked import away, final_state, published, state_of
 from jaxvib.study.stress.bends import stop_law
 from jaxvib.study.stress.case import Answer, Case, Reference
@@ -190,6 +191,19 @@ def _exponent_again(scene: Scene) -> Reference:
     return Reference([np.mean(late)], unknown=float(4.0 * np.std(late) / np.sqrt(late.size) / np.mean(late)))
 
 
+def _meaningless(scene: Scene) -> Answer:
+    """The derivative of where Ueda's oscillator is after 100 turns by the logarithm of its damping, and what a check says."""
+    start = state_of(scene, np.array([2.5, 0.0, 0.0, 1.0]))
+
+    def last(now: Scene) -> jax.Array:
+        asked = dict(start=start, save="window", max_steps=2**15, estimate=False, throw=False)
+        run = simulate(now, 200.0 * np.pi, adjoint=diffrax.ForwardMode(), **asked)  # pyright: ignore[reportArgumentType]
+        return run.window.state.displacement[-1, 0]
+
+    found = check_gradients(scene, last, free=("machine.damping",), routes=("forward",))
+    return Answer(found.gradient[0], None, "" if found.status_name == "agree" else found.status_name)
+
+
 CASES = (
     Case(
         "1e5 turns",
@@ -270,5 +284,16 @@ CASES = (
         answer=_exponent,
         reference=_exponent_again,
         within=(0.4, 0.4),  # both are means over some hundred turns
+    ),
+    Case(
+        "chaos, gradient of a run",
+        hard="forward mode gives 17 digits of a number that says nothing of any change larger than rounding",
+        quantity="derivative of the displacement after 100 turns by the damping, checked",
+        against="nothing: there is no right answer but a name",
+        scene=_ueda,
+        answer=_meaningless,
+        reference=lambda scene: Reference([0.0]),
+        within=(0.0, 0.0),
+        named=(("chaotic",), ("refused",)),
     ),
 )

@@ -134,3 +134,23 @@ def test_a_jam_has_the_derivatives_that_its_equation_says():
 def test_what_cannot_be_checked_is_refused(asked, says):
     with pytest.raises(jv.InputError, match=says):
         jv.check_gradients(SCENE, **asked)
+
+
+def test_a_quantity_of_chaos_is_named_and_one_with_noise_is_not():
+    """x -> 4 x (1 - x), whose exponent is ln 2: 60 times make 1e18 of a change; 5 times make 30, and derivatives are right."""
+
+    def of_orbit(many):
+        def quantity(scene):
+            x = 0.3 + 1e-6 * scene.machine.stiffness[0]
+            return jax.lax.fori_loop(0, many, lambda _, y: 4.0 * y * (1.0 - y), x)
+
+        return quantity
+
+    asked = dict(free=("machine.stiffness",), routes=("forward",))
+    found = jv.check_gradients(SCENE, of_orbit(60), **asked)
+    assert found.status_name == "chaotic" and np.abs(found.gradient[0, 0]) > 1e7
+    with pytest.raises(jv.ComputationError, match="no derivative means anything"):
+        found.require()
+    assert jv.check_gradients(SCENE, of_orbit(5), **asked).status_name == "agree"
+    noisy = jv.check_gradients(SCENE, lambda s: closed(s) * (1.0 + 1e-2 * jnp.sin(jax.lax.stop_gradient(closed(s)))), **asked)
+    assert noisy.status_name != "chaotic"
