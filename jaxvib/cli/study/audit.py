@@ -112,8 +112,5 @@ def _seconds(value: float) -> str:
 
 def _prices_table(rows: list[PriceRow]) -> str:
     cells = [[f"{row.part}: {row.kind}", f"{row.operations}", f"{row.added:+d}", row.beside] for row in rows]
-    return table(
-        "operations of the traced equations of motion; one on a vector counts once, however long it is",
-        ["part", "operations", "adds", "beside"],
-        cells,
-    )
+    title = "operations of the traced equations of motion; one on a vector counts once, however long it is"
+    return table(title, ["part", "operations", "adds", "beside"], cells)
