@@ -89,15 +89,18 @@ WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
-    """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right."""
+    """Rows of text under a title and column heads, drawn with lines; the first column to the left, numbers to the right.
+
+    Columns without a word in them are left out."""
     from rich.console import Console  # slow to import, and --json needs none of it
     from rich.table import Table
 
     drawn = Table(title=title, title_justify="left")
-    for k, name in enumerate(columns):
-        drawn.add_column(name, justify="left" if k == 0 else "right")
+    told = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
+    for k in told:
+        drawn.add_column(columns[k], justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:
-        drawn.add_row(*row)
+        drawn.add_row(*(row[k] for k in told))
     console = Console(width=118)
     with console.capture() as capture:
         console.print(drawn)

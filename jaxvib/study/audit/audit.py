@@ -160,6 +160,7 @@ def audit(
     elif not own.uncertainty <= 0.5 * accuracy:
         status = "unsettled"
     seconds, compiling = ask.times(scene)
+    effects = [effect_row(ask, scene, variant, float(accuracy)) for variant in variants]
     return Audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),
@@ -172,11 +173,19 @@ def audit(
         operations=field_operations(scene),
         seconds=seconds,
         compile=compiling,
-        effects=[effect_row(ask, scene, variant, float(accuracy)) for variant in variants],
+        effects=effects,
         tiers=tier_rows(scene, question, own, repeats) if tiers else [],
-        numbers=dimensionless_numbers(scene, own, accuracy),
+        numbers=[_as_computed(row, effects) for row in dimensionless_numbers(scene, own, accuracy)],
         coordinates=scene.machine.structure().coordinates,
     )
+
+
+def _as_computed(row: NumberRow, effects: Sequence[EffectRow]) -> NumberRow:
+    """A number's row; where what its effect changes was computed, that decides, and the number says how it comes about."""
+    for effect in effects:
+        if effect.effect == row.name.partition(":")[0] and effect.advice != "cannot tell":
+            return row._replace(advice=effect.advice, says=f"{row.says}; advised is what computing the effect came to")
+    return row
 
 
 def _question(

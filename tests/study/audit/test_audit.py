@@ -13,8 +13,9 @@ from plugin_effect import SealFriction
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.machine.files import DRIVES, EFFECTS
-from jaxvib.study.audit.compared import Asked, effect_row
-from jaxvib.study.audit.numbers import dimensionless_numbers, gravity_share
+from jaxvib.study.audit.audit import _as_computed
+from jaxvib.study.audit.compared import Asked, EffectRow, effect_row
+from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
 from jaxvib.study.audit.prices import prices
 from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
 from jaxvib.study.audit.variants import Variant, possible_variants, present_variants
@@ -171,6 +172,16 @@ def test_what_a_scene_could_have_is_put_in_with_usual_numbers():
     put_in = {variant.name: variant for variant in possible_variants(ROTOR, (1e-3, 1e-3, 1e-3, 1e-3), None)}
     assert set(put_in) == {"gravity", "moment_imbalance", "dry_friction", "cubic_support"}
     assert not list(possible_variants(SCENE, (2e-3,), (jv.Gravity(),)))  # it is there
+
+
+def test_a_number_advises_what_computing_its_effect_came_to():
+    row = NumberRow("gravity: g/(R Omega^2)", 0.02, 0.01, "perhaps needed", "its share")
+
+    def effect(advice, kind="gravity"):
+        return EffectRow(kind, False, "exact orbit", *[math.nan] * 5, 0, math.nan, math.nan, advice, "")
+
+    assert _as_computed(row, [effect("negligible")]).advice == "negligible"
+    assert _as_computed(row, [effect("cannot tell"), effect("negligible", "stop")]) == row
 
 
 class Answers:
