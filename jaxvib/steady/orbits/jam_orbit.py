@@ -231,7 +231,8 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     close = []
     for k in near:
         around = np.clip([k - _PARTS, k + _PARTS], 0, omega.size - 1)
-        if _ends_before(scene, *map(float, omega[around]), target):
+        low, high = (float(w) for w in omega[around])
+        if _ends_before(scene, low, high, target):
             crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
         else:
             close.append(k)
@@ -258,7 +259,8 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
         return False
     ends = slice(turns[0], turns[0] + 2)
     if looks > 1:
-        return _ends_before(scene, *map(float, omega[ends]), target, looks - 1)
+        low, high = (float(w) for w in omega[ends])
+        return _ends_before(scene, low, high, target, looks - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     fold = _between(omega[ends], speed[ends], slope[ends])[1]
     return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
