@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
-__all__ = ["CircularLoads", "Loads", "Pressing", "balls", "pendulums", "require_side_by_side", "rollers"]
+__all__ = ["CircularLoads", "Loads", "Pressing", "Twisting", "balls", "pendulums", "require_side_by_side", "rollers"]
 
 
 class Pressing(NamedTuple):
@@ -29,6 +29,19 @@ class Pressing(NamedTuple):
     def at(self, a: Mapping[int, Array]) -> Array:
         """N (count,) where the loads' carriers have the acceleration `a`, by axis."""
         return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
+
+
+class Twisting(NamedTuple):
+    """What a spin s of each load about the normal of its contact, relative to its track, does and what changes it.
+
+    s' = `rate` (count,) rad/s^2 while nothing holds it; generalised forces s `force`, a (count,) array for each coordinate;
+    energy `inertia` s^2/2, kg m^2; s = `still` (count,) rad/s of a load that does not turn in space.
+    """
+
+    rate: Array
+    force: tuple[Array, ...]
+    inertia: Array
+    still: Array
 
 
 class Loads(eqx.Module):
@@ -73,6 +86,13 @@ class Loads(eqx.Module):
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
         """Generalised force of a rolling load's own rotation besides kappa, N m; it does no work. None where there is none."""
+        return None
+
+    def twisting(
+        self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
+    ) -> Twisting | None:
+        """What a spin about the normal of the contact does, see `Twisting`; None for loads that nothing couples to it. `slip`
+        of the contact along each coordinate, m/s, where it may slide."""
         return None
 
     def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing | None:
