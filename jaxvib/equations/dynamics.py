@@ -178,14 +178,14 @@ class Dynamics(eqx.Module):
         if self._slip_limit is None:
             return None
         if state.spin is None or state.spin.slip is None:
-            raise InputError("state.spin", "has no slip, which an effect of this scene makes free; see with_spin(scene, state)")
+            raise InputError("state.spin", "has no slip, which an effect of the scene makes free; see with_spin(scene, state)")
         return state.spin.slip
 
     def _twisting(self, state: State, speed: Array) -> Twisting | None:
         if not any(effect.frees_twist for effect in self.effects):
             return None
         if state.spin is None or state.spin.twist is None:
-            raise InputError("state.spin", "has no twist, which an effect of this scene makes free; see with_spin(scene, state)")
+            raise InputError("state.spin", "has no twist, which an effect of the scene makes free; see with_spin(scene, state)")
         return self.loads.twisting(state.angle, state.rate, speed, state.spin.slip)
 
     def _unforced(self, state: State, speed: Array) -> Array:

@@ -46,9 +46,9 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
         + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + J_j s_j^2/2 ]
 
-    d what is out of balance in the rotor, J_r the inertia of a motor's rotor (an ideal drive has none); c a load's slip and s its
-    spin on its track, where effects free them. The time `t`, s, says
-    where an ideal drive has its rotor; it matters to an imbalance alone.
+    d what is out of balance in the rotor, J_r the inertia of a motor's rotor (an ideal drive has none); c a load's slip and s
+    its spin on its track, where effects free them. The time `t`, s, says where an ideal drive has its rotor; it matters to an
+    imbalance alone.
     """
     carrier, loads = scene.machine.carrier(), scene.loads
     q, v = state.displacement, state.velocity
@@ -141,10 +141,10 @@ def _spin_power(
         found = kinematics(loads, u, rate)
         rates = tuple(c / size for c, size in zip(spin.slip, found.sizes, strict=True))
         contact = missing_force(loads, found, change.rate, at_load, field.centre_forces(state, speed), 1.0)
-        lost = -sum(jnp.sum(f * c) for f, c in zip(contact, spin.slip, strict=True))
+        lost = -jnp.sum(dot(contact, spin.slip))
         turning = loads.spin_force(u, rate, speed)
         if turning is not None:
-            supplied = supplied - sum(jnp.sum(f * w) for f, w in zip(turning, rates, strict=True))
+            supplied = supplied - jnp.sum(dot(turning, rates))
     return rates, (supplied, lost)
 
 

@@ -85,7 +85,7 @@ def slid(
     **Arguments**: `needed` along the track by that motion, N; `a` its acceleration of what carries the loads; the generalised
     force of what acts on a load that is `rolling`, and at its `centre` alone; `friction` of the rolling.
     """
-    kappa, m = loads.inertia_factor(), loads.mass
+    kappa = loads.inertia_factor()
     normal = pressing.at(a)
     hold = limit.coefficient * (jnp.maximum(normal, 0.0) if loads.one_sided else jnp.abs(normal))
     wanted = [f - hold * c / limit.width for f, c in zip(needed, slip, strict=True)]

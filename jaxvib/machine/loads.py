@@ -14,7 +14,17 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
-__all__ = ["CircularLoads", "Loads", "Pressing", "Twisting", "balls", "pendulums", "require_side_by_side", "rollers"]
+__all__ = [
+    "CircularLoads",
+    "Loads",
+    "Pressing",
+    "Twisting",
+    "balls",
+    "pendulums",
+    "require_side_by_side",
+    "rollers",
+    "side_by_side",
+]
 
 
 class Pressing(NamedTuple):
@@ -99,6 +109,11 @@ class Loads(eqx.Module):
         """How hard the loads press on their track under gravity `g` (by axis, m/s^2 upward); None where nothing says it."""
         return None
 
+    def offsets(self) -> Array:
+        """How far ahead of the middle each load is, (count,) rad, where loads at rest that cannot all be at one point lie side
+        by side."""
+        return jnp.zeros((self.count,), dtype=jnp.result_type(self.mass))
+
     def own_frequency(self, speed: Array) -> Array | None:
         """The frequency of the loads' own motions that a step must resolve beside the rotor's `speed`, rad/s; or None."""
         return None
@@ -169,8 +184,7 @@ class CircularLoads(Loads):
         """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
         if self.own_radius is None:
             return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
-        angle = jnp.arcsin(self.own_radius / self.radius)
-        return jnp.arange(1 - self.count, self.count, 2, dtype=angle.dtype) * angle
+        return side_by_side(self.count, self.own_radius / self.radius)
 
     def unbalance(self) -> Array:
         """The unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
@@ -216,6 +230,12 @@ def _fit(loads: CircularLoads, r: Array) -> None:
         raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
     if not traced(r) and not traced(loads.radius):
         require_side_by_side(loads.count, float(loads.radius), float(r))
+
+
+def side_by_side(count: int, ratio: Array) -> Array:
+    """(2 j - N + 1) arcsin(r/R), (count,) rad: angles about their middle of loads that touch, `ratio` r/R."""
+    angle = jnp.arcsin(ratio)
+    return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 
 
 def require_side_by_side(count: int, radius: float, own_radius: float) -> None:

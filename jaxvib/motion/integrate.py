@@ -21,7 +21,7 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -104,17 +104,25 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
 
 
+def added_rate(scene: Scene) -> Array:
+    """The fastest that effects add to the loads' motion, see `Effect.own_rate`; 0 where there is none."""
+    rates = (effect.own_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
+    found = [jnp.max(rate) for rate in rates if rate is not None]
+    return functools.reduce(jnp.maximum, found, jnp.zeros_like(scene.drive.speed))
+
+
 @cached
 def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count.
 
-    Among the greatest is the loads' own frequency, where they have one.
+    Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = natural_frequencies(scene), scene.drive.speed
     own = scene.loads.own_frequency(speed)
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
+    fastest = jnp.maximum(fastest, added_rate(scene))
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 

@@ -15,7 +15,6 @@ from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
-from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced
@@ -75,8 +74,7 @@ def initial_state(
     def phases(value: float | Array) -> Array:
         if angles is not None:
             return numbers(angles, "rad", "angles", n) + spread
-        touching = any(effect.couples_loads for effect in scene.effects)
-        if touching and isinstance(scene.loads, CircularLoads):
+        if any(effect.couples_loads for effect in scene.effects):
             return value + scene.loads.offsets() + spread
         return value + spread
 

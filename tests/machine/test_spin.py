@@ -113,7 +113,7 @@ def test_a_contact_that_holds_rolls_exactly_and_one_that_does_not_is_let_go():
 
 @pytest.mark.parametrize("effects", [BOTH, BOTH[:1], BOTH[1:], (jv.FreeSpin(), jv.Sliding(0.1, 1e3))])
 def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
-    """On a rotor that gives way, with friction of all kinds: sliding, and in the last case sticking with a slip that dies out."""
+    """On a rotor that gives way, with friction of all kinds: sliding, and in the last case sticking while a slip dies out."""
     s = scene((*published(1e-4), *effects), drag=0.2)
 
     @jax.jit
@@ -185,6 +185,7 @@ def test_they_go_through_files_named_starts_and_ensembles():
 
 
 PLANE = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1, own_radius=0.01)
+POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +198,9 @@ PLANE = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1, own_radius=0.01)
             "effects.free_spin goes with balls in a torus; nothing couples 'ball'",
         ),
         (
-            lambda: jv.Scene(HEAVY, jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1), jv.ConstantSpeed(1.0), (jv.Sliding(0.1),)),
+            lambda: jv.Scene(
+                HEAVY, jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1), jv.ConstantSpeed(1.0), (jv.Sliding(0.1),)
+            ),
             "effects.sliding needs loads that roll, with an own_radius",
         ),
         (

@@ -160,6 +160,11 @@ class Effect(eqx.Module):
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
 
+    def own_rate(self, loads: Loads, speed: Array) -> Array | None:
+        """How fast what it adds to the loads' motion goes, rad/s or 1/s, for steps to resolve, at the rotor's `speed`, rad/s;
+        None where it adds nothing faster than the loads have by themselves."""
+        return None
+
     def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
         """**Raises** `InputError` where loads cannot start from the coordinates `u`, (..., count) each and known."""
 

@@ -76,9 +76,9 @@ class Sliding(Effect):
 
         F_t = (what rolling needs) - mu N c/width
 
-    that the limit allows, so that the rest of a slip dies out as exp(- kappa/(kappa-1) mu N t/(m width)); steps must resolve it,
-    about kappa/(kappa-1) mu R w^2/width of them a second. `RollingFriction` goes on against the motion of the centre while a
-    load slides.
+    that the limit allows, so that the rest of a slip dies out as exp(- kappa/(kappa-1) mu N t/(m width)); steps must resolve
+    it, about kappa/(kappa-1) mu R w^2/width of them a second. `RollingFriction` goes on against the motion of the centre while
+    a load slides.
 
     **Arguments**: `coefficient` mu (about 0.1 for oiled steel on steel), above 0; `width` m/s.
 
@@ -102,6 +102,12 @@ class Sliding(Effect):
         self.coefficient = number(coefficient, "", "effects.sliding.coefficient", low=0.0, open_low=True)
         self.width = number(width, "m/s", "effects.sliding.width", low=0.0, open_low=True)
         self.kind = "sliding"
+
+    def own_rate(self, loads: Loads, speed: Array) -> Array:
+        """kappa/(kappa - 1) mu R w^2 / width: at which a slip dies out."""
+        across, up, *_ = loads.position(*loads.rest())
+        kappa = loads.inertia_factor()
+        return kappa / (kappa - 1.0) * self.coefficient * jnp.hypot(across[0], up[0]) * speed**2 / self.width
 
     @property
     def slip_limit(self) -> SlipLimit:

@@ -14,14 +14,16 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.contact import LoadContact
+from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.study.capture.capture import CAUGHT, PER_RADIAN, thrown_state
+from jaxvib.study.capture.capture import CAUGHT, steps_per_second, thrown_state
 from jaxvib.study.capture.published_torus import (
     TABLES,
     PublishedRow,
@@ -40,8 +42,7 @@ __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
 """Of balls that touch: the paper leaves contact open. A contact lasts 3 ms, 0.07 turns."""
 
-_PER_CONTACT = 2.0
-"""Steps for each radian of what a contact swings with."""
+SPIN = FreeSpin()
 
 _COARSE, _ROUNDS, _LANES = 19, 2, 64
 
@@ -71,21 +72,27 @@ def _touching(run: _Runs) -> tuple[Scene, State]:
     return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, CONTACT)), state
 
 
+def _spinning(run: _Runs) -> tuple[Scene, State]:
+    scene, state = _alone(run)
+    return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, SPIN)), state
+
+
 class _Model(NamedTuple):
     make: Callable[[_Runs], tuple[Scene, State]]
     equations: Equations
-    contact: bool
+    effects: tuple[Effect, ...] = ()
 
 
 MODELS = {
-    "derived": _Model(_alone, vector_field, False),
-    "printed": _Model(_alone, printed_torus, False),
-    "cosine": _Model(_alone, cosine_torus, False),
-    "letter": _Model(_alone, letter_torus, False),
-    "contact": _Model(_touching, vector_field, True),
+    "derived": _Model(_alone, vector_field),
+    "printed": _Model(_alone, printed_torus),
+    "cosine": _Model(_alone, cosine_torus),
+    "letter": _Model(_alone, letter_torus),
+    "spinning": _Model(_spinning, vector_field, (SPIN,)),
+    "contact": _Model(_touching, vector_field, (CONTACT,)),
 }
 """By name: this package's equations, the paper's (`PrintedTorus`), those with the unbalance put right, to the letter, this
-package's with `CONTACT`."""
+package's with `FreeSpin`, and with `CONTACT`."""
 
 
 class TorusTables(Result):
@@ -307,10 +314,4 @@ def _outcomes(model: _Model, runs: _Runs, turns: int) -> np.ndarray:
 
 def _steps_per_second(model: _Model, gap: float) -> float:
     scene = published_scene(gap, 0.1, 0.01, 0.0)
-    own = scene.loads.own_frequency(scene.drive.speed)
-    assert own is not None
-    if not model.contact:
-        return PER_RADIAN * float(own)
-    # Two balls side by side, rolling counted in.
-    swing = math.sqrt(2.0 * float(CONTACT.stiffness) / (float(scene.loads.inertia_factor()) * float(scene.loads.mass)))
-    return max(PER_RADIAN * float(own), _PER_CONTACT * swing)
+    return steps_per_second(Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, *model.effects)))
