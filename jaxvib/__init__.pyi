@@ -89,6 +89,7 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 
 # Capture in a torus
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
+from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Results
 from jaxvib.results.files import load
@@ -236,6 +237,8 @@ __all__ = [
     "capture",
     "Capture",
     "CaptureStatus",
+    "threshold_curve",
+    "ThresholdCurve",
     # Results
     "Result",
     "load",

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["tables_chart", "threshold_chart", "torus_paths"]
+__all__ = ["curve_chart", "tables_chart", "threshold_chart", "torus_paths"]
 
 
 def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float) -> Figure:
@@ -30,6 +30,31 @@ def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, 
     axis.set_xlabel("initial speed relative to the rotor, in the rotor's speed")
     axis.set_ylabel("share of starts captured")
     axis.set_ylim(-0.05, 1.05)
+    return figure
+
+
+def curve_chart(value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray) -> Figure:
+    """Thresholds of capture over a number, with their uncertainty, and the least captured speeds.
+
+    >>> import numpy as np
+    >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)
+    1
+    """
+    figure, (axis,) = panels(1, size=(7.0, 3.4))
+    axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="every start captured")
+    axis.errorbar(value, threshold, uncertainty, marker="o", ms=4.0, capsize=3.0, color=COLORS[0], label="threshold")
+    apart = np.where(least < threshold - uncertainty, least, np.nan)
+    if np.any(np.isfinite(apart)):
+        axis.plot(value, apart, "v", color=COLORS[1], label="least captured speed")
+    missing = np.isnan(threshold)
+    if np.any(missing):
+        axis.plot(
+            value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not every start captured"
+        )
+    axis.set_xlabel("value")
+    axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
+    axis.set_ylim(-1.03, 0.0)
+    axis.legend()
     return figure
 
 

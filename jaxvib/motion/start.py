@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -19,10 +19,13 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced
 
-__all__ = ["Start", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
+__all__ = ["Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
+
+Turning = Literal["rolling", "still"]
+"""How loads turn by themselves at the start: they roll on their track, or not at all in space."""
 
 
 def initial_state(
@@ -105,7 +108,7 @@ def initial_state(
     return with_spin(scene, State(displacement.real, -jam.omega * displacement.imag, (angle,), rate))
 
 
-def with_spin(scene: Scene, state: State, turning: Literal["rolling", "still"] = "rolling") -> State:
+def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:
     """The state with the loads' own rotation, as far as effects of the scene make it free; one that has it stays as it is.
 
     **Arguments**: `turning` "rolling", for loads that roll on their track and do not spin on it, or "still", for loads that do
@@ -123,7 +126,7 @@ def with_spin(scene: Scene, state: State, turning: Literal["rolling", "still"] =
     >>> round(float(jv.with_spin(scene, rest, "still").spin.slip[0][0]), 6)        # - w (R + r)
     -21.0
     """
-    if turning not in ("rolling", "still"):
+    if turning not in get_args(Turning):
         raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
     twists = any(effect.frees_twist for effect in scene.effects)
     slips = any(effect.slip_limit is not None for effect in scene.effects)

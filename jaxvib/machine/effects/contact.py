@@ -99,7 +99,7 @@ class LoadContact(Effect):
         if np.min(apart) < _NEAREST:
             run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
             size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
-            problem = f"puts loads {i + 1} and {j + 1} inside each other, {apart[run, i, j] * size:.4g} m apart"
+            problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
     def own_rate(self, loads: Loads, speed: Array) -> Array:

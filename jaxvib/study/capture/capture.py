@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.integrate import added_rate
 from jaxvib.motion.run import Run
-from jaxvib.motion.start import with_spin
+from jaxvib.motion.start import Turning, with_spin
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -152,7 +152,7 @@ def capture(
     spread: Number = 1e-3,
     seed: int = 0,
     resolution: float | None = None,
-    turning: Literal["rolling", "still"] = "rolling",
+    turning: Turning = "rolling",
     stepsize_controller: EqualSteps | None = None,
     equations: Equations = vector_field,
 ) -> Capture:
@@ -193,7 +193,7 @@ def capture(
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {resolution!r}; it must be between 0 and 1, such as 1e-3")
-    if turning not in ("rolling", "still"):
+    if turning not in get_args(Turning):
         raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
     if turning == "still" and not any(effect.slip_limit is not None for effect in scene.effects):
         problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (property slip_limit)"
