@@ -116,7 +116,9 @@ class LoadContact(Effect):
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
         """k (2 r - s)^2 / 2 of the pairs that overlap, an entry a load."""
-        parts = [0.5 * self.stiffness * share * jnp.maximum(-gap, 0.0) ** 2 for share, gap in _clearances(loads, u)]
+        parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
+        if parts[-1].shape != (loads.count,):  # opposite loads make half as many pairs
+            parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
 
     def load_resistance(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -124,15 +126,14 @@ class LoadContact(Effect):
         damping = self._damping(loads)
 
         def gaps(*v: Array) -> tuple[Array, ...]:
-            return tuple(gap for _, gap in _clearances(loads, v))
+            return tuple(_clearances(loads, v))
 
         clearances, back = jax.vjp(gaps, *u)
         _, partings = jax.jvp(gaps, u, rate)
-        shares = [share for share, _ in _clearances(loads, u)]
         return back(
             tuple(
-                share * jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
-                for share, gap, parting in zip(shares, clearances, partings, strict=True)
+                jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
+                for gap, parting in zip(clearances, partings, strict=True)
             )
         )
 
@@ -184,19 +185,20 @@ def _loss(ratio: Array) -> Array:
     return jnp.where(middle, series, jnp.where(near < 0.0, below, above))
 
 
-def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[tuple[float, Array]]:
-    """Distances (count,) surface to surface between each load and the one so many further, negative where they overlap, for
-    every such number; and the share of each entry: 1/2 where every pair is there twice."""
+def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
+    """Distances surface to surface, negative where they overlap, between each load and the one so many further, for every such
+    number: every pair once."""
     own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(loads, CircularLoads):
         (phi,) = u
         ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
-        return [(1.0, 2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own)]
+        return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own]
     n, place = loads.count, loads.position(*u)
     found = []
     for k in range(1, n // 2 + 1):
-        square = sum((jnp.concatenate([x[k:], x[:k]]) - x) ** 2 for x in place)
+        pairs = n // 2 if 2 * k == n else n
+        square = sum((jnp.concatenate([x[k:], x[:k]])[:pairs] - x[:pairs]) ** 2 for x in place)
         same = square == 0.0
         distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
-        found.append((0.5 if 2 * k == n else 1.0, distance - 2.0 * own))
-    return found or [(1.0, jnp.ones_like(u[0]))]
+        found.append(distance - 2.0 * own)
+    return found or [jnp.ones_like(u[0])]
