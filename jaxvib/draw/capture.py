@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, panels
@@ -33,14 +34,16 @@ def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, 
     return figure
 
 
-def curve_chart(value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray) -> Figure:
+def curve_chart(
+    value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
+) -> Figure:
     """Thresholds of capture over a number, with their uncertainty, and the least captured speeds.
 
     >>> import numpy as np
     >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)
     1
     """
-    figure, (axis,) = panels(1, size=(7.0, 3.4))
+    figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
     axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="every start captured")
     axis.errorbar(value, threshold, uncertainty, marker="o", ms=4.0, capsize=3.0, color=COLORS[0], label="threshold")
     apart = np.where(least < threshold - uncertainty, least, np.nan)

@@ -21,6 +21,7 @@ from jaxvib.study.capture.capture import Capture, Turning, capture
 from jaxvib.units import Number
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["ThresholdCurve", "threshold_curve"]
@@ -52,11 +53,14 @@ class ThresholdCurve(Result):
             lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; the least {least:.4f}"))
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Thresholds with their uncertainty over the values, and the least captured speeds. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Thresholds with their uncertainty over the values, and the least captured speeds.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
         from jaxvib.draw.capture import curve_chart  # slow to import: only who draws pays
 
-        return curve_chart(self.value, self.threshold, self.uncertainty, self.least)
+        return curve_chart(self.value, self.threshold, self.uncertainty, self.least, ax=ax)
 
 
 def threshold_curve(
