@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from jaxvib.draw.style import COLORS, panels
 
@@ -72,22 +73,35 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     2
     """
     figure, (paths, speeds) = panels(2, size=(7.0, 3.4))
+    late = max(1, round(0.9 * time.size))
     for j in range(around.shape[1]):
         colour = COLORS[j % len(COLORS)]
-        wrapped = np.mod(around[:, j] + np.pi, 2.0 * np.pi) - np.pi
+        x, y = _within(around[:, j], -np.pi), _within(across[:, j], -0.5 * np.pi)
         # No line across the picture where a ball leaves it on one side and comes back on the other.
-        broken = np.where(np.abs(np.diff(wrapped, prepend=wrapped[:1])) > np.pi, np.nan, wrapped)
-        paths.plot(np.degrees(broken), np.degrees(across[:, j]), color=colour, lw=0.6, label=f"ball {j + 1}")
-        paths.plot(np.degrees(wrapped[-1:]), np.degrees(across[-1:, j]), "o", color=colour)
+        leaps = (np.abs(np.diff(x, prepend=x[:1])) > np.pi) | (np.abs(np.diff(y, prepend=y[:1])) > np.pi)
+        broken = np.degrees(np.where(leaps, np.nan, x))
+        paths.plot(broken, np.degrees(y), color=colour, lw=0.6, alpha=0.3)
+        paths.plot(broken[late:], np.degrees(y[late:]), color=colour, lw=1.2, label=f"ball {j + 1}, the last tenth")
+        paths.plot(np.degrees(x[:1]), np.degrees(y[:1]), "o", mfc="white", color=colour, label=None if j else "start")
+        paths.plot(np.degrees(x[-1:]), np.degrees(y[-1:]), "o", color=colour, label=None if j else "end")
         speeds.plot(time, rate[:, j], color=colour, lw=0.8)
-    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8)
+    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8, label="outer equator")
     paths.set_xlim(-180.0, 180.0)
+    paths.set_xticks(np.arange(-180, 181, 90))
+    paths.yaxis.set_major_locator(MultipleLocator(45.0))
     paths.set_xlabel("around the axis, relative to the rotor, degrees")
     paths.set_ylabel("in the tube, degrees")
-    paths.legend()
+    paths.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    speeds.axhline(0.0, color=COLORS[5], ls="--", lw=0.8)
     speeds.set_xlabel("time, s")
-    speeds.set_ylabel("speed relative to the rotor")
+    speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
+    figure.tight_layout()
     return figure
+
+
+def _within(angle: np.ndarray, least: float) -> np.ndarray:
+    """The angle in the turn that begins at `least`, rad."""
+    return np.mod(angle - least, 2.0 * np.pi) + least
 
 
 def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]]) -> Figure:

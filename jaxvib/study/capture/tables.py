@@ -207,8 +207,10 @@ def published_tables(
     gaps with the lesser friction and the greater damping, are not captured from the paper's speeds in 6000 turns either.
     "cosine", tried for two rows, moves no border by more than 0.002 but for chaotic ones. By "derived" captures from speeds
     below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: what does
-    it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w). "contact" moves the thresholds of
-    "derived" by -0.07 to 0.07, a quarter of them by more than 0.03, mostly up.
+    it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w). "spinning", tried for eight points
+    of all gaps, is captured from rest at seven and from -0.967 at the other: a free spin that begins at the bottom takes the
+    balls up by as much as 0.35 of the rotor's speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of
+    them by more than 0.03, mostly up.
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
