@@ -203,18 +203,18 @@ def published_tables(
     >>> found.paper.tolist(), found.threshold.shape
     ([-0.868], (1, 1))
 
-    By "printed" 45 of the 47 points come out within 0.1 of the paper, half of them within 0.04; the other two, of the smallest
-    gaps with the lesser friction and the greater damping, are not captured from the paper's speeds in 6000 turns either. The mass
-    that the paper does not print does not explain them: with 6.6 to 7.4 kg two of 120 starts from -0.95 to -0.4 were captured
-    in 2000 turns, at speeds that do not follow one another. Nor does it explain the gap of 5.1 at p = 0.010, where with 6.8 to
-    7.4 kg all of 12 speeds from -0.95 on are captured (the paper has -0.868); with 6.6 kg one at -0.84 fails, so that the
-    paper's number may be the upper end of a narrow band of failures. At p = 0.005 the same gap has such bands with every mass.
-    "cosine", tried for two rows, moves no border by more than 0.002 but for chaotic ones. By "derived" captures from speeds
-    below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: what does
-    it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w). "spinning", tried for eight points
-    of all gaps, is captured from rest at seven and from -0.967 at the other: a free spin that begins at the bottom takes the
-    balls up by as much as 0.35 of the rotor's speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of
-    them by more than 0.03, mostly up.
+    By "printed" 45 of the 47 points come out within 0.1 of the paper, half of them within 0.04; the other two, of the
+    smallest gaps with the lesser friction and the greater damping, are not captured from the paper's speeds in 6000 turns
+    either. The mass that the paper does not print does not explain them: with 6.6 to 7.4 kg two of 120 starts from -0.95 to
+    -0.4 were captured in 2000 turns, at speeds that do not follow one another. Nor does it explain the gap of 5.1 at p =
+    0.010, where with 6.8 to 7.4 kg all of 12 speeds from -0.95 on are captured (the paper has -0.868); with 6.6 kg one at
+    -0.84 fails, so that the paper's number may be the upper end of a narrow band of failures. At p = 0.005 the same gap has
+    such bands with every mass. "cosine", tried for two rows, moves no border by more than 0.002 but for chaotic ones. By
+    "derived" captures from speeds below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to
+    0.7 above the paper's: what does it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w).
+    "spinning", tried for eight points of all gaps, is captured from rest at seven and from -0.967 at the other: a free spin
+    that begins at the bottom takes the balls up by as much as 0.35 of the rotor's speed. "contact" moves the thresholds of
+    "derived" by -0.07 to 0.07, a quarter of them by more than 0.03, mostly up.
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
