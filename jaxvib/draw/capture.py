@@ -95,7 +95,6 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     speeds.axhline(0.0, color=COLORS[5], ls="--", lw=0.8)
     speeds.set_xlabel("time, s")
     speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
-    figure.tight_layout()
     return figure
 
 
