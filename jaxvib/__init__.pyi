@@ -23,6 +23,7 @@ from jaxvib.machine.effects.base import Effect, Gravity, MomentImbalance, Static
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.friction import DryFriction
 from jaxvib.machine.effects.rolling import RollingFriction
+from jaxvib.machine.effects.spin import FreeSpin, Sliding
 from jaxvib.machine.effects.supports import CubicSupport, Stop
 
 # Scenes, and their files
@@ -30,10 +31,10 @@ from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_
 from jaxvib.machine.scene import Scene
 
 # The equations
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.forces import energy, foundation_force, normal_force, power
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.motion.start import initial_state
+from jaxvib.motion.start import initial_state, with_spin
 
 # Jams of light loads
 from jaxvib.steady.branches import Branches, branches
@@ -88,6 +89,7 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 
 # Capture in a torus
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
+from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Results
 from jaxvib.results.files import load
@@ -131,6 +133,8 @@ __all__ = [
     "Gravity",
     "DryFriction",
     "RollingFriction",
+    "FreeSpin",
+    "Sliding",
     "StaticImbalance",
     "MomentImbalance",
     "CubicSupport",
@@ -144,8 +148,10 @@ __all__ = [
     "scene_to_toml",
     # The equations
     "State",
+    "Spin",
     "vector_field",
     "initial_state",
+    "with_spin",
     "natural_frequencies",
     "energy",
     "power",
@@ -231,6 +237,8 @@ __all__ = [
     "capture",
     "Capture",
     "CaptureStatus",
+    "threshold_curve",
+    "ThresholdCurve",
     # Results
     "Result",
     "load",

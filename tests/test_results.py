@@ -32,6 +32,7 @@ from jaxvib.study.audit.compared import EffectRow
 from jaxvib.study.audit.numbers import NumberRow
 from jaxvib.study.audit.tiers import TierRow
 from jaxvib.study.capture.capture import _judged
+from jaxvib.study.capture.curve import ThresholdCurve
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
@@ -156,6 +157,9 @@ RESULTS = {
         resolution=np.asarray(0.02),
         starts=np.asarray(4),
         turns=np.asarray(2000),
+    ),
+    "ThresholdCurve": lambda: ThresholdCurve(
+        *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2]]), turns=np.asarray(2000)
     ),
     "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
     "Stress": lambda: stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)]),

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from jaxvib.draw.style import COLORS, panels
 
-__all__ = ["tables_chart", "threshold_chart", "torus_paths"]
+__all__ = ["curve_chart", "tables_chart", "threshold_chart", "torus_paths"]
 
 
 def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float) -> Figure:
@@ -33,6 +35,33 @@ def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, 
     return figure
 
 
+def curve_chart(
+    value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
+) -> Figure:
+    """Thresholds of capture over a number, with their uncertainty, and the least captured speeds.
+
+    >>> import numpy as np
+    >>> len(curve_chart(np.arange(2.0), np.array([-0.5, np.nan]), np.array([0.1, np.nan]), np.array([-0.6, -0.2])).axes)
+    1
+    """
+    figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
+    axis.fill_between(value, threshold, 0.0, color=COLORS[0], alpha=0.12, lw=0.0, label="every start captured")
+    axis.errorbar(value, threshold, uncertainty, marker="o", ms=4.0, capsize=3.0, color=COLORS[0], label="threshold")
+    apart = np.where(least < threshold - uncertainty, least, np.nan)
+    if np.any(np.isfinite(apart)):
+        axis.plot(value, apart, "v", color=COLORS[1], label="least captured speed")
+    missing = np.isnan(threshold)
+    if np.any(missing):
+        axis.plot(
+            value[missing], np.zeros(np.sum(missing)), "x", color="black", clip_on=False, label="not every start captured"
+        )
+    axis.set_xlabel("value")
+    axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
+    axis.set_ylim(-1.03, 0.0)
+    axis.legend()
+    return figure
+
+
 def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray) -> Figure:
     """Paths of balls on the unrolled torus, and their speeds.
 
@@ -44,22 +73,34 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     2
     """
     figure, (paths, speeds) = panels(2, size=(7.0, 3.4))
+    late = max(1, round(0.9 * time.size))
     for j in range(around.shape[1]):
         colour = COLORS[j % len(COLORS)]
-        wrapped = np.mod(around[:, j] + np.pi, 2.0 * np.pi) - np.pi
+        x, y = _within(around[:, j], -np.pi), _within(across[:, j], -0.5 * np.pi)
         # No line across the picture where a ball leaves it on one side and comes back on the other.
-        broken = np.where(np.abs(np.diff(wrapped, prepend=wrapped[:1])) > np.pi, np.nan, wrapped)
-        paths.plot(np.degrees(broken), np.degrees(across[:, j]), color=colour, lw=0.6, label=f"ball {j + 1}")
-        paths.plot(np.degrees(wrapped[-1:]), np.degrees(across[-1:, j]), "o", color=colour)
+        leaps = (np.abs(np.diff(x, prepend=x[:1])) > np.pi) | (np.abs(np.diff(y, prepend=y[:1])) > np.pi)
+        broken = np.degrees(np.where(leaps, np.nan, x))
+        paths.plot(broken, np.degrees(y), color=colour, lw=0.6, alpha=0.3)
+        paths.plot(broken[late:], np.degrees(y[late:]), color=colour, lw=1.2, label=f"ball {j + 1}, the last tenth")
+        paths.plot(np.degrees(x[:1]), np.degrees(y[:1]), "o", mfc="white", color=colour, label=None if j else "start")
+        paths.plot(np.degrees(x[-1:]), np.degrees(y[-1:]), "o", color=colour, label=None if j else "end")
         speeds.plot(time, rate[:, j], color=colour, lw=0.8)
-    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8)
+    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8, label="outer equator")
     paths.set_xlim(-180.0, 180.0)
+    paths.set_xticks(np.arange(-180, 181, 90))
+    paths.yaxis.set_major_locator(MultipleLocator(45.0))
     paths.set_xlabel("around the axis, relative to the rotor, degrees")
     paths.set_ylabel("in the tube, degrees")
-    paths.legend()
+    paths.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    speeds.axhline(0.0, color=COLORS[5], ls="--", lw=0.8)
     speeds.set_xlabel("time, s")
-    speeds.set_ylabel("speed relative to the rotor")
+    speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
     return figure
+
+
+def _within(angle: np.ndarray, least: float) -> np.ndarray:
+    """The angle in the turn that begins at `least`, rad."""
+    return np.mod(angle - least, 2.0 * np.pi) + least
 
 
 def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]]) -> Figure:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-import operator
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,16 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.equations.sliding import Kinematics, dot, kinematics, missing_force, slid, slip_rates, total
+from jaxvib.errors import InputError
 from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects.base import Effect, Friction, total_gravity
-from jaxvib.machine.loads import Loads
+from jaxvib.machine.effects.base import Effect, Friction, SlipLimit, total_gravity
+from jaxvib.machine.loads import Loads, Twisting
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, times
 
-__all__ = ["Dynamics", "State", "vector_field"]
+__all__ = ["Dynamics", "Spin", "State", "vector_field"]
 
-_Kinematics: TypeAlias = tuple[list[tuple[Array, Array]], tuple[Array, Array]]
-"""Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x and a y."""
+
+class Spin(eqx.Module):
+    """What of the loads' own rotation is free, where effects make it so (`FreeSpin`, `Sliding`); also how it changes.
+
+    **Attributes**: `twist` (count,) rad/s, a load's spin about the normal of its contact, relative to its track; `slip`, a
+    (count,) array m/s for each coordinate of a load, the velocity of its point of contact relative to the track along that
+    coordinate. Each is None where no effect frees it.
+    """
+
+    twist: Array | None = None
+    slip: tuple[Array, ...] | None = None
 
 
 class State(eqx.Module):
@@ -30,7 +39,8 @@ class State(eqx.Module):
 
     **Attributes**: `displacement` q (nd,) m and `velocity` q' (nd,) m/s of the carrier's coordinates; `angle` and `rate`, a
     tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s;
-    `rotor` the rotor's angle and speed, rad and rad/s, where a motor drives it, None under an ideal drive.
+    `rotor` the rotor's angle and speed, rad and rad/s, where a motor drives it, None under an ideal drive; `spin` of the loads
+    where effects make it free, see `Spin` and `with_spin`, else None.
     """
 
     displacement: Array
@@ -38,6 +48,7 @@ class State(eqx.Module):
     angle: tuple[Array, ...]
     rate: tuple[Array, ...]
     rotor: tuple[Array, Array] | None = None
+    spin: Spin | None = None
 
     @property
     def azimuth(self) -> Array:
@@ -70,6 +81,10 @@ class _Eliminated(NamedTuple):
     reaction: list[Array]
     drag: Array
     pull: dict[int, Array] | None
+
+    def change(self, a: dict[int, Array]) -> tuple[Array, ...]:
+        """u''."""
+        return tuple(f - sum(self.answers[axis][i] * x for axis, x in a.items()) for i, f in enumerate(self.free))
 
 
 class Dynamics(eqx.Module):
@@ -109,23 +124,69 @@ class Dynamics(eqx.Module):
         speed = self.drive.rotor_speed(t, state.rotor)
         unforced = self._unforced(state, speed)
         throw = self._throw(t, state)
-        loads = _kinematics(self.loads, state.angle, state.rate)
+        loads = kinematics(self.loads, state.angle, state.rate)
+        drag, force = self._forces(state, speed)
 
-        def accelerations(friction: Sequence[Friction]) -> tuple[list[Array], Array, _Eliminated, Array | None]:
-            part = self._eliminate(loads, state, speed, friction)
-            weight, reaction, spin = self._with_rotor(part, throw, speed)
+        def accelerations(
+            friction: Sequence[Friction], force: Sequence[Array], kappa: Array
+        ) -> tuple[list[Array], Array, _Eliminated, Array | None]:
+            part = self._eliminate(loads, drag, force, kappa, friction)
+            weight, reaction, rotor = self._with_rotor(part, throw, speed)
             a, carrier = self._close(weight, reaction, unforced)
-            return a, carrier, part, None if spin is None else spin[0] - _dot(spin[1], a)
+            return a, carrier, part, None if rotor is None else rotor[0] - dot(rotor[1], a)
 
-        friction = self._friction(state, speed)
+        friction, kappa = self._friction(state, speed), self.loads.inertia_factor()
         if any(each.normal is not None for each in friction):
             # The sign of a reaction that depends on the accelerations: that of the motion without its friction.
-            at_loads = self._at_loads(accelerations([each for each in friction if each.normal is None])[0])
+            plain = [each for each in friction if each.normal is None]
+            at_loads = self._at_loads(accelerations(plain, force, kappa)[0])
             friction = [each if each.normal is None else each.signed(at_loads) for each in friction]
-        a, carrier, part, spin = accelerations(friction)
+        a, carrier, part, rotor = accelerations(friction, force, kappa)
         at_loads = self._at_loads(a)
-        change = tuple(f - sum(part.answers[axis][i] * x for axis, x in at_loads.items()) for i, f in enumerate(part.free))
-        return State(state.velocity, carrier, state.rate, change, None if spin is None else (speed, spin))
+        change = part.change(at_loads)
+        slip, limit = self._slip(state), self._slip_limit
+        if slip is not None and limit is not None:
+            # Whether a load sticks or slides: by what the motion in which all of them roll asks of its contact.
+            u, rate = state.angle, state.rate
+            pressing = self.loads.pressing(u, rate, total_gravity(self.effects))
+            assert pressing is not None
+            centre = self.centre_forces(state, speed)
+            needed = missing_force(self.loads, loads, change, at_loads, centre, 1.0)
+            moved = slid(self.loads, loads, slip, limit, pressing, at_loads, needed, force, centre, friction)
+            a, carrier, part, rotor = accelerations(moved.friction, moved.force, moved.kappa)
+            at_loads = self._at_loads(a)
+            change = part.change(at_loads)
+            rolled = list(force)
+            for each in friction:
+                for i, f in enumerate(each.linear(at_loads)):
+                    rolled[i] = rolled[i] + f
+            lacking = missing_force(self.loads, loads, change, at_loads, rolled, kappa)
+            inertia = (kappa - 1.0) * self.loads.mass
+            slip_change = slip_rates(self.loads, u, rate, slip, [f / inertia for f in lacking])
+        else:
+            slip_change = None
+        twisting = self._twisting(state, speed)
+        spin = None if twisting is None and slip is None else Spin(None if twisting is None else twisting.rate, slip_change)
+        return State(state.velocity, carrier, state.rate, change, None if rotor is None else (speed, rotor), spin)
+
+    @property
+    def _slip_limit(self) -> SlipLimit | None:
+        found = [limit for limit in (effect.slip_limit for effect in self.effects) if limit is not None]
+        return found[0] if found else None
+
+    def _slip(self, state: State) -> tuple[Array, ...] | None:
+        if self._slip_limit is None:
+            return None
+        if state.spin is None or state.spin.slip is None:
+            raise InputError("state.spin", "has no slip, which an effect of the scene makes free; see with_spin(scene, state)")
+        return state.spin.slip
+
+    def _twisting(self, state: State, speed: Array) -> Twisting | None:
+        if not any(effect.frees_twist for effect in self.effects):
+            return None
+        if state.spin is None or state.spin.twist is None:
+            raise InputError("state.spin", "has no twist, which an effect of the scene makes free; see with_spin(scene, state)")
+        return self.loads.twisting(state.angle, state.rate, speed, state.spin.slip)
 
     def _unforced(self, state: State, speed: Array) -> Array:
         """Accelerations of the carrier without loads and imbalance."""
@@ -142,18 +203,34 @@ class Dynamics(eqx.Module):
         found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
         return [each.signed({}) if each.normal is None else each for each in found if each is not None]
 
-    def _eliminate(self, kinematics: _Kinematics, state: State, speed: Array, friction: Sequence[Friction]) -> _Eliminated:
-        loads, axes = self.loads, self.axes
-        columns, curvature = kinematics
+    def _forces(self, state: State, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
+        """The torque of the drag, and the generalised forces on the loads but for friction; without a `rotation` of their own
+        those at their centres alone."""
+        loads = self.loads
         torque = loads.resistance(state.angle, state.rate, speed)
-        drag, force = torque[0], list(torque)
-        spin = loads.spin_force(state.angle, state.rate, speed)
-        if spin is not None:
-            force = [f + s for f, s in zip(force, spin, strict=True)]
+        force = list(torque)
+        turning = loads.spin_force(state.angle, state.rate, speed) if rotation else None
+        if turning is not None:
+            force = [f + s for f, s in zip(force, turning, strict=True)]
+        twisting = self._twisting(state, speed) if rotation else None
+        if twisting is not None:
+            assert state.spin is not None and state.spin.twist is not None
+            force = [f + state.spin.twist * s for f, s in zip(force, twisting.force, strict=True)]
         for effect in self.effects:
             for extra in (effect.load_force(loads, state.angle), effect.load_resistance(loads, state.angle, state.rate)):
                 if extra is not None:
                     force = [f + e for f, e in zip(force, extra, strict=True)]
+        return torque[0], force
+
+    def centre_forces(self, state: State, speed: Array) -> list[Array]:
+        """The generalised forces that act at the loads' centres, the contact with their track left out, N m of an angle."""
+        return self._forces(state, speed, rotation=False)[1]
+
+    def _eliminate(
+        self, found: Kinematics, drag: Array, force: Sequence[Array], kappa: Array, friction: Sequence[Friction]
+    ) -> _Eliminated:
+        loads, axes, force = self.loads, self.axes, list(force)
+        columns, curvature = found
         pulls: list[dict[int, Array]] = [{} for _ in force]
         for each in friction:
             rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
@@ -163,9 +240,9 @@ class Dynamics(eqx.Module):
                 if each.normal is not None:
                     pulls[i] = {axis: lever * each.normal[axis] + pulls[i].get(axis, 0.0) for axis in axes}
         m = loads.mass
-        inertia = loads.inertia_factor() * m
-        solve = small_inverse([[inertia * _dot(a, b) for b in columns] for a in columns])
-        free = solve(tuple(f - inertia * _dot(column, curvature) for f, column in zip(force, columns, strict=True)))
+        inertia = kappa * m
+        solve = small_inverse([[inertia * dot(a, b) for b in columns] for a in columns])
+        free = solve(tuple(f - inertia * dot(column, curvature) for f, column in zip(force, columns, strict=True)))
         rows = {axis: [m * column[axis] for column in columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, pulls, strict=True)] for axis, row in rows.items()}
         answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
@@ -173,10 +250,10 @@ class Dynamics(eqx.Module):
         # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
         arms = self._arms()
         onto = [(axis, arm) for arm in range(len(arms)) for axis in axes]
-        own = {(i, k): m * (1.0 if i == k else 0.0) - m * _dot(across[i], answers[k]) for i in axes for k in axes}
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], answers[k]) for i in axes for k in axes}
         moments = {(i, k, n): self._total(own[i, k], *arms[1:2] * n) for i, k in own for n in range(2 * len(arms) - 1)}
         weight = [[moments[i, k, first + second] for k, second in onto] for i, first in onto]
-        push = {i: m * (_dot(across[i], free) + curvature[i]) for i in axes}
+        push = {i: m * (dot(across[i], free) + curvature[i]) for i in axes}
         reaction = [self._total(push[i], *arms[1:2] * n) for i, n in onto]
         return _Eliminated(free, answers, weight, reaction, drag, pulls[0] or None)
 
@@ -211,10 +288,10 @@ class Dynamics(eqx.Module):
 
         def thrown(angle: Array) -> tuple[Array, ...]:
             found = [imbalance for imbalance in (effect.imbalance(angle) for effect in self.effects) if imbalance is not None]
-            static = tuple(_sum(imbalance.static[axis] for imbalance in found) for axis in self.axes)
+            static = tuple(total(imbalance.static[axis] for imbalance in found) for axis in self.axes)
             if self.stations is None:
                 return static
-            moment = tuple(_sum(imbalance.moment[axis] for imbalance in found) for axis in self.axes)
+            moment = tuple(total(imbalance.moment[axis] for imbalance in found) for axis in self.axes)
             if self.cg_offset is not None:
                 moment = tuple(x + self.cg_offset * y for x, y in zip(moment, static, strict=True))
             return (*static, *moment)
@@ -307,24 +384,3 @@ def vector_field(scene: Scene) -> Dynamics:
         effects=tuple(effect.prepared(scene.loads) for effect in effects),
         axes=carrier.axes,
     )
-
-
-def _kinematics(loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> _Kinematics:
-    """Columns of J and c = (dJ/dt) u', of all loads at once (the position acts elementwise)."""
-
-    def along(direction: tuple[Array, ...]) -> Callable[..., tuple[Array, Array]]:
-        return lambda *v: jax.jvp(loads.position, v, direction)[1]
-
-    columns = []
-    for i in range(len(u)):
-        direction = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
-        columns.append(along(direction)(*u))
-    return columns, jax.jvp(along(rate), u, rate)[1]
-
-
-def _sum(values: Iterable[Array]) -> Array:
-    return functools.reduce(operator.add, values)
-
-
-def _dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
-    return _sum(a * b for a, b in zip(x, y, strict=True))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import Dynamics, State, vector_field
+from jaxvib.equations.sliding import dot, kinematics, missing_force
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
@@ -41,8 +44,11 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     E = q'.M q'/2 + q.K q/2 + sum_j [ m_j |B_j q' + p_j'|^2/2 + (kappa_j - 1) m_j |p_j'|^2/2 + V_j(u_j) ] + V(q)
         + theta' d'(theta).P q' + J_r theta'^2/2
 
-    d what is out of balance in the rotor, J_r the inertia of a motor's rotor (an ideal drive has none). The time `t`, s, says
-    where an ideal drive has its rotor; it matters to an imbalance alone.
+        + sum_j [ (kappa_j - 1) m_j (|c_j|^2/2 - p_j'.c_j) + J_j s_j^2/2 ]
+
+    d what is out of balance in the rotor, J_r the inertia of a motor's rotor (an ideal drive has none); c a load's slip and s
+    its spin on its track, where effects free them. The time `t`, s, says where an ideal drive has its rotor; it matters to an
+    imbalance alone.
     """
     carrier, loads = scene.machine.carrier(), scene.loads
     q, v = state.displacement, state.velocity
@@ -63,6 +69,14 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
             parts.append(effect.support_potential(rows @ q))
     t = jnp.asarray(t, q.dtype)
     turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
+    if state.spin is not None and state.spin.slip is not None:
+        found = kinematics(loads, state.angle, state.rate)
+        pairs = zip(state.spin.slip, found.columns, found.sizes, strict=True)
+        parts += [jnp.sum(own * loads.mass * c * (0.5 * c - dot(column, p_rate) / size)) for c, column, size in pairs]
+    if state.spin is not None and state.spin.twist is not None:
+        twisting = loads.twisting(state.angle, state.rate, rate)
+        assert twisting is not None
+        parts.append(jnp.sum(0.5 * twisting.inertia * state.spin.twist**2))
     parts.append(rate * _throw_rate(scene, turn) @ v)
     motor = scene.drive.torque_and_inertia(rate)
     if motor is not None:
@@ -73,22 +87,26 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     """Power that the rotor puts in, and power that dampers, drag and friction dissipate, W; dE/dt is their difference.
 
-    P_in = speed T, T the motor's torque, or that which turns an ideal drive's rotor against loads and imbalance:
+    P_in = speed T, T the motor's torque, or that which turns an ideal drive's rotor against loads, their spin and imbalance:
     T = sum_j M_j + d'(theta).P q'';    P_diss = q'.C q' + sum_j M_j (speed - phi_j') + what supports and contacts take,
-    M_j = b_W R^2 (speed - phi_j') + friction
+    M_j = b_W R^2 (speed - phi_j') + friction. Loads that slide dissipate - F_t.c besides.
     """
     carrier, loads = scene.machine.carrier(), scene.loads
     turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
-    acceleration = vector_field(scene)(t, state).velocity
+    field = vector_field(scene)
+    change = field(t, state)
+    acceleration = change.velocity
     at_load = carrier.point_rates(acceleration)
     taken = loads.resistance(state.angle, state.rate, speed)
     g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
+    sliding, spun = _spin_power(field, state, change, at_load, speed)
     for effect in scene.effects:
         friction = effect.friction(loads, state.angle, state.rate, speed, g)
         if friction is not None:
             rubbing = friction.forces(at_load)
             taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
+            lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
         resistance = effect.load_resistance(loads, state.angle, state.rate)
         if resistance is not None:
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
@@ -102,7 +120,32 @@ def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
     motor = scene.drive.torque_and_inertia(speed)
     torque = braking + _throw_rate(scene, turn) @ acceleration if motor is None else motor[0]
-    return speed * torque, sum(lost[1:], lost[0])
+    return speed * torque + spun[0], sum(lost[1:], lost[0]) + spun[1]
+
+
+def _spin_power(
+    field: Dynamics, state: State, change: State, at_load: Mapping[int, Array], speed: Array
+) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    """The rates of the coordinates that a load's slip makes up for; what the rotor puts into loads that spin and slide, and
+    what sliding takes, W, but for the friction of rolling."""
+    loads, spin, zero = field.loads, state.spin, jnp.zeros(())
+    if spin is None:
+        return (), (zero, zero)
+    u, rate = state.angle, state.rate
+    supplied, lost, rates = zero, zero, ()
+    if spin.twist is not None:
+        twisting = loads.twisting(u, rate, speed)
+        assert twisting is not None
+        supplied = speed * jnp.sum(twisting.force[0] * spin.twist)
+    if spin.slip is not None:
+        found = kinematics(loads, u, rate)
+        rates = tuple(c / size for c, size in zip(spin.slip, found.sizes, strict=True))
+        contact = missing_force(loads, found, change.rate, at_load, field.centre_forces(state, speed), 1.0)
+        lost = -jnp.sum(dot(contact, spin.slip))
+        turning = loads.spin_force(u, rate, speed)
+        if turning is not None:
+            supplied = supplied - jnp.sum(dot(turning, rates))
+    return rates, (supplied, lost)
 
 
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:

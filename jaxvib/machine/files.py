@@ -14,11 +14,7 @@ import numpy as np
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
-from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
-from jaxvib.machine.effects.contact import LoadContact
-from jaxvib.machine.effects.friction import DryFriction
-from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.effects.supports import CubicSupport, Stop
+from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
@@ -56,16 +52,6 @@ DRIVES = {
     "run_up": RunUp,
     "dc_motor": DCMotor,
     "induction_motor": InductionMotor,
-}
-EFFECTS = {
-    "gravity": Gravity,
-    "static_imbalance": StaticImbalance,
-    "moment_imbalance": MomentImbalance,
-    "dry_friction": DryFriction,
-    "rolling_friction": RollingFriction,
-    "cubic_support": CubicSupport,
-    "stop": Stop,
-    "load_contact": LoadContact,
 }
 _SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 

@@ -14,7 +14,17 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
-__all__ = ["CircularLoads", "Loads", "Pressing", "balls", "pendulums", "require_side_by_side", "rollers"]
+__all__ = [
+    "CircularLoads",
+    "Loads",
+    "Pressing",
+    "Twisting",
+    "balls",
+    "pendulums",
+    "require_side_by_side",
+    "rollers",
+    "side_by_side",
+]
 
 
 class Pressing(NamedTuple):
@@ -29,6 +39,19 @@ class Pressing(NamedTuple):
     def at(self, a: Mapping[int, Array]) -> Array:
         """N (count,) where the loads' carriers have the acceleration `a`, by axis."""
         return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
+
+
+class Twisting(NamedTuple):
+    """What a spin s of each load about the normal of its contact, relative to its track, does and what changes it.
+
+    s' = `rate` (count,) rad/s^2 while nothing holds it; generalised forces s `force`, a (count,) array for each coordinate;
+    energy `inertia` s^2/2, kg m^2; s = `still` (count,) rad/s of a load that does not turn in space.
+    """
+
+    rate: Array
+    force: tuple[Array, ...]
+    inertia: Array
+    still: Array
 
 
 class Loads(eqx.Module):
@@ -75,9 +98,21 @@ class Loads(eqx.Module):
         """Generalised force of a rolling load's own rotation besides kappa, N m; it does no work. None where there is none."""
         return None
 
+    def twisting(
+        self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
+    ) -> Twisting | None:
+        """What a spin about the normal of the contact does, see `Twisting`; None for loads that nothing couples to it. `slip`
+        of the contact along each coordinate, m/s, where it may slide."""
+        return None
+
     def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing | None:
         """How hard the loads press on their track under gravity `g` (by axis, m/s^2 upward); None where nothing says it."""
         return None
+
+    def offsets(self) -> Array:
+        """How far ahead of the middle each load is, (count,) rad, where loads at rest that cannot all be at one point lie side
+        by side."""
+        return jnp.zeros((self.count,), dtype=jnp.result_type(self.mass))
 
     def own_frequency(self, speed: Array) -> Array | None:
         """The frequency of the loads' own motions that a step must resolve beside the rotor's `speed`, rad/s; or None."""
@@ -149,8 +184,7 @@ class CircularLoads(Loads):
         """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
         if self.own_radius is None:
             return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
-        angle = jnp.arcsin(self.own_radius / self.radius)
-        return jnp.arange(1 - self.count, self.count, 2, dtype=angle.dtype) * angle
+        return side_by_side(self.count, self.own_radius / self.radius)
 
     def unbalance(self) -> Array:
         """The unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
@@ -196,6 +230,12 @@ def _fit(loads: CircularLoads, r: Array) -> None:
         raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
     if not traced(r) and not traced(loads.radius):
         require_side_by_side(loads.count, float(loads.radius), float(r))
+
+
+def side_by_side(count: int, ratio: Array) -> Array:
+    """(2 j - N + 1) arcsin(r/R), (count,) rad: angles about their middle of loads that touch, `ratio` r/R."""
+    angle = jnp.arcsin(ratio)
+    return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 
 
 def require_side_by_side(count: int, radius: float, own_radius: float) -> None:

@@ -67,6 +67,9 @@ class Scene(eqx.Module):
             )
         for effect in effects:
             effect.check(machine, loads)
+            if effect.needs_ideal_drive and not drive.ideal:
+                problem = f"goes with a drive of given speed (property ideal), not with {drive.kind!r}; use ConstantSpeed"
+                raise InputError(f"effects.{effect.kind}", problem)
         require_comparable(machine, loads, drive)
         self.machine = machine
         self.loads = loads

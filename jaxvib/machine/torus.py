@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.loads import Loads, Pressing, require_side_by_side
+from jaxvib.machine.loads import Loads, Pressing, Twisting, require_side_by_side, side_by_side
 from jaxvib.units import Number, number, numbers, traced
 from jaxvib.units import count as whole
 
@@ -73,6 +73,10 @@ class TorusBalls(Loads):
         quarter = jnp.full((self.count,), 0.5 * jnp.pi, dtype=jnp.result_type(self.radius))
         return -quarter, quarter
 
+    def offsets(self) -> Array:
+        """Side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
+        return side_by_side(self.count, self.own_radius / (self.radius + self.gap))
+
     def inertia_factor(self) -> Array:
         """7/5."""
         return jnp.asarray(1.0 + _ROLLING, dtype=self.mass.dtype)
@@ -85,6 +89,18 @@ class TorusBalls(Loads):
         """(2/5) m w B rho cos a (a', -f')."""
         turn = _ROLLING * self.mass * speed * self._arm(u[1]) * self.gap * jnp.cos(u[1])
         return turn * rate[1], -turn * rate[0]
+
+    def twisting(
+        self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
+    ) -> Twisting:
+        """s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r, forces (2/5) m r s (B a', - rho sin a f'), s = w cos a of none."""
+        (_, a), (turn, climb), m, own = u, rate, self.mass, self.own_radius
+        arm, up = self._arm(a), jnp.sin(a)
+        lever = _ROLLING * m * own
+        change = climb * (speed * arm - self.radius * turn)
+        if slip is not None:
+            change = change + slip[0] * climb - slip[1] * turn * up
+        return Twisting(change / own, (lever * arm * climb, -lever * self.gap * up * turn), lever * own, speed * jnp.cos(a))
 
     def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing:
         """N, against the tube's wall."""

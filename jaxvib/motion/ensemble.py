@@ -24,7 +24,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
-from jaxvib.motion.start import initial_state, require_start
+from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y
@@ -207,7 +207,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
             raise InputError("make", f"gives {given!r}; it must give a Scene, or a Scene and a State")
-        return scene, state
+        return scene, with_spin(scene, state)
 
     return eqx.filter_vmap(one)(values)
 
@@ -332,8 +332,8 @@ class _Watching(eqx.Module):
 
 
 def _watched(state: State, missing: Array) -> _Watched:
-    return _Watched(state.displacement, state.velocity, state.angle, state.rate, state.rotor, missing=missing)
+    return _Watched(state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin, missing=missing)
 
 
 def _plain(state: State) -> State:
-    return State(state.displacement, state.velocity, state.angle, state.rate, state.rotor)
+    return State(state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin)

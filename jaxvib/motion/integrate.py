@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory
@@ -21,7 +21,7 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -43,7 +43,8 @@ class StepControl(eqx.Module):
 
 @cached
 def natural_units(scene: Scene) -> State:
-    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed.
+    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
+    the rotor's speed at the loads' distance from its axis.
 
     S is the loads' unbalance, or the rotor's own where that is larger.
     """
@@ -59,7 +60,17 @@ def natural_units(scene: Scene) -> State:
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
     rotor = None if scene.drive.ideal else (one, speed)
-    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor))
+    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    twist = speed if any(effect.frees_twist for effect in scene.effects) else None
+    slip = (speed * arm,) if any(effect.slip_limit is not None for effect in scene.effects) else None
+    spin = None if twist is None and slip is None else Spin(twist, slip)
+    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
+
+
+def each_coordinate(unit: State, number: int) -> State:
+    """Natural units with one for each of so many coordinates of a load."""
+    spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.twist, unit.spin.slip * number)
+    return State(unit.displacement, unit.velocity, unit.angle * number, unit.rate * number, unit.rotor, spin)
 
 
 def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepControl) -> diffrax.AbstractStepSizeController:
@@ -69,13 +80,14 @@ def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepC
     natural = natural_units(scene)
     # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
     rotor = None if state.rotor is None else (jnp.zeros(()), jnp.ones(()))
-    relative = State(jnp.ones(()), jnp.ones(()), (jnp.zeros(()),) * len(state.angle), (jnp.ones(()),) * len(state.rate), rotor)
-    angles, rates = natural.angle * len(state.angle), natural.rate * len(state.rate)
-    unit = State(natural.displacement, natural.velocity, angles, rates, natural.rotor)
+    one, number = jnp.ones(()), len(state.angle)
+    spin = jax.tree.map(jnp.ones_like, state.spin)
+    relative = State(one, one, (jnp.zeros(()),) * number, (one,) * number, rotor, spin)
+    unit = each_coordinate(natural, number)
     dtype = state.displacement.dtype
 
     def spread(tree: State) -> State:
-        return jax.tree.map(lambda value, leaf: jnp.full(leaf.shape, value, dtype), tree, state)
+        return jax.tree.map(lambda value, leaf: jnp.broadcast_to(jnp.asarray(value, dtype), leaf.shape), tree, state)
 
     tolerance = jnp.asarray(control.tolerance, dtype)
     units = motion.pack(spread(unit))
@@ -92,17 +104,25 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
 
 
+def added_rate(scene: Scene) -> Array:
+    """The fastest that effects add to the loads' motion, see `Effect.own_rate`; 0 where there is none."""
+    rates = (effect.own_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
+    found = [jnp.max(rate) for rate in rates if rate is not None]
+    return functools.reduce(jnp.maximum, found, jnp.zeros_like(scene.drive.speed))
+
+
 @cached
 def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count.
 
-    Among the greatest is the loads' own frequency, where they have one.
+    Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = natural_frequencies(scene), scene.drive.speed
     own = scene.loads.own_frequency(speed)
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
+    fastest = jnp.maximum(fastest, added_rate(scene))
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 

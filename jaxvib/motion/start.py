@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import equinox as eqx
 import jax
@@ -10,19 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.dynamics import Spin, State
+from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
-from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced
 
-__all__ = ["Start", "brought_up", "initial_state", "require_start", "whole_state"]
+__all__ = ["Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
+
+Turning = Literal["rolling", "still"]
+"""How loads turn by themselves at the start: they roll on their track, or not at all in space."""
 
 
 def initial_state(
@@ -74,8 +77,7 @@ def initial_state(
     def phases(value: float | Array) -> Array:
         if angles is not None:
             return numbers(angles, "rad", "angles", n) + spread
-        touching = any(effect.couples_loads for effect in scene.effects)
-        if touching and isinstance(scene.loads, CircularLoads):
+        if any(effect.couples_loads for effect in scene.effects):
             return value + scene.loads.offsets() + spread
         return value + spread
 
@@ -84,7 +86,7 @@ def initial_state(
         first, *others = scene.loads.rest()
         angle = (phases(first), *others)
         require_start(scene, angle)
-        return State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor)
+        return with_spin(scene, State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:
@@ -102,11 +104,61 @@ def initial_state(
     angle = phases(0.0)
     require_start(scene, (angle,))
     displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
-    return State(
-        displacement.real,
-        -jam.omega * displacement.imag,
-        (angle,),
-        (jnp.full((n,), jam.omega),),
+    rate = (jnp.full((n,), jam.omega),)
+    return with_spin(scene, State(displacement.real, -jam.omega * displacement.imag, (angle,), rate))
+
+
+def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:
+    """The state with the loads' own rotation, as far as effects of the scene make it free; one that has it stays as it is.
+
+    **Arguments**: `turning` "rolling", for loads that roll on their track and do not spin on it, or "still", for loads that do
+    not turn in space, so that their contact slides where the scene has `Sliding`:
+
+        c = p' - w axis x (p + r n),    s = - w axis . n        (n the normal of the contact)
+
+    **Returns** `State`. **Raises** `InputError` for another word, and for a spin that the scene does not make free or of a
+    wrong shape.
+
+    >>> import jax.numpy as jnp, jaxvib as jv
+    >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
+    >>> scene = jv.Scene(jv.planar_rotor(mass=9.0, stiffness=1e4, damping=9.0), loads, jv.ConstantSpeed(100.0), jv.Sliding(0.1))
+    >>> rest = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (jnp.zeros(1),))
+    >>> round(float(jv.with_spin(scene, rest, "still").spin.slip[0][0]), 6)        # - w (R + r)
+    -21.0
+    """
+    if turning not in get_args(Turning):
+        raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
+    twists = any(effect.frees_twist for effect in scene.effects)
+    slips = any(effect.slip_limit is not None for effect in scene.effects)
+    if not (twists or slips):
+        if state.spin is not None:
+            raise InputError("start.spin", "is given, but no effect of the scene makes it free; leave it out, or add FreeSpin")
+        return state
+    if state.spin is not None:
+        n = (scene.loads.count,)
+        needed = (n if twists else None, (n,) * len(state.angle) if slips else None)
+        twist, slip = state.spin.twist, state.spin.slip
+        found = (None if twist is None else jnp.shape(twist), None if slip is None else tuple(map(jnp.shape, slip)))
+        if found != needed:
+            problem = f"has shapes {found} of twist and slip; this scene needs {needed} (None where no effect frees it)"
+            raise InputError("start.spin", problem)
+        return state
+    zero = jnp.zeros_like(state.azimuth)
+    twist, slip = zero, tuple(zero for _ in state.angle)
+    if turning == "still":
+        loads, u, rate, w = scene.loads, state.angle, state.rate, scene.drive.rotor_speed(jnp.zeros(()), state.rotor)
+        twisting, pressing = loads.twisting(u, rate, w), loads.pressing(u, rate, {})
+        twist = zero if twisting is None else twisting.still
+        if slips:
+            assert pressing is not None
+            own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+            across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), pressing.normal, strict=False))
+            along = jax.jvp(loads.position, u, rate)[1]
+            relative = (along[0] + w * up, along[1] - w * across, *along[2:])
+            found = kinematics(loads, u, rate)
+            slip = tuple(dot(column, relative) / size for column, size in zip(found.columns, found.sizes, strict=True))
+    return eqx.tree_at(
+        lambda s: s.spin, state, Spin(twist if twists else None, slip if slips else None), is_leaf=lambda leaf: leaf is None
     )
 
 
@@ -145,7 +197,7 @@ def whole_state(scene: Scene, state: State, mode: int | None) -> State:
         if any(shape != (length,) for shape in shapes):
             raise InputError(f"start.{name}", f"has shape {shapes[0]}; this scene needs ({length},)")
     require_start(scene, state.angle)
-    return state
+    return with_spin(scene, state)
 
 
 def require_start(scene: Scene, u: tuple[Array, ...]) -> None:

@@ -8,6 +8,8 @@ from torus import OWN, RADIUS, balls
 
 import jaxvib as jv
 from jaxvib.machine.effects.contact import damping_ratio
+from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.study.capture.capture import steps_per_second
 
 HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 
@@ -88,6 +90,36 @@ def test_a_restitution_survives_the_file_and_wrong_ones_are_named():
     uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, own_radius=0.0125)
     with pytest.raises(jv.InputError, match="is for loads of one mass"):
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
+
+
+def test_balls_of_a_torus_that_start_in_one_place_are_refused_and_named_starts_lay_them_side_by_side():
+    s, zero = on_equator(0.5, count=3), jnp.zeros(2)
+
+    def start(*f, a=0.5 * jnp.pi):
+        return jv.State(zero, zero, (jnp.asarray(f), a + jnp.zeros(3)), (jnp.zeros(3), jnp.zeros(3)))
+
+    says = r"start.angle puts loads 1 and 3 inside each other, 0 m apart; start them 0.025 m apart, their diameter"
+    with pytest.raises(jv.InputError, match=says):
+        jv.simulate(s, 0.1, start=start(0.0, 1.0, 2.0 * jnp.pi))
+    with pytest.raises(jv.InputError, match=r"inside each other, 0\.022"):  # in one of several runs
+        steps = jv.EqualSteps(8)
+        jv.ensemble(lambda f: (s, start(0.0, 1.0, f)), jnp.asarray([2.0, 1.11]), 0.1, stepsize_controller=steps)
+    for kind in (s, on_equator(0.5, count=2)):
+        place = np.stack(kind.loads.position(*jv.initial_state(kind).angle))
+        np.testing.assert_allclose(np.linalg.norm(np.diff(place, axis=1), axis=0), 2.0 * OWN, rtol=1e-12)
+    # Across the tube they have their room as well.
+    jv.initial_state(s, angles=[0.0, 0.2, 0.4])
+
+
+def test_steps_of_captures_and_ensembles_resolve_a_contact():
+    """Ten steps of what takes pi sqrt(mu/k), by ensembles; six by captures."""
+    s = on_equator(0.5)
+    bare = jv.Scene(s.machine, s.loads, jv.ConstantSpeed(140.0))
+    touching = jv.Scene(s.machine, s.loads, jv.ConstantSpeed(140.0), s.effects)
+    swing = np.sqrt(1e5 / (0.7 * float(s.loads.mass) / (1.0 - (OWN / 0.2025) ** 2)))
+    np.testing.assert_allclose(fastest_and_slowest(touching)[0], swing, rtol=1e-12)
+    np.testing.assert_allclose(steps_per_second(touching), 2.0 * swing, rtol=1e-12)
+    assert steps_per_second(bare) == float(bare.loads.own_frequency(140.0)) < swing
 
 
 def test_jammed_balls_press_together_with_the_unbalance_of_their_arc():

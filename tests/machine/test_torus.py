@@ -8,11 +8,24 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from torus import MASS, OWN, SPEED, balls, lagrangian_accelerations, published, rolling_ball_accelerations, scene, some_state
+from torus import (
+    MASS,
+    OWN,
+    RADIUS,
+    SPEED,
+    balls,
+    lagrangian_accelerations,
+    published,
+    rolling_ball_accelerations,
+    scene,
+    some_state,
+)
 
 import jaxvib as jv
 from jaxvib.machine.torus import TorusBalls
 from jaxvib.results.status import status_names
+
+HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 
 evaluate = jax.jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
@@ -175,6 +188,34 @@ def test_without_friction_and_with_a_coefficient_of_zero_is_the_same():
     assert np.all(np.isfinite(zero.rate[0]))
     slope = jax.grad(lambda k: jv.vector_field(scene((jv.RollingFriction(k),)))(0.0, state).rate[0][0])(0.0)
     assert np.isfinite(slope) and float(slope) != 0.0
+
+
+@pytest.mark.parametrize("along", ["axis", "up"])
+def test_friction_holds_a_ball_on_a_slope_up_to_its_limit_and_lets_it_roll_beyond(along):
+    """Up the wall of a tube that lies level, and along the outer equator of a ring that stands upright."""
+    share, width = 0.05, 1e-4
+    friction = jv.RollingFriction(share * OWN, width=width)
+    s = jv.Scene(HEAVY, balls(1), jv.ConstantSpeed(1e-9), (jv.Gravity(along=along), friction))
+    i, arm = (1, 0.0025) if along == "axis" else (0, RADIUS + 0.0025)
+
+    def climbs(slope, rate):
+        """The acceleration up the slope, in the ball's, at a speed in widths."""
+        u = (0.0, slope) if i == 1 else (slope - 0.5 * jnp.pi, 0.5 * jnp.pi)
+        rates = [0.0, 0.0]
+        rates[i] = rate * width / arm
+        pairs = (tuple(jnp.asarray([x]) for x in pair) for pair in (u, rates))
+        return float(evaluate(s, 0.0, jv.State(jnp.zeros(2), jnp.zeros(2), *pairs)).rate[i][0]) * 1.4 * arm / 9.81
+
+    gentle, steep = 0.6 * share, 2.0 * share
+    close = dict(rtol=3e-3, atol=3e-3 * gentle)
+    # It sticks: from rest it falls, until it creeps, and faster than that it is stopped; a steeper wall it rolls down.
+    np.testing.assert_allclose(climbs(gentle, 0.0), -np.sin(gentle), **close)
+    np.testing.assert_allclose(climbs(gentle, -np.arctanh(np.tan(gentle) / share)), 0.0, **close)
+    for sign in (1.0, -1.0):
+        held = -np.sin(gentle) - sign * share * np.cos(gentle)
+        np.testing.assert_allclose(climbs(gentle, sign * 20.0), held, **close)
+    assert climbs(gentle, -20.0) > 0.0 > climbs(steep, -20.0)
+    np.testing.assert_allclose(climbs(steep, -20.0), share * np.cos(steep) - np.sin(steep), **close)
 
 
 def mujoco_torus(s, step=1e-5):

@@ -10,6 +10,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.motion.start import Turning
 from jaxvib.study.capture.capture import thrown_state
 
 
@@ -21,6 +22,13 @@ from jaxvib.study.capture.capture import thrown_state
 @click.option("--starts", type=click.IntRange(min=1), default=1, show_default=True, help="Perturbed starts at each speed.")
 @click.option("--turns", type=click.IntRange(min=1), default=2000, show_default=True, help="Turns of the rotor in each run.")
 @click.option("--resolution", type=float, help="Look for the threshold as finely as this.")
+@click.option(
+    "--turning",
+    type=click.Choice(["rolling", "still"]),
+    default="rolling",
+    show_default=True,
+    help="How balls start: rolling, or thrown without turning, so that they slide first (effect sliding).",
+)
 @shared
 def capture(
     scene: Path,
@@ -30,13 +38,16 @@ def capture(
     starts: int,
     turns: int,
     resolution: float | None,
+    turning: Turning,
     output: Output,
 ) -> None:
     """From which initial speeds the balls in a torus of SCENE come to turn with the rotor; --out adds pictures."""
     if not -1.0 <= low < high <= 0.0:
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; speeds go up from -1 at least to 0 at most")
     loaded = jv.load_scene(scene)
-    found = jv.capture(loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution)
+    found = jv.capture(
+        loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, turning=turning
+    )
     picture, paths = output.file("capture.png"), output.file("paths.png")
     if picture is not None and paths is not None:
         from jaxvib.draw.capture import torus_paths
@@ -45,7 +56,7 @@ def capture(
         # One run just above the threshold, or from the highest speed where none was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
-        run = jv.simulate(loaded, until, start=thrown_state(loaded, speed), estimate=False)
+        run = jv.simulate(loaded, until, start=jv.with_spin(loaded, thrown_state(loaded, speed), turning), estimate=False)
         kept = run.trajectory
         assert kept is not None
         around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]

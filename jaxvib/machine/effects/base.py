@@ -22,6 +22,7 @@ __all__ = [
     "Gravity",
     "Imbalance",
     "MomentImbalance",
+    "SlipLimit",
     "StaticImbalance",
     "Typical",
     "total_gravity",
@@ -64,6 +65,11 @@ class Friction(NamedTuple):
         sign = jnp.where(self._reaction(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
         return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
 
+    def linear(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
+        """As `forces` of a friction that is `signed` already."""
+        reaction = self._reaction(a)
+        return tuple(lever * reaction for lever in (self.lever, *self.others))
+
     def _reaction(self, a: Mapping[int, Array]) -> Array:
         if self.normal is None:
             return self.reaction
@@ -75,6 +81,14 @@ class Imbalance(NamedTuple):
 
     static: tuple[Array, Array]
     moment: tuple[Array, Array]
+
+
+class SlipLimit(NamedTuple):
+    """How far the contact of a rolling load holds: a force along the track up to `coefficient` times N; a slip below `width`,
+    m/s, dies out."""
+
+    coefficient: Array
+    width: Array
 
 
 class Typical(NamedTuple):
@@ -120,6 +134,17 @@ class Effect(eqx.Module):
     couples_loads: ClassVar[bool] = False
     """Whether loads act on each other by it, so that their order and their distances count."""
 
+    frees_twist: ClassVar[bool] = False
+    """Whether rolling loads may spin about the normal of their contact (`Loads.twisting`, `Spin.twist`)."""
+
+    needs_ideal_drive: ClassVar[bool] = False
+    """Whether it goes with a drive of given speed alone (property `ideal`)."""
+
+    @property
+    def slip_limit(self) -> SlipLimit | None:
+        """From which force on the contact of a rolling load slides (`Spin.slip`); None where it always rolls."""
+        return None
+
     @property
     def gravity(self) -> dict[int, Array]:
         """The acceleration of gravity that the effect brings into the scene, m/s^2, by the axis of a load's position (0 across,
@@ -134,6 +159,11 @@ class Effect(eqx.Module):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` where the effect does not go with this machine or these loads."""
+
+    def own_rate(self, loads: Loads, speed: Array) -> Array | None:
+        """How fast what it adds to the loads' motion goes, rad/s or 1/s, for steps to resolve, at the rotor's `speed`, rad/s;
+        None where it adds nothing faster than the loads have by themselves."""
+        return None
 
     def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
         """**Raises** `InputError` where loads cannot start from the coordinates `u`, (..., count) each and known."""

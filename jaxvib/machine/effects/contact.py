@@ -25,7 +25,7 @@ class LoadContact(Effect):
     r is the loads' `own_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
     follows load j, and load 1 follows the last one a turn later, so that N pairs are all there are. A state to start from has
     its angles in this order, less than a turn apart; the named ones lay loads that are together side by side. Loads with
-    several coordinates meet in any pair, s = |p(u_i) - p(u_j)|.
+    several coordinates meet in any pair, s = |p(u_i) - p(u_j)|, and may start where no two are nearer than 0.9 of 2 r.
 
     Two loads that meet on a track that does not give way part with the share e of the speed with which they met,
 
@@ -33,7 +33,7 @@ class LoadContact(Effect):
 
     in cosh gamma = zeta > 1: e = exp(-2 gamma coth gamma), and lose the share 1 - e^2 of the energy of their relative motion.
     What they were rolling with is counted in, friction between the loads is not. A contact lasts about pi sqrt(mu/k), which
-    steps must resolve: equal steps need ten for each.
+    steps must resolve: equal steps need ten for each, and `ensemble` and `capture` take as many unless told.
 
     **Arguments**: `stiffness` k N/m; `damping` c N s/m, or in its place `restitution` e, above 0, up to 1.
 
@@ -79,8 +79,9 @@ class LoadContact(Effect):
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
-        """On a circle, in the order of the track, less than a turn from the first to the last."""
+        """On a circle, in the order of the track, less than a turn from the first to the last; else not inside each other."""
         if not loads.circular:
+            self._require_apart(loads, u)
             return
         phi = np.asarray(u[0])
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
@@ -88,6 +89,22 @@ class LoadContact(Effect):
             which = np.round(phi[wrong][0] if phi.ndim > 1 else phi, 4).tolist()
             problem = "loads in contact never pass each other: each angle must be above the one before, all within one turn"
             raise InputError("start.angle", f"is {which} rad; {problem} (add 2 pi where a load is a turn behind, or sort them)")
+
+    def _require_apart(self, loads: Loads, u: tuple[Array, ...]) -> None:
+        place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
+        points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
+        wide = 2.0 * np.asarray(loads.own_radius).reshape(-1, 1, 1)  # pyright: ignore[reportAttributeAccessIssue]
+        apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
+        apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
+        if np.min(apart) < _NEAREST:
+            run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
+            size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
+            problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
+            raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
+
+    def own_rate(self, loads: Loads, speed: Array) -> Array:
+        """sqrt(k / mu): what a contact swings with."""
+        return jnp.sqrt(self.stiffness / self._reduced(loads))
 
     def prepared(self, loads: Loads) -> LoadContact:
         """The same with the damping that the restitution stands for."""
@@ -99,7 +116,9 @@ class LoadContact(Effect):
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
         """k (2 r - s)^2 / 2 of the pairs that overlap, an entry a load."""
-        parts = [0.5 * self.stiffness * share * jnp.maximum(-gap, 0.0) ** 2 for share, gap in _clearances(loads, u)]
+        parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
+        if parts[-1].shape != (loads.count,):  # opposite loads make half as many pairs
+            parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
 
     def load_resistance(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -107,15 +126,14 @@ class LoadContact(Effect):
         damping = self._damping(loads)
 
         def gaps(*v: Array) -> tuple[Array, ...]:
-            return tuple(gap for _, gap in _clearances(loads, v))
+            return tuple(_clearances(loads, v))
 
         clearances, back = jax.vjp(gaps, *u)
         _, partings = jax.jvp(gaps, u, rate)
-        shares = [share for share, _ in _clearances(loads, u)]
         return back(
             tuple(
-                share * jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
-                for share, gap, parting in zip(shares, clearances, partings, strict=True)
+                jnp.where(gap < 0.0, jnp.maximum(-damping * parting, self.stiffness * gap), 0.0)
+                for gap, parting in zip(clearances, partings, strict=True)
             )
         )
 
@@ -123,11 +141,18 @@ class LoadContact(Effect):
         """c, as it is given or as the restitution asks for."""
         if self.restitution is None:
             return self.damping
+        return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * self._reduced(loads))
+
+    def _reduced(self, loads: Loads) -> Array:
+        """mu, of the lightest loads where they differ."""
         across, up, *_ = loads.position(*loads.rest())
         arm = jnp.hypot(across[0], up[0])
         own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
-        reduced = 0.5 * loads.inertia_factor() * loads.mass / (1.0 - (own / arm) ** 2)
-        return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * reduced)
+        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own / arm) ** 2)
+
+
+_NEAREST = 0.9
+"""Loads may start so near to each other, in their diameters: those of a run that is gone on with may be pressed together."""
 
 
 def damping_ratio(restitution: Array) -> Array:
@@ -160,19 +185,20 @@ def _loss(ratio: Array) -> Array:
     return jnp.where(middle, series, jnp.where(near < 0.0, below, above))
 
 
-def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[tuple[float, Array]]:
-    """Distances (count,) surface to surface between each load and the one so many further, negative where they overlap, for
-    every such number; and the share of each entry: 1/2 where every pair is there twice."""
+def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
+    """Distances surface to surface, negative where they overlap, between each load and the one so many further, for every such
+    number: every pair once."""
     own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(loads, CircularLoads):
         (phi,) = u
         ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])
-        return [(1.0, 2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own)]
+        return [2.0 * loads.radius * jnp.sin(0.5 * jnp.clip(ahead - phi, -jnp.pi, jnp.pi)) - 2.0 * own]
     n, place = loads.count, loads.position(*u)
     found = []
     for k in range(1, n // 2 + 1):
-        square = sum((jnp.concatenate([x[k:], x[:k]]) - x) ** 2 for x in place)
+        pairs = n // 2 if 2 * k == n else n
+        square = sum((jnp.concatenate([x[k:], x[:k]])[:pairs] - x[:pairs]) ** 2 for x in place)
         same = square == 0.0
         distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
-        found.append((0.5 if 2 * k == n else 1.0, distance - 2.0 * own))
-    return found or [(1.0, jnp.ones_like(u[0]))]
+        found.append(distance - 2.0 * own)
+    return found or [jnp.ones_like(u[0])]

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.dynamics import Spin, State
 from jaxvib.machine.scene import Scene
 from jaxvib.units import traced
 
@@ -32,12 +32,19 @@ def error_scale(state: State, unit: State) -> State:
     def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
 
+    spin = None
+    if unit.spin is not None and state.spin is not None:
+        twist, slip = unit.spin.twist, unit.spin.slip
+        slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in state.angle)
+        # A spin grows with nothing but chance to bound it.
+        spin = Spin(None if twist is None or state.spin.twist is None else largest(state.spin.twist, twist), slip)
     return State(
         largest(state.displacement, unit.displacement),
         largest(state.velocity, unit.velocity),
         tuple(xp.asarray(unit.angle[0]) for _ in state.angle),
         tuple(xp.asarray(unit.rate[0]) for _ in state.rate),
         None if unit.rotor is None else (xp.asarray(unit.rotor[0]), xp.asarray(unit.rotor[1])),
+        spin,
     )
 
 
@@ -102,7 +109,7 @@ def turned(state: State, to: State) -> State:
     rotor = None
     if state.rotor is not None and to.rotor is not None:
         rotor = (near(state.rotor[0], to.rotor[0]), state.rotor[1])
-    return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor)
+    return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor, state.spin)
 
 
 def _library(tree: PyTree[Array]) -> ModuleType:

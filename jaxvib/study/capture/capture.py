@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,12 +12,14 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, ensemble
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import added_rate
 from jaxvib.motion.run import Run
+from jaxvib.motion.start import Turning, with_spin
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -26,13 +28,16 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["CAUGHT", "PER_RADIAN", "Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
+__all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "steps_per_second", "thrown_state"]
 
 CAUGHT = 3e-3
 """A load whose mean speed differs from the rotor's by less turns with it, as in `regime`."""
 
 PER_RADIAN = 1.0
 """Steps for each radian of what moves fastest, balls up and down their tube: errors far below those of chance."""
+
+_PER_ADDED = 2.0
+"""Steps for each radian of what effects add, such as a contact between balls: six for a collision."""
 
 _SCAN = 32
 """Initial speeds that are tried side by side where a threshold is looked for."""
@@ -110,6 +115,13 @@ class Capture(Result):
         return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold))
 
 
+def steps_per_second(scene: Scene) -> float:
+    """How many equal steps a second resolve what moves in the tube, and the contacts and slips that effects add."""
+    speed, own = scene.drive.speed, scene.loads.own_frequency(scene.drive.speed)
+    slowest = float(speed) if own is None else float(jnp.max(own))
+    return max(PER_RADIAN * slowest, _PER_ADDED * float(added_rate(scene)))
+
+
 def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
     """The carrier at rest, the loads side by side at the bottom of the tube, all at the same speed relative to the rotor.
 
@@ -140,6 +152,7 @@ def capture(
     spread: Number = 1e-3,
     seed: int = 0,
     resolution: float | None = None,
+    turning: Turning = "rolling",
     stepsize_controller: EqualSteps | None = None,
     equations: Equations = vector_field,
 ) -> Capture:
@@ -156,7 +169,10 @@ def capture(
     - `turns` of the rotor that each run takes; a capture that needs more counts as a failure
     - `starts` a speed; all but the first are moved along the ring, each load by itself, by up to `spread` rad, by `seed`
     - `resolution`: how finely the threshold is looked for, relative to the rotor's speed
-    - `stepsize_controller`: `EqualSteps(n)` for the whole run; the default is a step for each radian of the fastest motion
+    - `turning` "rolling", for balls that roll from the start, or "still", for balls that are thrown without turning, so that
+      they slide until they roll; it needs the effect `Sliding`
+    - `stepsize_controller`: `EqualSteps(n)` for the whole run; the default is a step for each radian of the fastest motion, two
+      where that is a contact between balls or the end of a slip
     - `equations`: as `ensemble`; `jaxvib.study.capture.published_torus.printed_torus` for the paper's printed ones
 
     **Returns** `Capture`. **Raises** `InputError` for loads that are none of a torus, a motor, and numbers not allowed.
@@ -177,6 +193,11 @@ def capture(
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
         raise InputError("resolution", f"is {resolution!r}; it must be between 0 and 1, such as 1e-3")
+    if turning not in get_args(Turning):
+        raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
+    if turning == "still" and not any(effect.slip_limit is not None for effect in scene.effects):
+        problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (property slip_limit)"
+        raise InputError("turning", problem)
     tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
     allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
     if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
@@ -186,15 +207,16 @@ def capture(
     shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
     shifts[0] = 0.0
     if stepsize_controller is None:
-        fastest = float(fastest_and_slowest(scene)[0])
-        stepsize_controller = EqualSteps(max(16, math.ceil(PER_RADIAN * end * fastest)))
+        fastest = max(steps_per_second(scene), PER_RADIAN * float(jnp.max(natural_frequencies(scene))))
+        stepsize_controller = EqualSteps(max(16, math.ceil(end * fastest)))
 
     def outcomes(which: np.ndarray) -> list[np.ndarray]:
         """Which runs are captured, stay finite, leave their wall, (speeds, starts) each."""
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
-        ran = ensemble(_thrown, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
+        make = _thrown if turning == "rolling" else _thrown_still
+        ran = ensemble(make, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
         finite = np.asarray(ran.finite)
         found = (np.all(slip < CAUGHT, axis=1) & finite, finite, np.any(ran.detached, axis=1))
@@ -216,6 +238,11 @@ def capture(
 def _thrown(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
     scene, speed, shift = value
     return scene, thrown_state(scene, speed, shift)
+
+
+def _thrown_still(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
+    scene, state = _thrown(value)
+    return scene, with_spin(scene, state, "still")
 
 
 def _least(captured: np.ndarray) -> int:

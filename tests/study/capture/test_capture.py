@@ -43,6 +43,29 @@ def test_fractions_are_of_perturbed_starts_and_say_their_error():
     np.testing.assert_array_equal(again.captured, found.captured)
 
 
+def test_a_threshold_curve_is_captures_beside_each_other():
+    speeds = np.linspace(-1.0, -0.1, 4)
+    curve = jv.threshold_curve(published_torus, [2.5, 3.5], speeds, turns=150)
+    alone = jv.capture(published_torus(3.5), speeds, turns=150)
+    assert curve.threshold[1] == float(alone.threshold) and curve.uncertainty[1] == float(alone.uncertainty)
+    assert np.all((curve.least >= -1.0) & (curve.least <= -0.1)) and curve.summary().count("+-") == 2
+    assert len(curve.plot().axes) == 1
+    with pytest.raises(jv.InputError, match=r"values is \[\]; one finite number"):
+        jv.threshold_curve(published_torus, [])
+
+
+def test_captures_of_balls_that_are_thrown_without_turning():
+    base = published_torus(3.5)
+    scene = jv.Scene(base.machine, base.loads, base.drive, (*base.effects, jv.Sliding(0.1)))
+    rolled, slid = (jv.capture(scene, [-0.7, -0.1], turns=20, turning=how) for how in ("rolling", "still"))
+    assert np.all(rolled.finite) and np.all(slid.finite) and not np.any(rolled.captured[0])
+    start = jv.with_spin(scene, thrown_state(scene, -0.7), "still")
+    np.testing.assert_allclose(start.spin.slip[0], -0.7 * 140.0 * 0.2)
+    for scene_, how, says in ((base, "still", "property slip_limit"), (scene, "asleep", "it must be 'rolling' or 'still'")):
+        with pytest.raises(jv.InputError, match=says):
+            jv.capture(scene_, [-0.5], turns=5, turning=how)
+
+
 @pytest.mark.parametrize(("equations", "lever"), [(printed_torus, 2.5), (letter_torus, 15.0), (cosine_torus, 2.5)])
 def test_the_printed_model_is_its_equations_solved_together(equations, lever):
     """Against the printed equations with x'', y'' and the balls' accelerations as unknowns of one linear system."""

@@ -1,0 +1,135 @@
+"""What the contact of a rolling load asks of its track, what the track can give, and how a load slides."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.effects.base import Friction, SlipLimit
+from jaxvib.machine.loads import Loads, Pressing
+
+__all__ = ["Kinematics", "Slid", "dot", "kinematics", "missing_force", "slid", "slip_rates", "total"]
+
+Coordinates: TypeAlias = tuple[Array, ...]
+"""An array (count,) for each coordinate of a load."""
+
+
+class Kinematics(NamedTuple):
+    """Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x, a y and, where loads move so, a z."""
+
+    columns: list[tuple[Array, ...]]
+    curvature: tuple[Array, ...]
+
+    @property
+    def sizes(self) -> list[Array]:
+        """|dp/du_i|, m."""
+        return [jnp.sqrt(dot(column, column)) for column in self.columns]
+
+
+def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
+    """J and (dJ/dt) u' of all loads at once (the position acts elementwise)."""
+
+    def along(direction: Coordinates) -> Callable[..., tuple[Array, ...]]:
+        return lambda *v: jax.jvp(loads.position, v, direction)[1]
+
+    columns = [along(_unit(u, i))(*u) for i in range(len(u))]
+    return Kinematics(columns, jax.jvp(along(rate), u, rate)[1])
+
+
+def missing_force(
+    loads: Loads, found: Kinematics, change: Coordinates, a: Mapping[int, Array], force: Sequence[Array], kappa: Array | float
+) -> list[Array]:
+    """What a motion needs along each coordinate's unit tangent besides the generalised `force`, (count,) N each.
+
+        [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
+
+    `change` u''; `a` the acceleration of what carries the loads, by axis; `kappa` 1 for the loads' mass alone.
+    """
+    columns, curvature = found
+    needed = []
+    for column, f, size in zip(columns, force, found.sizes, strict=True):
+        inertial = dot(column, curvature) + total(dot(column, other) * x for other, x in zip(columns, change, strict=True))
+        carried = total(column[axis] * x for axis, x in a.items())
+        needed.append((loads.mass * (kappa * inertial + carried) - f) / size)
+    return needed
+
+
+class Slid(NamedTuple):
+    """Loads that stick or slide, each by itself: the inertia factor, the generalised force, the friction of what slides."""
+
+    kappa: Array
+    force: list[Array]
+    friction: list[Friction]
+
+
+def slid(
+    loads: Loads,
+    found: Kinematics,
+    slip: Coordinates,
+    limit: SlipLimit,
+    pressing: Pressing,
+    a: Mapping[int, Array],
+    needed: Sequence[Array],
+    rolling: Sequence[Array],
+    centre: Sequence[Array],
+    friction: Sequence[Friction],
+) -> Slid:
+    """How each load goes on, from the motion in which all of them roll: by that what the contact is asked for is known.
+
+    **Arguments**: `needed` along the track by that motion, N; `a` its acceleration of what carries the loads; the generalised
+    force of what acts on a load that is `rolling`, and at its `centre` alone; `friction` of the rolling.
+    """
+    kappa = loads.inertia_factor()
+    normal = pressing.at(a)
+    hold = limit.coefficient * (jnp.maximum(normal, 0.0) if loads.one_sided else jnp.abs(normal))
+    wanted = [f - hold * c / limit.width for f, c in zip(needed, slip, strict=True)]
+    fast = dot(slip, slip) > limit.width**2
+    slides = fast | (dot(wanted, wanted) > hold**2)
+    along = [jnp.where(fast, -c, f) for c, f in zip(slip, wanted, strict=True)]
+    size = jnp.sqrt(jnp.where(slides, dot(along, along), 1.0))
+    levers = [jnp.where(slides, limit.coefficient * f / size, 0.0) * arm for f, arm in zip(along, found.sizes, strict=True)]
+    rubbing = Friction(levers[0], pressing.reaction, pressing.normal, tuple(levers[1:]), loads.one_sided).signed(a)
+    # A slip within the width dies out while the load rolls.
+    dying = [arm * kappa * hold * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
+    force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, dying, strict=True)]
+    kept = [
+        each._replace(
+            lever=jnp.where(slides, 0.0, each.lever), others=tuple(jnp.where(slides, 0.0, lever) for lever in each.others)
+        )
+        for each in friction
+    ]
+    return Slid(jnp.where(slides, 1.0, kappa), force, [*kept, rubbing])
+
+
+def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
+    """How the slip along each coordinate changes: `change` (c')_t, and what the turning of the tangents adds."""
+
+    def tangents(*v: Array) -> list[list[Array]]:
+        columns = [jax.jvp(loads.position, v, _unit(v, i))[1] for i in range(len(v))]
+        return [[x / jnp.sqrt(dot(column, column)) for x in column] for column in columns]
+
+    straight, turning = jax.jvp(tangents, u, rate)
+    return tuple(
+        h - total(c * dot(turn, along) for c, turn in zip(slip, turning, strict=True))
+        for h, along in zip(change, straight, strict=True)
+    )
+
+
+def _unit(u: Coordinates, i: int) -> Coordinates:
+    return tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
+
+
+def total(values: Iterable[Array]) -> Array:
+    """The sum of arrays."""
+    return functools.reduce(operator.add, values)
+
+
+def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """The sum of the products of two vectors' components."""
+    return total(a * b for a, b in zip(x, y, strict=True))

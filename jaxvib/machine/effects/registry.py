@@ -1,0 +1,26 @@
+"""The effects that scene files and audits know, by their names there."""
+
+from __future__ import annotations
+
+from jaxvib.machine.effects.base import Gravity, MomentImbalance, StaticImbalance
+from jaxvib.machine.effects.contact import LoadContact
+from jaxvib.machine.effects.friction import DryFriction
+from jaxvib.machine.effects.rolling import RollingFriction
+from jaxvib.machine.effects.spin import FreeSpin, Sliding
+from jaxvib.machine.effects.supports import CubicSupport, Stop
+
+__all__ = ["EFFECTS"]
+
+EFFECTS = {
+    "gravity": Gravity,
+    "static_imbalance": StaticImbalance,
+    "moment_imbalance": MomentImbalance,
+    "dry_friction": DryFriction,
+    "rolling_friction": RollingFriction,
+    "cubic_support": CubicSupport,
+    "stop": Stop,
+    "load_contact": LoadContact,
+    "free_spin": FreeSpin,
+    "sliding": Sliding,
+}
+"""Each builds its effect from the fields of its table."""

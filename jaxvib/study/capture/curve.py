@@ -1,0 +1,122 @@
+"""Capture thresholds over a number of the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.ensemble import Equations
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.study.capture.capture import Capture, Turning, capture
+from jaxvib.units import Number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["ThresholdCurve", "threshold_curve"]
+
+
+class ThresholdCurve(Result):
+    """The initial speed from which on balls are captured, over a number.
+
+    **Attributes** (V values): `value` (V,); `threshold` and `uncertainty` (V,), those of `Capture` at each value: -1 where
+    every start was captured, NaN where not every start at the highest speed was; `least` (V,), the least speed at which any
+    start was captured, NaN where none was: between both, captures and failures alternate; `turns` of the rotor that each run
+    took.
+    """
+
+    status = Computed.done
+
+    value: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    threshold: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    uncertainty: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    least: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    turns: Array = eqx.field(metadata=in_unit(""))
+
+    def summary(self) -> str:
+        """A line for each value, for a person to read."""
+        lines = [f"captured in {int(self.turns)} turns: from which initial speed on, and the least, in the rotor's speed"]
+        for each in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
+            value, threshold, uncertainty, least = map(float, each)
+            found = "not every start" if np.isnan(threshold) else f"{threshold:.4f} +- {uncertainty:.1e}"
+            lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; the least {least:.4f}"))
+        return "\n".join(lines)
+
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """Thresholds with their uncertainty over the values, and the least captured speeds.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        """
+        from jaxvib.draw.capture import curve_chart  # slow to import: only who draws pays
+
+        return curve_chart(self.value, self.threshold, self.uncertainty, self.least, ax=ax)
+
+
+def threshold_curve(
+    make: Callable[[float], Scene],
+    values: Sequence[float] | np.ndarray,
+    speeds: Sequence[float] | np.ndarray | None = None,
+    *,
+    turns: int = 2000,
+    starts: int = 1,
+    spread: Number = 1e-3,
+    seed: int = 0,
+    resolution: float | None = None,
+    turning: Turning = "rolling",
+    equations: Equations = vector_field,
+) -> ThresholdCurve:
+    """Capture thresholds of scenes that differ in one number.
+
+    **Arguments**: `make` gives the scene of a value; `values` (V,); all others as `capture`, which is asked for each of them.
+
+    **Returns** `ThresholdCurve`. **Raises** `InputError` for no values, and as `capture`.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from jaxvib.study.capture.published_torus import published_torus
+    >>> curve = jv.threshold_curve(published_torus, [5.4], [-1.0, -0.2], turns=60)
+    >>> curve.threshold.tolist()
+    [-0.6]
+
+    Source: as `capture`.
+    """
+    numbers = np.asarray(values, dtype=float)
+    if numbers.ndim != 1 or numbers.size == 0 or not np.all(np.isfinite(numbers)):
+        raise InputError("values", f"is {values!r}; one finite number at least is needed, in a row")
+    found = [
+        capture(
+            make(float(value)),
+            speeds,
+            turns=turns,
+            starts=starts,
+            spread=spread,
+            seed=seed,
+            resolution=resolution,
+            turning=turning,
+            equations=equations,
+        )
+        for value in numbers
+    ]
+    return ThresholdCurve(
+        value=numbers,
+        threshold=np.array([-1.0 if each.status_name == "all_captured" else float(each.threshold) for each in found]),
+        uncertainty=np.array([0.0 if each.status_name == "all_captured" else float(each.uncertainty) for each in found]),
+        least=np.array([_least(each) for each in found]),
+        turns=jnp.asarray(turns),
+    )
+
+
+def _least(found: Capture) -> float:
+    captured = np.flatnonzero(np.any(found.captured, axis=1))
+    return float(found.speed[captured[0]]) if captured.size else float("nan")
