@@ -80,6 +80,10 @@ from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 from jaxvib.study.stress.result import Stress, StressStatus
 from jaxvib.study.stress.run import stress
 
+# Numbers that the papers print
+from jaxvib.study.published.result import Reproduced, ReproducedStatus
+from jaxvib.study.published.run import reproduce
+
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
@@ -216,6 +220,10 @@ __all__ = [
     "stress",
     "Stress",
     "StressStatus",
+    # Numbers that the papers print
+    "reproduce",
+    "Reproduced",
+    "ReproducedStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",

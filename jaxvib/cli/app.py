@@ -109,6 +109,7 @@ _HOMES = {
     "capture": "study.capture",
     "cost": "study.cost",
     "identify": "study.identify",
+    "reproduce": "study.reproduce",
     "stress": "study.stress",
     "whirl": "whirl",
     "criterion": "criterion",

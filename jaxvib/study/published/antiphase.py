@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import cast
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.linear import natural_frequencies, steady_displacement
 from jaxvib.machine.dimensionless import Dimensionless
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.roots import bracketed_root
@@ -26,8 +27,8 @@ _PAPER = "antiphase"
 _BIFURCATIONS = ((0.3339, 0.7978), (0.3806, 0.4141), (1.0015, 5.1829), (1.2154, 1.3932))
 """(41), (42): load speeds where jams appear or vanish, each with its rotor speed; (42) lists these in another order."""
 
-_OTHER = dict(natural=(0.3, 0.5), link_natural=0.6, rho=1.3)
-"""A machine whose supports are not alike, on which general formulas are tried."""
+_OTHER = ((0.3, 0.5), 0.6, 1.3)
+"""n1 and n2, n12, rho of a machine whose supports are not alike, on which general formulas are tried."""
 
 
 def antiphase_scene(speed: float = 3.0, count: int = 1, beta: float = 1.0) -> Scene:
@@ -36,16 +37,32 @@ def antiphase_scene(speed: float = 3.0, count: int = 1, beta: float = 1.0) -> Sc
     >>> antiphase_scene().loads.count
     1
     """
-    return _form(speed=speed, count=count, beta=beta).scene()
+    return _form((1 / 3, 1 / 3), 2 / 3, 1.0, speed=speed, count=count, beta=beta).scene()
 
 
 def _form(
-    *, speed: float = 3.0, count: int = 1, beta: float = 1.0, damping: tuple[float, ...] = (0.01, 0.01, 0.01), **machine: object
+    natural: tuple[float, float],
+    link_natural: float,
+    rho: float,
+    damping: tuple[float, float, float] = (0.01, 0.01, 0.01),
+    *,
+    speed: float = 3.0,
+    count: int = 1,
+    beta: float = 1.0,
 ) -> Dimensionless:
-    numbers = dict(natural=(1 / 3, 1 / 3), link_natural=2 / 3, rho=1.0) | machine
+    """`damping` h1, h2, h12."""
     return Dimensionless(
-        "antiphase", damping=damping[:2], link_damping=damping[2], eps=1e-4, beta=beta, speed=speed, count=count, **numbers
-    )  # pyright: ignore[reportArgumentType]
+        "antiphase",
+        natural=natural,
+        link_natural=link_natural,
+        rho=rho,
+        damping=damping[:2],
+        link_damping=damping[2],
+        eps=1e-4,
+        beta=beta,
+        speed=speed,
+        count=count,
+    )
 
 
 def antiphase_paper() -> PaperAnswer:
@@ -89,53 +106,46 @@ def _numbers() -> list[PublishedRow]:
 
 
 def _formulas() -> list[PublishedRow]:
-    (n1, n2), n12, rho = (0.3, 0.5), 0.6, 1.3
-    form = _form(damping=(0.0, 0.0, 0.0), **_OTHER)
-    still = _at_speed(form.scene())
+    (n1, n2), n12, rho = _OTHER
+    form = _form(*_OTHER, (0.0, 0.0, 0.0))
+    still = form.scene()
     stiffness = cast(Platforms, still.machine).stiffness
     ideal = math.sqrt(n1**2 * n2**2 + n12**2 * n1**2 + rho * n12**2 * n2**2) / n2
 
-    def force(omega):
-        return jnp.sum(stiffness * steady_displacement(still, omega).imag)
+    @jax.jit
+    def quiet(near: Array) -> tuple[Array, Array]:
+        """The speed near that one at which the supports' forces cancel, and the platforms' motion there."""
+        omega = bracketed_root(lambda w: jnp.sum(stiffness * steady_displacement(still, w).imag), 0.9 * near, 1.1 * near)
+        return omega, -form.read(amplitude=steady_displacement(still, omega).imag)["amplitude"]
 
-    found = float(bracketed_root(force, jnp.asarray(0.9 * ideal), jnp.asarray(1.1 * ideal)))
-    both = -form.read(amplitude=steady_displacement(still, jnp.asarray(found)).imag)["amplitude"]
+    found, both = quiet(jnp.asarray(ideal))
     said = f"n1 = {n1}, n2 = {n2}, n12 = {n12}, rho = {rho}"
-    quiet = "the speed at which the supports' forces cancel"
-    rows = [
-        compared(_PAPER, "(16)", quiet, ideal, found, within=1e-9, kind="formula", note=said),
-        compared(
-            _PAPER, "(13)", "platform 1 there", n2**2 / (n1**2 - n2**2), float(both[0]), within=1e-9, kind="formula", note=said
-        ),
-        compared(
-            _PAPER, "(13)", "platform 2 there", -(n1**2) / (n1**2 - n2**2), float(both[1]), within=1e-9, kind="formula", note=said
-        ),
-    ]
-    damped = _form(damping=(0.02, 0.05, 0.01), **_OTHER)
-    omega = 0.7
-    computed = float(jnp.abs(damped.read(amplitude=steady_displacement(_at_speed(damped.scene()), omega))["amplitude"][1]))
-    amplitude = [_platform_2(omega, (n1, n2), n12, (0.02, 0.05), 0.01, rho, own) for own in (0, 1)]
+    row = partial(compared, _PAPER, within=1e-9, kind="formula")
+    (h1, h2, h12), omega = (0.02, 0.05, 0.01), 0.7
+    damped = _form(*_OTHER, (h1, h2, h12))
+    answer = jax.jit(steady_displacement)(damped.scene(), jnp.asarray(omega))
+    computed = float(jnp.abs(damped.read(amplitude=answer)["amplitude"][1]))
+    printed, corrected = (_platform_2(omega, (n1, n2), n12, (h1, h2), h12, rho, own) for own in (0, 1))
     note = (
-        "a33 = n2^2 + n12^2 - W^2, a34 = -2 W (h2 + h12): the exciter's platform stands on its own support, whose numbers 2 "
-        f"are printed as 1; it matters where supports differ ({said}, h1 = 0.02, h2 = 0.05, h12 = 0.01, W = 0.7); proved by the "
-        "machine's equations, solved for the steady motion"
+        "a33 = n2^2 + n12^2 - W^2, a34 = -2 W (h2 + h12): the exciter's platform stands on its own support, "
+        "whose numbers 2 "
+        f"are printed as 1; it matters where supports differ ({said}, h1 = {h1}, h2 = {h2}, h12 = {h12}, W = "
+        f"{omega}); proved "
+        "by the machine's equations, solved for the steady motion"
     )
-    rows.append(
-        compared(
-            _PAPER, "(29), a33, a34", "amplitude of platform 2", amplitude[0], computed, within=1e-9, kind="formula",
-            known=MISPRINT, corrected=amplitude[1], note=note,
-        )
-    )  # fmt: skip
-    return rows
+    return [
+        row("(16)", "speed at which the supports' forces cancel", ideal, float(found), note=said),
+        row("(13)", "platform 1 there", n2**2 / (n1**2 - n2**2), float(both[0]), note=said),
+        row("(13)", "platform 2 there", -(n1**2) / (n1**2 - n2**2), float(both[1]), note=said),
+        row("(29), a33, a34", "amplitude of platform 2", printed, computed, known=MISPRINT, corrected=corrected, note=note),
+    ]
 
 
-def _at_speed(scene: Scene) -> Scene:
-    """The scene as questions about given load speeds have it."""
-    return eqx.tree_at(lambda s: s.drive, scene, ConstantSpeed(3.0))
-
-
-def _platform_2(omega: float, natural: tuple[float, ...], n12: float, damping: tuple[float, ...], h12: float, rho: float, own: int):
-    """Amplitude of platform 2 by the determinants (27) to (30), s = 1; `own` 0 with the support of platform 1 in a33, a34."""
+def _platform_2(
+    omega: float, natural: tuple[float, float], n12: float, damping: tuple[float, float], h12: float, rho: float, own: int
+) -> float:
+    """Amplitude of platform 2 by the determinants (27) to (30), s = 1; `own` 0 with the support of platform 1 "
+    "in a33, a34."""
     (n1, h1), (n, h) = (natural[0], damping[0]), (natural[own], damping[own])
     one = n1**2 + rho * n12**2 - omega**2 + 2j * omega * (h1 + rho * h12)
     two = n**2 + n12**2 - omega**2 + 2j * omega * (h + h12)

@@ -18,7 +18,7 @@ _LEAST, _MOST = 1e-9, 30.0
 
 
 def verdict_chart(rows: Sequence[PublishedRow], *, ax: Axes | None = None) -> Figure:
-    """Relative differences of printed and computed numbers, a line for each row with its bound as a bar, a mark for each verdict;
+    """Relative differences of printed and computed numbers, a line for each row, its bound a bar, a mark for each verdict;
     what cannot be computed stands at the right."""
     figure, (axes,) = panels(1, size=(9.0, 1.6 + 0.2 * max(len(rows), 4)), ax=ax)
     for k, row in enumerate(rows):

@@ -26,9 +26,9 @@ class PublishedRow(NamedTuple):
     """A printed number beside the computed one.
 
     **Attributes**: `paper`; `kind`; `place` in the paper; `quantity` and its `unit`; `printed`: the number, or what the printed
-    formula gives; `computed` by this package, NaN where nothing can be computed; `difference` of the two; `within`: how far they
-    may be apart, half a unit of the last printed digit unless the note says otherwise; `corrected`: what the corrected formula
-    or datum gives, NaN where nothing is corrected; `verdict`; `known`: the verdict that this version of the package is known to
+    formula gives; `computed` by this package, NaN where nothing can be computed; `difference` of the two; `within`: how far
+    they may be apart, half a unit of the last printed digit unless the note says otherwise; `corrected`: what the corrected
+    formula or datum gives, NaN where nothing is corrected; `verdict`; `known`: the verdict that this version is known to
     come to; `note`: under which reading, why not, or the correction and the check that proves it.
     """
 
@@ -76,8 +76,8 @@ def compared(
 ) -> PublishedRow:
     """The row of a printed number, its verdict from the numbers alone.
 
-    "reproduced" where printed and computed are not further apart than `within`; else "misprint" where what the corrected formula
-    gives is that near to the computed number; else "not reproducible".
+    "reproduced" where printed and computed are not further apart than `within`; else "misprint" where what the corrected
+    formula gives is that near to the computed number; else "not reproducible".
 
     >>> compared("a", "(1)", "x", 0.33, 0.3349, within=0.005).verdict
     'reproduced'
