@@ -94,6 +94,8 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 
 # Results
+from jaxvib.report.page import html_report
+from jaxvib.results.csv import write_csv
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
 
@@ -242,4 +244,6 @@ __all__ = [
     # Results
     "Result",
     "load",
+    "write_csv",
+    "html_report",
 ]

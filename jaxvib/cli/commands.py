@@ -10,6 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.ode.progress import ProgressBar
@@ -53,6 +54,7 @@ def new(kind: str, output: Output) -> None:
 @click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Fail after so many steps.")
 @click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
+@CSV
 @shared
 def simulate(
     scene: Path,
@@ -65,9 +67,12 @@ def simulate(
     accuracy: float | None,
     max_steps: int | None,
     window: bool,
+    csv: Path | None,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    if csv is not None and window:
+        raise InputError("--csv", "goes without --window, which keeps no trajectory to write")
     loaded = jv.load_scene(scene)
     run = jv.simulate(
         loaded,
@@ -81,10 +86,11 @@ def simulate(
         save="window" if window else "all",
         progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
-    picture, data = output.file("history.png"), output.file("run.npz")
-    if picture is not None and data is not None:
-        run.plot().savefig(picture)
+    output.picture("history.png", run.plot)
+    data = output.file("run.npz")
+    if data is not None:
         run.save(data)
+    output.csv(csv, run, "time")
     structure = loaded.machine.structure()
     document = {
         "status": "done",
@@ -107,7 +113,7 @@ def simulate(
         "evaluations": int(run.evaluations),
         "seconds": float(run.seconds),
     }
-    output.done(document, run.summary, "simulate")
+    output.done(document, run.summary, "simulate", run)
 
 
 def _steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:

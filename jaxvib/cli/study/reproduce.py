@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @app.command("reproduce")
 @click.argument("papers", nargs=-1, metavar="[PAPER]...")
-@click.option("--full", is_flag=True, help="All six rows of the torus paper's tables in place of one; many minutes.")
+@click.option("--full", is_flag=True, help="All six rows of the torus paper's tables in place of one; minutes more.")
 @click.option("--list", "listing", is_flag=True, help="Say what the papers are, and compute nothing.")
 @shared
 @click.pass_context
@@ -32,18 +32,17 @@ def reproduce(context: click.Context, papers: tuple[str, ...], full: bool, listi
         return
 
     def figure(name: str, draw: Callable[[], Figure]) -> None:
-        picture = output.file(f"{name}.png")
-        if picture is not None:
-            draw().savefig(picture)
+        output.picture(f"{name}.png", draw)
 
     found = jv.reproduce(papers, full=full, report=lambda name: click.echo(f"{name}: computing", err=True), figure=figure)
-    picture = output.file("reproduce.png")
-    if picture is not None:
-        found.plot().savefig(picture)
-    tables = [_table(name, found.of(name)) for name in found.papers] if not output.as_json else []
-    output.done(found.as_dict(), lambda: "\n".join([*tables, found.summary()]), "reproduce")
+    output.picture("reproduce.png", found.plot)
+    output.done(found.as_dict(), lambda: _text(found), "reproduce", found)
     if found.unexpected:
         context.exit(1)
+
+
+def _text(found: jv.Reproduced) -> str:
+    return "\n".join([*(_table(name, found.of(name)) for name in found.papers), found.summary()])
 
 
 def _table(paper: str, rows: list[PublishedRow]) -> str:

@@ -47,7 +47,9 @@ def rotor_paper() -> PaperAnswer:
     True
     """
     rows = [*_critical_speeds(), *_data(), *_jams(), *_run_ups(), *_measured()]
-    return PaperAnswer(rows, {"campbell": lambda: whirl(published_rotor()).plot(), "figure_4_curve_2": _figure_4})
+    return PaperAnswer(
+        rows, {"campbell": lambda: whirl(published_rotor(), np.linspace(0.0, 600.0, 121)).plot(), "figure_4_curve_2": _figure_4}
+    )
 
 
 def _figure_4() -> Figure:

@@ -53,7 +53,7 @@ def reproduce(
     **Arguments**
 
     - `papers`: names of `PAPERS`; all unless said otherwise
-    - `full`: all six rows of the torus paper's tables in place of one, many minutes
+    - `full`: all six rows of the torus paper's tables in place of one, some minutes more
     - `report`: is called with the name of each paper as it is begun
     - `figure`: is called with the name of each figure that is drawn again and with what draws it
 
