@@ -6,6 +6,7 @@ import ast
 import importlib
 import json
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +57,13 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
+    "describe": "describe",
+    "envelope": "motion.settle",
+    "growth": "motion.settle",
+    "onset": "motion.stability",
+    "run-ups": "motion.run_ups",
+    "settle": "motion.settle",
+    "stability-map": "motion.stability",
     "audit": "study.audit",
     "capture": "study.capture",
     "cost": "study.cost",
@@ -94,7 +102,7 @@ def _first_line(name: str) -> str:
     source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):
-            return click.utils.make_default_short_help(ast.get_docstring(node) or "", 62)
+            return textwrap.shorten((ast.get_docstring(node) or "").split("\n\n")[0], 62, placeholder="...")
     return ""
 
 

@@ -100,8 +100,12 @@ class Output:
         self, path: Path, document: dict[str, Any], text: Callable[[], str], name: str, result: Result | None
     ) -> None:
         from jaxvib.machine.files import load_scene
+        from jaxvib.machine.scene import Scene
         from jaxvib.report.page import Report, units_of
 
+        scene = getattr(result, "scene", None)
+        if not isinstance(scene, Scene):
+            scene = None if self.scene is None else load_scene(self.scene)
         asked = click.get_current_context().find_root().obj or [name]
         found = Report(
             title=f"jaxvib {name}",
@@ -109,7 +113,7 @@ class Output:
             document=document,
             units={} if result is None else units_of(result),
             text=text(),
-            scene=None if self.scene is None or self.scene.suffix != ".toml" else load_scene(self.scene),
+            scene=scene,
             figures=self.figures,
         )
         path.write_text(found.html(), encoding="utf-8")

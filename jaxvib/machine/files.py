@@ -69,8 +69,6 @@ EFFECTS = {
     "load_contact": LoadContact,
 }
 SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
-"""What the tables of a scene file may be, by their `kind`."""
-
 
 T = TypeVar("T")
 

@@ -71,7 +71,7 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
                 ]
                 for k, name in enumerate(names)
             }
-            listed = {name: "Sequence" in str(parameters[name].annotation) for name in names}
+            listed = {name: str(parameters[name].annotation).startswith("Sequence") for name in names}
             given = {n: _example(p, several) for n, p in parameters.items() if n not in numeric}
             given |= {n: each if listed[n] else each[0] for n, each in probes.items()}
             # What these numbers make may be no machine; the units are read before that is seen.

@@ -50,9 +50,10 @@ class Report:
         parts = [f"<h1>{escaped(self.title)}</h1>"]
         if self.command:
             parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
-        parts += [_section("What it is worth", worth(self.document, self.units))]
+        units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
+        parts += [_section("What it is worth", worth(self.document, units))]
         parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
-        parts += [_section("Results", results(self.document, self.units))]
+        parts += [_section("Results", results(self.document, units))]
         if self.scene is not None:
             parts += [_section("Machine", parameters(self.scene))]
         if self.text:
@@ -113,6 +114,13 @@ def units_of(result: eqx.Module) -> dict[str, str]:
     return found
 
 
+def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
+    """Of "m or rad" the unit that all coordinates of the scene's machine have, where they are alike."""
+    alike = set(scene.machine.structure().units)
+    which = ("m", "rad").index(*alike) if len(alike) == 1 else None
+    return {name: unit.split(" or ")[which] if which is not None and " or " in unit else unit for name, unit in units.items()}
+
+
 def _section(title: str, body: str) -> str:
     return f"<section><h2>{escaped(title)}</h2>{body}</section>" if body else ""
 
@@ -166,12 +174,13 @@ th, td { padding: 0.2rem 0.7rem 0.2rem 0; text-align: left; vertical-align: top;
 th { font-weight: 600; }
 td.n, th.n { text-align: right; white-space: nowrap; }
 td.unit { color: #555; white-space: nowrap; }
-figure { margin: 1rem 0; break-inside: avoid; }
+figure { margin: 1rem 0; break-inside: avoid; overflow-x: auto; }
 figure img { max-width: 100%; height: auto; }
 figcaption { color: #555; font-size: 0.9rem; }
 pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.25; }
 details { margin-top: 2rem; }
 summary { cursor: pointer; }
+@media screen and (max-width: 40rem) { figure img { max-width: none; width: 44rem; } }
 @media print {
   body { font-size: 10pt; max-width: none; padding: 0; }
   .wide { overflow: visible; }
