@@ -117,8 +117,8 @@ def units_of(result: eqx.Module) -> dict[str, str]:
 def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
     """Of "m or rad" the unit that all coordinates of the scene's machine have, where they are alike."""
     alike = set(scene.machine.structure().units)
-    which = ("m", "rad").index(*alike) if len(alike) == 1 else None
-    return {name: unit.split(" or ")[which] if which is not None and " or " in unit else unit for name, unit in units.items()}
+    choice = {("m",): 0, ("rad",): 1}.get(tuple(alike))
+    return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}
 
 
 def _section(title: str, body: str) -> str:

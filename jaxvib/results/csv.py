@@ -44,7 +44,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
             said = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
             own = _own_unit(unit, axes[1:], place, units)
             head, column = " ".join([name, *filter(None, said)]), values[(slice(None), *place)]
-            parts = [("real ", column.real), ("imaginary ", column.imag)] if np.iscomplexobj(column) else [("", column)]
+            parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
                 heads.append(f"{part}{head} ({own})" if own else part + head)
                 rows.append(numbers)
