@@ -117,7 +117,7 @@ def units_of(result: eqx.Module) -> dict[str, str]:
 def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
     """Of "m or rad" the unit that all coordinates of the scene's machine have, where they are alike."""
     alike = set(scene.machine.structure().units)
-    choice = {("m",): 0, ("rad",): 1}.get(tuple(alike))
+    choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
     return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}
 
 

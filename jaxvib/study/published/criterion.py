@@ -51,7 +51,7 @@ def criterion_paper() -> PaperAnswer:
     >>> [row.place for row in criterion_paper().rows if row.verdict == "misprint"]
     ['(10)', 'after (38), f(0)', '(39), platform 3', '(57), c', '(59), d']
     """
-    three = _form(*_THREE, 0.01, 0.01)
+    three = _form(*_THREE)
     return PaperAnswer([*_one_mass(), *_two_masses(), *_three_masses()], {"three_masses": lambda: criterion(three).plot()})
 
 
