@@ -26,7 +26,7 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
         {
             "kind": kind,
             "about": (inspect.getdoc(build) or "").split("\n\n")[0].replace("\n", " "),
-            "arguments": [argument._asdict() | {"allowed": list(argument.allowed)} for argument in arguments_of(build)],
+            "arguments": [argument._asdict() for argument in arguments_of(build)],
         }
         for kind, build in kinds.items()
     ]
@@ -38,12 +38,13 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
                 [
                     argument["name"],
                     argument["unit"],
-                    "needed" if argument["default"] is None else argument["default"],
+                    "needed" if argument["needed"] else argument["default"] or "none",
                     ", ".join(argument["allowed"]),
                 ]
                 for argument in part["arguments"]
             ]
-            parts.append(table(f"{part['kind']}: {part['about']}", ["argument", "unit", "default", "one of"], rows))
+            parts.append(f"{part['kind']}: {part['about']}")
+            parts.append(table("", ["argument", "unit", "default", "one of"], rows))
         if name is not None:
             parts.append(_manual(kinds[name]))
         return "\n".join(parts)

@@ -23,11 +23,12 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
 
 
 class Argument(NamedTuple):
-    """One argument of a part: its `name`; its `unit`, "" for none; its `default` as text, None where it must be given; the
-    `allowed` texts, where it is one of several."""
+    """One argument of a part: its `name`; its `unit`, "" for none; whether it must be given, `needed`; its `default` as text,
+    None where there is none; the `allowed` texts, where it is one of several."""
 
     name: str
     unit: str
+    needed: bool
     default: str | None
     allowed: tuple[str, ...]
 
@@ -53,8 +54,8 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
     The units are those in which it reads them: it is given quantities that note what they are asked for.
 
     >>> import jaxvib as jv
-    >>> [(a.name, a.unit, a.default) for a in arguments_of(jv.Stop)][:2]
-    [('stiffness', 'N/m', None), ('gap', 'm', None)]
+    >>> [(a.name, a.unit, a.needed, a.default) for a in arguments_of(jv.Stop)][1:3]
+    [('gap', 'm', True, None), ('damping', 'N s/m', False, '0.0')]
     """
     parameters = inspect.signature(build).parameters
     numeric = [name for name, p in parameters.items() if _numeric(str(p.annotation))]
@@ -86,8 +87,8 @@ def arguments_of(build: Callable[..., object]) -> list[Argument]:
                 break
     found = []
     for name, parameter in parameters.items():
-        default = None if parameter.default is parameter.empty else _shown(parameter.default)
-        found.append(Argument(name, units.get(name, ""), default, _choices(build, parameter)))
+        default = None if parameter.default in (parameter.empty, None) else _shown(parameter.default)
+        found.append(Argument(name, units.get(name, ""), name in needed, default, _choices(build, parameter)))
     return found
 
 
@@ -112,7 +113,7 @@ def _choices(build: Callable[..., object], parameter: inspect.Parameter) -> tupl
 
 
 def _shown(value: object) -> str:
-    return "none" if value is None else "true" if value is True else "false" if value is False else str(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def described(group: str, name: str) -> Callable[..., object]:

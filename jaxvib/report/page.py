@@ -174,6 +174,7 @@ th, td { padding: 0.2rem 0.7rem 0.2rem 0; text-align: left; vertical-align: top;
 th { font-weight: 600; }
 td.n, th.n { text-align: right; white-space: nowrap; }
 td.unit { color: #555; white-space: nowrap; }
+td.below { color: #555; padding-left: 1.5rem; }
 figure { margin: 1rem 0; break-inside: avoid; overflow-x: auto; }
 figure img { max-width: 100%; height: auto; }
 figcaption { color: #555; font-size: 0.9rem; }
@@ -186,6 +187,7 @@ summary { cursor: pointer; }
   .wide { overflow: visible; }
   table { font-size: 8pt; }
   tr, figure { break-inside: avoid; }
+  figure img { max-height: 19cm; }
   h2, h3 { break-after: avoid; }
   details { display: none; }
 }

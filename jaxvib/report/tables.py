@@ -29,6 +29,9 @@ _HIDDEN = ("scene", "toml")
 _MOST = 12
 """So many numbers of a list are shown one by one."""
 
+_LONG = 40
+"""A text of more characters than that stands below its row."""
+
 _ROWS = 200
 """So many rows of a table are shown."""
 
@@ -100,12 +103,17 @@ def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
 
 
 def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    """A row for each entry; what is long stands below it, over the whole width."""
+    every = list(dict.fromkeys(name for row in rows for name in row))
+    long = [name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _LONG for row in rows)]
+    names = [name for name in every if name not in long]
     heads = "".join(f"<th{_side(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
-    body = "".join(
-        "<tr>" + "".join(f"<td{_side(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
-        for row in rows[:_ROWS]
-    )
+    body = ""
+    for row in rows[:_ROWS]:
+        body += "<tr>" + "".join(f"<td{_side(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
+        for name in long:
+            if row.get(name):
+                body += f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name])}</td></tr>"
     return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more(len(rows))}"
 
 
@@ -141,6 +149,8 @@ def _cell(value: Plain) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return escaped(f"{value:.6g}")
+    if isinstance(value, (list, tuple)) and value and isinstance(value[0], Mapping):
+        return _rows(value, {})  # pyright: ignore[reportArgumentType]
     if isinstance(value, (list, tuple)):
         return ", ".join(_cell(x) for x in value) or "none"
     if isinstance(value, Mapping):

@@ -173,7 +173,7 @@ def test_describe(typed):
     listed = {part["kind"]: part for part in json.loads(out)["effects"]}
     assert code == 0 and set(listed) == set(EFFECTS)
     reaction = next(a for a in listed["dry_friction"]["arguments"] if a["name"] == "reaction")
-    assert reaction["allowed"] == ["exact", "run_up", "steady"] and reaction["default"] == "exact"
+    assert reaction["allowed"] == ["exact", "run_up", "steady"] and reaction["default"] == "exact" and not reaction["needed"]
     code, out, _ = typed("describe", "drives", "dc_motor")
     assert code == 0 and "stall_torque" in out and "N m" in out and "**Arguments**" in out
     code, _, err = typed("describe", "drives", "dc_motr")
