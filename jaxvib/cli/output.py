@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import jaxvib as jv
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ class Output:
         scene = getattr(result, "scene", None)
         if not isinstance(scene, Scene):
             scene = None if self.scene is None else load_scene(self.scene)
+        draws = getattr(jv, "sketch", None)
         asked = click.get_current_context().find_root().obj or [name]
         found = Report(
             title=f"jaxvib {name}",
@@ -114,6 +116,7 @@ class Output:
             units={} if result is None else units_of(result),
             text=text(),
             scene=scene,
+            sketch=None if scene is None or draws is None else draws(scene),
             figures=self.figures,
         )
         path.write_text(found.html(), encoding="utf-8")

@@ -34,7 +34,7 @@ class Report:
     """What a page is made of.
 
     **Arguments**: `title`; the `document`, plain values as in JSON, and the `units` of its numbers by name; the `command` that
-    it came from; its `text` as a terminal shows it; the `scene` that it is about; `figures` with their names.
+    it came from; its `text` as a terminal shows it; the `scene` that it is about and a `sketch` of it; `figures` by name.
     """
 
     title: str
@@ -44,6 +44,7 @@ class Report:
     text: str = ""
     scene: Scene | None = None
     figures: Sequence[tuple[str, Figure]] = ()
+    sketch: Figure | None = None
 
     def html(self) -> str:
         """The page: HTML with its style and its figures in it, which asks no network for anything. All text is escaped."""
@@ -55,7 +56,8 @@ class Report:
         parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
         parts += [_section("Results", results(self.document, units))]
         if self.scene is not None:
-            parts += [_section("Machine", parameters(self.scene))]
+            sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
+            parts += [_section("Machine", sketch + parameters(self.scene))]
         if self.text:
             parts.append(f"<details><summary>As the terminal shows it</summary><pre>{escaped(self.text)}</pre></details>")
         parts.append(_section("Made with", _versions()))

@@ -66,13 +66,14 @@ def test_a_scene_file_with_a_hostile_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     name = "a<script>alert(1)<b>.toml"
     (tmp_path / name).write_text("# " + HOSTILE + "\n" + jv.scene_to_toml(scene("two_mass", speed=150.0)))
+    monkeypatch.setattr("jaxvib.sketch", lambda scene: Figure(figsize=(1.0, 1.0)), raising=False)
     assert run(["modes", name, "--report", "deep/er/report.html"]) == 0
     assert "wrote deep/er/report.html" in capsys.readouterr().out
     text = (tmp_path / "deep" / "er" / "report.html").read_text()
     page = checked(text)
     said = " ".join(page.text)
     assert name in said and "evil.example" not in text
-    assert "Machine" in said and "N s/m" in said and "by slope, for light loads" in said and len(page.links) == 1
+    assert "Machine" in said and "N s/m" in said and "by slope, for light loads" in said and len(page.links) == 2
     assert "amplitude, m" in said and "m or rad" not in said and "omega, rad/s" in said and "jaxvib" in said
 
 
