@@ -10,7 +10,6 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.study.published.run import PAPERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
 def reproduce(context: click.Context, papers: tuple[str, ...], full: bool, listing: bool, output: Output) -> None:
     """Numbers that the source papers print beside computed ones, with verdicts; PAPER is antiphase, criterion, rotor, torus or
     bearing [all, some minutes]. --out draws their figures again. Exit code 1: a verdict is not the one that is known."""
+    from jaxvib.study.published.run import PAPERS  # slow to import, and --help needs none of it
+
     if listing:
         output.done({"papers": PAPERS}, lambda: "\n".join(f"{name}: {about}" for name, about in PAPERS.items()), "papers")
         return
@@ -46,6 +47,8 @@ def _text(found: jv.Reproduced) -> str:
 
 
 def _table(paper: str, rows: list[PublishedRow]) -> str:
+    from jaxvib.study.published.run import PAPERS
+
     def shown(value: float, unit: str = "") -> str:
         return "" if math.isnan(value) else f"{value:.6g} {unit}".rstrip()
 
