@@ -81,6 +81,10 @@ from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 from jaxvib.study.stress.result import Stress, StressStatus
 from jaxvib.study.stress.run import stress
 
+# Numbers that the papers print
+from jaxvib.study.published.result import Reproduced, ReproducedStatus
+from jaxvib.study.published.run import reproduce
+
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
@@ -92,6 +96,8 @@ from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Results
+from jaxvib.report.page import html_report
+from jaxvib.results.csv import write_csv
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
 
@@ -222,6 +228,10 @@ __all__ = [
     "stress",
     "Stress",
     "StressStatus",
+    # Numbers that the papers print
+    "reproduce",
+    "Reproduced",
+    "ReproducedStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",
@@ -242,4 +252,6 @@ __all__ = [
     # Results
     "Result",
     "load",
+    "write_csv",
+    "html_report",
 ]

@@ -36,6 +36,8 @@ from jaxvib.study.capture.curve import ThresholdCurve
 from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
+from jaxvib.study.published.entry import compared
+from jaxvib.study.published.result import reproduced_of
 from jaxvib.study.stress.case import StressRow
 from jaxvib.study.stress.result import stress_of
 from optimize.pareto import Front
@@ -163,6 +165,7 @@ RESULTS = {
     ),
     "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
     "Stress": lambda: stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)]),
+    "Reproduced": lambda: reproduced_of([compared("criterion", "(12)", "resonance", 1.0, math.nan, within=0.1, note="none")]),
     "Tiers": tiers,
     "HarmonicConvergence": lambda: HarmonicConvergence(
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])

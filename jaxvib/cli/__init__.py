@@ -12,7 +12,8 @@ __all__ = ["main"]
 def main() -> None:
     """The command `jaxvib`; exit code 0 done, 1 the computation failed, 2 bad input."""
     gc.disable()
-    prepare()
+    if sys.argv[1:] and not {"-h", "--help", "--version"} & set(sys.argv[1:]):
+        prepare()
     from jaxvib.cli.app import run
 
     gc.freeze()  # modules stay: looking through them again and again, and at the end, takes a fifth of a short command

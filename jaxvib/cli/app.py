@@ -2,72 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import json
-import math
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from jaxvib.cli.output import Output
 from jaxvib.errors import ComputationError, InputError
 
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
 __all__ = ["WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
-
-
-class Output:
-    """Where a command's results go: a JSON document or text on stdout, and files in a folder."""
-
-    def __init__(self, as_json: bool, folder: Path | None):
-        self.as_json = as_json
-        self.folder = folder
-        self.files: list[str] = []
-        if folder is not None:
-            self._make(folder)
-
-    @staticmethod
-    def _make(folder: Path) -> None:
-        """Before anything is computed: a result that has nowhere to go is lost."""
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError("--out", f"is {str(folder)!r}, which cannot be made a folder ({error.strerror})") from error
-
-    def file(self, name: str) -> Path | None:
-        """The path of a result file; None where no folder was asked for."""
-        if self.folder is None:
-            return None
-        self.files.append(str(self.folder / name))
-        return self.folder / name
-
-    def done(self, document: dict[str, Any], text: Callable[[], str], name: str) -> None:
-        """Prints the document or the text, and writes the document to NAME.json in the folder."""
-        path = self.file(f"{name}.json")
-        body = json.dumps(_plain(document), indent=2, allow_nan=False)
-        if path is not None:
-            path.write_text(body + "\n", encoding="utf-8")
-        if self.as_json:
-            click.echo(body)
-            return
-        click.echo(text())
-        for written in self.files:
-            click.echo(f"wrote {written}")
-
-
-def _plain(value: Any) -> Any:
-    """The value for JSON; a number that is not finite becomes null, which a reader cannot mistake for one."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
@@ -108,10 +60,18 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 _HOMES = {
+    "describe": "describe",
+    "envelope": "motion.settle",
+    "growth": "motion.settle",
+    "onset": "motion.stability",
+    "run-ups": "motion.run_ups",
+    "settle": "motion.settle",
+    "stability-map": "motion.stability",
     "audit": "study.audit",
     "capture": "study.capture",
     "cost": "study.cost",
     "identify": "study.identify",
+    "reproduce": "study.reproduce",
     "stress": "study.stress",
     "whirl": "whirl",
     "criterion": "criterion",
@@ -129,10 +89,28 @@ class _Lazy(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(_HOMES)
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """A line for each command, read from its module's text: importing them all would take a second."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _first_line(name)) for name in self.list_commands(ctx)])
+
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in _HOMES:
             importlib.import_module(f"jaxvib.cli.{_HOMES[cmd_name]}")
         return super().get_command(ctx, cmd_name)
+
+
+def _first_line(name: str) -> str:
+    """What a command's docstring begins with."""
+    source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):
+            return textwrap.shorten((ast.get_docstring(node) or "").split("\n\n")[0], 62, placeholder="...")
+    return ""
+
+
+def _is_command(decorator: ast.expr, name: str) -> bool:
+    return isinstance(decorator, ast.Call) and any(isinstance(x, ast.Constant) and x.value == name for x in decorator.args)
 
 
 @click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)
@@ -145,12 +123,15 @@ def app() -> None:
 
 
 def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds --json and --out to a command; it gets them as one `Output`."""
+    """Adds --json, --out and --report to a command; it gets them as one `Output`."""
 
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout, nothing else.")
     @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Write pictures and data into this folder.")
-    def wrapped(as_json: bool, out: Path | None, **rest: Any) -> None:
-        command(output=Output(as_json, out), **rest)
+    @click.option(
+        "--report", type=click.Path(path_type=Path, dir_okay=False), help="Write one web page with all of it (.html)."
+    )
+    def wrapped(as_json: bool, out: Path | None, report: Path | None, **rest: Any) -> None:
+        command(output=Output(as_json, out, report, rest.get("scene")), **rest)
 
     wrapped.__name__ = command.__name__
     wrapped.__doc__ = command.__doc__
@@ -164,7 +145,7 @@ def run(arguments: list[str]) -> int:
     wants_json = "--json" in arguments
     try:
         # a command that computed all it was asked, and found a failure, exits by itself with its code
-        return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False) or 0
+        return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": str(error)})
     except ComputationError as error:

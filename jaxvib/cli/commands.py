@@ -10,6 +10,8 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.motion.document import chosen_steps, run_document
+from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.ode.progress import ProgressBar
@@ -17,7 +19,6 @@ from jaxvib.units import number
 
 if TYPE_CHECKING:
     from jaxvib.motion.start import Start
-    from jaxvib.results.fields import Plain
 
 
 @app.command("new")
@@ -53,6 +54,7 @@ def new(kind: str, output: Output) -> None:
 @click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
 @click.option("--max-steps", type=int, help="Fail after so many steps.")
 @click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
+@CSV
 @shared
 def simulate(
     scene: Path,
@@ -65,9 +67,12 @@ def simulate(
     accuracy: float | None,
     max_steps: int | None,
     window: bool,
+    csv: Path | None,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    if csv is not None and window:
+        raise InputError("--csv", "goes without --window, which keeps no trajectory to write")
     loaded = jv.load_scene(scene)
     run = jv.simulate(
         loaded,
@@ -76,65 +81,19 @@ def simulate(
         mode=mode,
         apart=apart,
         spin_up=spin_up,
-        stepsize_controller=_steps(tolerance, accuracy),
+        stepsize_controller=chosen_steps(tolerance, accuracy),
         max_steps=max_steps,
         save="window" if window else "all",
         progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
-    picture, data = output.file("history.png"), output.file("run.npz")
-    if picture is not None and data is not None:
-        run.plot().savefig(picture)
+    output.picture("history.png", run.plot)
+    data = output.file("run.npz")
+    if data is not None:
         run.save(data)
-    structure = loaded.machine.structure()
-    document = {
-        "status": "done",
-        "message": run.message,
-        "time": float(run.window.time[-1]),
-        "rotor_speed": float(run.window.rotor_speed[-1]),
-        "omega": float(run.omega),
-        "load_speed": run.load_speed.tolist(),
-        "coordinates": list(structure.coordinates),
-        "units": list(structure.units),
-        "amplitude": run.amplitude.tolist(),
-        "foundation_force": float(run.foundation_force),
-        "drift": float(run.drift),
-        "regime": _regime(run.regime),
-        "settled": bool(run.settled),
-        "together": bool(run.together),
-        "steps": int(run.steps),
-        "rejected": int(run.rejected),
-        "error": float(run.error),
-        "evaluations": int(run.evaluations),
-        "seconds": float(run.seconds),
-    }
-    output.done(document, run.summary, "simulate")
-
-
-def _steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
-    """How steps are chosen. **Raises** `InputError` where both options are given."""
-    if tolerance is not None and accuracy is not None:
-        raise InputError("accuracy", "is given together with tolerance; give one of them")
-    if accuracy is not None:
-        return jv.Accuracy(accuracy)
-    return None if tolerance is None else jv.Tolerance(tolerance)
+    output.csv(csv, run, "time")
+    output.done(run_document(run), run.summary, "simulate", run)
 
 
 def _long(scene: jv.Scene, until: str) -> bool:
     """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)
-
-
-def _regime(found: jv.Regime) -> dict[str, Plain]:
-    """The regime and its evidence; names as in `RegimeName` and `PhasePattern`."""
-    return {
-        "name": found.label,
-        "pattern": found.pattern_label,
-        "mode": int(found.mode),
-        "resonance": int(found.resonance),
-        "resonance_speed": float(found.resonance_speed),
-        "ripple": float(found.ripple),
-        "phase": found.phase.tolist(),
-        "unbalance": float(found.unbalance),
-        "rotor_caught": bool(found.caught),
-        "change": float(found.change),
-    }

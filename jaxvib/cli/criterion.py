@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import jax
@@ -14,6 +15,9 @@ import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
 from jaxvib.steady.balance.states import balanced_intervals
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _RPM = 30.0 / np.pi
 
@@ -35,8 +39,8 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         exact = balanced_intervals(loaded, 0.05 * lowest, top)
         document["exact_balancing"] = exact
         document["exact_up_to"] = top
-    picture = output.file("criterion.png")
-    if picture is not None:
+
+    def figure() -> Figure:
         from jaxvib.draw.criterion import pull_chart
         from jaxvib.draw.style import panels
 
@@ -45,7 +49,9 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1, size=(9.0, 4.0))
         pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
-        figure.savefig(picture)
+        return figure
+
+    output.picture("criterion.png", figure)
 
     def text() -> str:
         rows = [[label, f"{w:.6g}", f"{_RPM * w:.5g}"] for label, w in judged.speeds.labelled()]
@@ -63,7 +69,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
             lines.append(f"exact stability was looked for up to {top:.5g} rad/s")
         return "\n".join(lines)
 
-    output.done(document, text, "criterion")
+    output.done(document, text, "criterion", judged)
 
 
 def _ends(span: Sequence[float | None]) -> list[str]:

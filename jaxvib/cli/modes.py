@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 from jaxvib.steady.jams.jam import JUDGED
 from jaxvib.steady.jams.phases import growth_apart
@@ -27,9 +28,17 @@ SpeedUnit: TypeAlias = Literal["rad/s", "rpm"]
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
 @WITHOUT
+@CSV
 @shared
 def modes(
-    scene: Path, speed: str | None, unit: SpeedUnit, exact: bool, phases: bool, without: tuple[str, ...], output: Output
+    scene: Path,
+    speed: str | None,
+    unit: SpeedUnit,
+    exact: bool,
+    phases: bool,
+    without: tuple[str, ...],
+    csv: Path | None,
+    output: Output,
 ) -> None:
     """Every jam mode of SCENE at its rotor speed, for light loads or exactly; --out adds the branch diagram.
 
@@ -41,16 +50,18 @@ def modes(
     if exact and phases:
         raise InputError("--phases", "goes without --exact: jams at unequal phases are known for light loads only")
     if exact:
-        _exact(loaded, unit, output)
+        _exact(loaded, unit, csv, output)
         return
     structure = loaded.machine.structure()
     if phases or structure.axes != (1,):
+        if csv is not None:
+            raise InputError("--csv", "writes branches over the load speed; jams at any phases have none, see --json")
         _phases(loaded, unit, output)
         return
     found = jax.device_get(jv.jam_modes(loaded))  # in NumPy's hands: reading it compiles nothing
-    picture = output.file("branches.png")
-    if picture is not None:
-        jv.branches(loaded).plot(unit=unit).savefig(picture)
+    output.picture("branches.png", lambda: jv.branches(loaded).plot(unit=unit))
+    if csv is not None:
+        output.csv(csv, jv.branches(loaded), "point")
     jams = [found.select(k) for k in found.mode_numbers()]
     growth = dict(zip(found.mode.tolist(), growth_apart(loaded, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
@@ -104,7 +115,7 @@ def modes(
             lines.append(table("folds", ["loads, rad/s", "rotor, rad/s"], pairs))
         return "\n".join([*lines, *_left_out(loaded)])
 
-    output.done(document, text, "modes")
+    output.done(document, text, "modes", found)
 
 
 def _apart(growth: float) -> str:
@@ -121,9 +132,7 @@ def _left_out(scene: jv.Scene) -> list[str]:
 def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     """The jams of light loads at any phases."""
     found = jv.phase_jams(scene)
-    picture = output.file("phases.png")
-    if picture is not None:
-        found.plot(unit=unit).savefig(picture)
+    output.picture("phases.png", lambda: found.plot(unit=unit))
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
         "rotor_speed": float(scene.drive.speed),
@@ -163,10 +172,10 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
         said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
         return "\n".join([table(title, head, rows), said, *_left_out(scene)])
 
-    output.done(document, text, "modes")
+    output.done(document, text, "modes", found)
 
 
-def _exact(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
+def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -> None:
     """The exact jams, those that light loads have and those that only the full equations have, and the special points."""
     from jaxvib.steady.orbits.jam_orbit import exact_mode_speeds  # needs the time integrator: only who asks pays
 
@@ -175,9 +184,8 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
     known = {k: jam for k, jam in jams.items() if bool(np.isfinite(jam.rotor_speed))}
     diagram = jv.branches(scene, exact=True)
-    picture = output.file("branches.png")
-    if picture is not None:
-        diagram.plot(unit=unit).savefig(picture)
+    output.picture("branches.png", lambda: diagram.plot(unit=unit))
+    output.csv(csv, diagram, "point")
     document = {
         "rotor_speed": float(scene.drive.speed),
         "resonances": light.resonances.tolist(),
@@ -223,4 +231,4 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
             lines.append(table("where stability changes", ["", "loads, rad/s", "rotor, rad/s"], points))
         return "\n".join(lines)
 
-    output.done(document, text, "modes")
+    output.done(document, text, "modes", diagram)

@@ -55,18 +55,18 @@ def optimize(design: Path, starts: int | None, seed: int | None, resume: Path | 
     for name, save in (
         ("search.npz", lambda path: best.save(path)),
         ("found.toml", lambda path: jv.save_scene(best.scene, path)),
-        ("before_after.png", lambda path: best.plot().savefig(path)),
-        ("convergence.png", lambda path: best.plot_convergence().savefig(path)),
     ):
         path = output.file(name)
         if path is not None:
             save(path)
+    output.picture("before_after.png", best.plot)
+    output.picture("convergence.png", best.plot_convergence)
     if best.run is not None:
-        picture, data = output.file("history.png"), output.file("run.npz")
-        if picture is not None and data is not None:
-            best.run.plot().savefig(picture)
+        output.picture("history.png", best.run.plot)
+        data = output.file("run.npz")
+        if data is not None:
             best.run.save(data)
-    output.done(_document(best), lambda: _text(best), "optimize")
+    output.done(_document(best), lambda: _text(best), "optimize", best)
 
 
 def _document(best: Synthesis) -> dict:

@@ -10,6 +10,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import CSV
 from jaxvib.units import number
 
 _RPM = 30.0 / np.pi
@@ -21,8 +22,9 @@ _RPM = 30.0 / np.pi
 @click.option(
     "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Whether the loads' masses count."
 )
+@CSV
 @shared
-def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], output: Output) -> None:
+def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
     """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
     loaded = jv.load_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
@@ -36,10 +38,11 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], outpu
         {"speed": float(w), "decay": float(d), "forward": bool(f)}
         for w, d, f in zip(found.speed[0], found.decay[0], found.forward[0], strict=True)
     ]
-    picture = output.file("campbell.png")
-    if picture is not None:
-        top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
-        jv.whirl(loaded, np.linspace(0.0, top, 161), loads=loads).plot().savefig(picture)
+    top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
+    speeds = np.linspace(0.0, top, 161)
+    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot())
+    if csv is not None:
+        output.csv(csv, jv.whirl(loaded, speeds, loads=loads), "rotor_speed")
     document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}
 
     def text() -> str:
@@ -53,4 +56,4 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], outpu
             ]
         )
 
-    output.done(document, text, "whirl")
+    output.done(document, text, "whirl", found)

@@ -25,6 +25,7 @@ from jaxvib.machine.torus import torus_balls
 __all__ = [
     "DRIVES",
     "EFFECTS",
+    "SECTIONS",
     "TEMPLATES",
     "Tables",
     "called",
@@ -53,8 +54,7 @@ DRIVES = {
     "dc_motor": DCMotor,
     "induction_motor": InductionMotor,
 }
-_SECTIONS = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
-
+SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "loads": _LOADS, "drive": DRIVES}
 
 T = TypeVar("T")
 
@@ -161,10 +161,10 @@ def scene_from_toml(text: str) -> Scene:
 def scene_from_tables(tables: Tables) -> Scene:
     """A scene from the tables of a scene file, see `scene_from_toml`."""
     for name in tables:
-        if name not in (*_SECTIONS, "effects"):
-            raise InputError(name, f"is no table of a scene file; {closest(name, [*_SECTIONS, 'effects'])}")
+        if name not in (*SECTIONS, "effects"):
+            raise InputError(name, f"is no table of a scene file; {closest(name, [*SECTIONS, 'effects'])}")
     parts = {}
-    for name, kinds in _SECTIONS.items():
+    for name, kinds in SECTIONS.items():
         if name not in tables:
             raise InputError(name, f"is missing; a scene file needs the table [{name}]")
         parts[name] = _built(tables[name], name, kinds)
@@ -235,7 +235,7 @@ def scene_to_toml(scene: Scene) -> str:
     import tomli_w  # only where a file is written
 
     tables: dict[str, Tables] = {}
-    for name, kinds in _SECTIONS.items():
+    for name, kinds in SECTIONS.items():
         part = getattr(scene, name)
         tables[name] = {"kind": part.kind, **_fields(part, kinds[part.kind])}
     tables["effects"] = {}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import xarray
     from _typeshed import DataclassInstance
 
-__all__ = ["as_dict", "as_text", "in_unit", "is_named_tuple", "part", "to_xarray"]
+__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "labels_of", "part", "to_xarray"]
 
 EACH = "*"
 """Stands for the `outer_axes` of the class that a field is in."""
@@ -137,9 +137,9 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
         import xarray as xr
     except ImportError as error:
         raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
-    labels = _labels(result)
+    labels = labels_of(result)
     variables = {}
-    for name, axes, value, unit in _columns(result, None, "", (), {}):
+    for name, axes, value, unit in columns(result):
         extra = value.ndim - len(axes)
         batch = ("batch",) if extra == 1 else tuple(f"batch_{k + 1}" for k in range(extra))
         attributes = {"units": _one_unit(unit, labels.get("unit", ()))} if unit else {}
@@ -153,7 +153,12 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
     return data if status is None else data.assign_attrs(result=type(result).__name__, message=sentence(status))
 
 
-def _labels(result: eqx.Module) -> Labels:
+def columns(result: eqx.Module) -> Iterator[Column]:
+    """Every array of a result: its name, the names of its axes, its values, its unit."""
+    return _columns(result, None, "", (), {})
+
+
+def labels_of(result: eqx.Module) -> Labels:
     """Labels of axes by the axis's name, of "unit" those of the coordinates."""
     labels: dict[str, Sequence[str]] = {}
     for field in dataclasses.fields(result):

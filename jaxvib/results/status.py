@@ -76,8 +76,8 @@ def sentence(status: eqx.Enumeration) -> str:
     """
     names = status_names(status)
     enumeration = enumeration_of(status)
-    if names.ndim == 0:
-        return enumeration[status]
+    if names.ndim == 0:  # by its name: a status that went through NumPy is no member any more
+        return enumeration[getattr(enumeration, str(names))]
     said = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
     parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in said.items() if k]
     return "; ".join(parts) or "there is none"

@@ -64,10 +64,9 @@ def audit(
     loaded = loaded_scene(scene, without)
     asked = dict(mode=mode, until=until, start=start, possible=possible, tiers=tiers, repeats=repeats)
     found = jv.audit(loaded, accuracy=share, **asked)  # pyright: ignore[reportArgumentType]
-    picture = output.file("audit.png")
-    if picture is not None and found.effects:
-        found.plot().savefig(picture)
-    output.done(found.as_dict(), lambda: audit_text(found), "audit")
+    if found.effects:
+        output.picture("audit.png", found.plot)
+    output.done(found.as_dict(), lambda: audit_text(found), "audit", found)
 
 
 def audit_text(found: jv.Audit) -> str:

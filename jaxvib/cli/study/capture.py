@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
@@ -12,6 +13,9 @@ import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.motion.start import Turning
 from jaxvib.study.capture.capture import thrown_state
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @app.command("capture")
@@ -48,11 +52,11 @@ def capture(
     found = jv.capture(
         loaded, np.linspace(low, high, speeds), turns=turns, starts=starts, resolution=resolution, turning=turning
     )
-    picture, paths = output.file("capture.png"), output.file("paths.png")
-    if picture is not None and paths is not None:
+    output.picture("capture.png", found.plot)
+
+    def paths() -> Figure:
         from jaxvib.draw.capture import torus_paths
 
-        found.plot().savefig(picture)
         # One run just above the threshold, or from the highest speed where none was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high
         until = 2.0 * math.pi * min(turns, 400) / float(loaded.drive.speed)
@@ -61,7 +65,9 @@ def capture(
         assert kept is not None
         around = np.asarray(kept.state.azimuth) - np.asarray(kept.rotor_angle)[:, None]
         rate = np.asarray(kept.state.azimuth_rate) / np.asarray(kept.rotor_speed)[:, None] - 1.0
-        torus_paths(around, np.asarray(kept.state.angle[1]), rate, np.asarray(kept.time)).savefig(paths)
+        return torus_paths(around, np.asarray(kept.state.angle[1]), rate, np.asarray(kept.time))
+
+    output.picture("paths.png", paths)
 
     def text() -> str:
         rows = [
@@ -72,4 +78,4 @@ def capture(
         return table("starts captured", head, rows) + "\n" + found.summary()
 
     document = {**found.as_dict(), "fraction": found.fraction.tolist(), "standard_error": found.standard_error.tolist()}
-    output.done(document, text, "capture")
+    output.done(document, text, "capture", found)

@@ -37,10 +37,8 @@ def cost(
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
     chosen = solvers or tuple(SOLVERS)
     found = jv.work_precision(jv.load_scene(scene), quantity, mode=mode, until=until, solvers=chosen, repeats=repeats)
-    picture = output.file("cost.png")
-    if picture is not None:
-        found.plot().savefig(picture)
-    output.done(cost_document(found), lambda: cost_table(found), "cost")
+    output.picture("cost.png", found.plot)
+    output.done(cost_document(found), lambda: cost_table(found), "cost", found)
 
 
 def cost_document(cost: Cost) -> dict[str, Any]:

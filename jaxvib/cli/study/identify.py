@@ -55,9 +55,9 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             tables[section] = {**old, field: value} if isinstance(old, dict) else old
     pendulum, swing, dry, instrument = measurement_from_tables(tables, record.parent)
     found = jv.identify(pendulum, swing, dry=dry, instrument=instrument)
-    picture, data = output.file("record.png"), output.file("fit.csv")
-    if picture is not None and data is not None:
-        found.plot().savefig(picture)
+    output.picture("record.png", found.plot)
+    data = output.file("fit.csv")
+    if data is not None:
         columns = np.stack([swing.time, swing.angle, found.fitted], axis=1)
         np.savetxt(data, columns, fmt="%.9g", delimiter=",", header="time (s),angle (rad),fit (rad)", comments="")
     ten = found.decrement
@@ -106,7 +106,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             lines.append(f"errors of mu1 and mu2 are correlated by {found.correlation:.3f}")
         return "\n".join([*lines, *found.notes])
 
-    output.done(document, text, "identify")
+    output.done(document, text, "identify", found)
 
 
 def _row(name: str, estimate: Estimate) -> list[str]:

@@ -30,10 +30,8 @@ def stress(
         click.echo(f"{row.case}, {row.dtype}: {row.verdict}", err=True)
 
     found = jv.stress(only, precisions=precisions or PRECISIONS, report=report)
-    picture = output.file("stress.png")
-    if picture is not None:
-        found.plot().savefig(picture)
-    output.done(found.as_dict(), lambda: f"{_table(found)}\n{found.summary()}", "stress")
+    output.picture("stress.png", found.plot)
+    output.done(found.as_dict(), lambda: f"{_table(found)}\n{found.summary()}", "stress", found)
     if found.failures:
         context.exit(1)
 

@@ -1,0 +1,58 @@
+"""jaxvib run-ups."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared, table
+
+
+@app.command("run-ups")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--until", required=True, help="End time of each, such as 6s.")
+@click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [the scene's].")
+@click.option("--starts", type=int, help="So many random sets of angles [one, all loads together at the bottom].")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the random angles.")
+@click.option("--tolerance", type=float, help="Error a step may make [1e-7].")
+@click.option("--batch", type=int, default=16, show_default=True, help="So many go side by side.")
+@shared
+def run_ups(
+    scene: Path,
+    until: str,
+    drags: tuple[str, ...],
+    starts: int | None,
+    seed: int,
+    tolerance: float | None,
+    batch: int,
+    output: Output,
+) -> None:
+    """Run SCENE up from rest, at each drag from each of many initial angles, and name where the loads end."""
+    from jaxvib.units import number
+
+    each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
+    steps = None if tolerance is None else jv.Tolerance(tolerance)
+    loaded = jv.load_scene(scene)
+    found = jv.run_ups(loaded, until, drag=each, starts=starts, seed=seed, batch=batch, stepsize_controller=steps)
+    output.picture("run_ups.png", found.plot)
+    data = output.file("run_ups.npz")
+    if data is not None:
+        found.save(data)
+    kinds = sorted(set(found.kind.ravel().tolist()))
+    rows = [
+        {
+            "drag": float(drag),
+            "shares": {kind: float(found.fraction(kind)[k]) for kind in kinds},
+            "kind": found.kind[k].tolist(),
+            "omega": found.omega[k].tolist(),
+        }
+        for k, drag in enumerate(found.drag)
+    ]
+
+    def text() -> str:
+        shares = [[f"{row['drag']:.5g}", *(f"{100.0 * row['shares'][kind]:.3g} %" for kind in kinds)] for row in rows]
+        return "\n".join([table("where loads end", ["drag, N s/m", *kinds], shares), found.summary()])
+
+    output.done({"until": until, "starts": len(found.angle), "seed": seed, "run_ups": rows}, text, "run_ups", found)

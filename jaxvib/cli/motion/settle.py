@@ -1,0 +1,118 @@
+"""jaxvib settle, envelope, growth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.output import CSV
+from jaxvib.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxvib.motion.start import Start
+
+_START = click.option(
+    "--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Initial state [jam with --mode, else rest]."
+)
+_MODE = click.option("--mode", type=int, help="Number of the jam mode to start in.")
+
+
+@app.command("settle")
+@click.argument("scene", type=click.Path(path_type=Path))
+@_START
+@_MODE
+@click.option("--drift", type=float, help="Relative change that counts as none [1e-6].")
+@click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
+@click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
+@shared
+def settle(
+    scene: Path,
+    start: Start | None,
+    mode: int | None,
+    drift: float | None,
+    tolerance: float | None,
+    stretches: int,
+    output: Output,
+) -> None:
+    """Integrate the full equations of SCENE until amplitudes and speeds no longer change; --out keeps the last stretch."""
+    from jaxvib.cli.motion.document import chosen_steps, run_document
+
+    loaded = jv.load_scene(scene)
+    steps = chosen_steps(tolerance, None)
+    run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
+    output.picture("history.png", run.plot)
+    data = output.file("run.npz")
+    if data is not None:
+        run.save(data)
+    output.done(run_document(run), run.summary, "settle", run)
+
+
+@app.command("envelope")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--until", required=True, help="End time, such as 20s or '10 min'.")
+@_START
+@_MODE
+@click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
+@click.option("--tolerance", type=float, help="Error a step may make [1e-4].")
+@CSV
+@shared
+def envelope(
+    scene: Path,
+    until: str,
+    start: Start | None,
+    mode: int | None,
+    spin_up: str | None,
+    tolerance: float | None,
+    csv: Path | None,
+    output: Output,
+) -> None:
+    """Integrate the averaged equations of SCENE: long run-ups in steps of many turns; --out keeps them (envelope.npz)."""
+    loaded = jv.load_scene(scene)
+    begin = ("rest" if mode is None else "jam") if start is None else start
+    steps = None if tolerance is None else jv.Tolerance(tolerance)
+    run = jv.envelope(loaded, until, start=begin, mode=mode, spin_up=spin_up, stepsize_controller=steps)
+    output.picture("envelope.png", run.plot)
+    data = output.file("envelope.npz")
+    if data is not None:
+        run.save(data)
+    output.csv(csv, run, "time")
+    structure = loaded.machine.structure()
+    document = {
+        "status": run.status_name,
+        "message": run.message,
+        "time": float(run.window.time[-1]),
+        "rotor_speed": float(run.window.rotor_speed[-1]),
+        "omega": float(run.omega),
+        "load_speed": run.load_speed.tolist(),
+        "coordinates": list(structure.coordinates),
+        "units": list(structure.units),
+        "amplitude": run.amplitude.tolist(),
+        "foundation_force": float(run.foundation_force),
+        "drift": float(run.drift),
+        "settled": bool(run.settled),
+        "ripple": run.ripple.tolist(),
+        "steps": int(run.steps),
+        "rejected": int(run.rejected),
+    }
+    output.done(document, run.summary, "envelope", run)
+
+
+@app.command("growth")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--until", required=True, help="How long all stretches are together, such as 60s.")
+@_START
+@_MODE
+@click.option("--stretches", type=int, default=40, show_default=True, help="Into how many stretches it is cut, 8 at least.")
+@shared
+def growth(scene: Path, until: str, start: Start | None, mode: int | None, stretches: int, output: Output) -> None:
+    """How fast motions of SCENE part that begin next to each other: regular or chaotic, and what derivatives are worth."""
+    if start == "spin_up":
+        raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
+    begin = ("rest" if mode is None else "jam") if start is None else start
+    found = jv.growth(jv.load_scene(scene), until, start=begin, mode=mode, stretches=stretches)
+    output.picture("growth.png", found.plot)
+    output.done(found.as_dict(), found.summary, "growth", found)

@@ -1,0 +1,121 @@
+"""jaxvib stability-map, onset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxvib.machine.scene import Scene
+
+_VARY = click.option(
+    "--vary", required=True, metavar="NAME", help="A number of the scene, such as loads.mass or machine.stiffness[0]."
+)
+_OMEGA = click.option(
+    "--omega", nargs=2, required=True, metavar="FROM TO", help="Range of load speeds, such as '20 rad/s' '60 rad/s'."
+)
+_POINTS = click.option("--points", type=int, default=300, show_default=True, help="Load speeds of each diagram.")
+
+
+@app.command("stability-map")
+@click.argument("scene", type=click.Path(path_type=Path))
+@_VARY
+@click.option("--value", "values", multiple=True, required=True, help="Of that number, with its unit, repeatable.")
+@_OMEGA
+@_POINTS
+@WITHOUT
+@shared
+def stability_map(
+    scene: Path,
+    vary: str,
+    values: tuple[str, ...],
+    omega: tuple[str, str],
+    points: int,
+    without: tuple[str, ...],
+    output: Output,
+) -> None:
+    """Where exact jams of SCENE are stable as one of its numbers grows; --out draws the map."""
+    make, read = _varied(loaded_scene(scene, without), vary)
+    x = [read(value, "--value") for value in values]
+    found = jv.stability_map(make, x, omega=_range(omega), points=points)
+    output.picture("stability_map.png", lambda: found.plot(label=vary))
+    rows = [
+        {
+            "value": float(value),
+            "stable_share": float(found.stable[k].mean()),
+            "special": [{"kind": p.kind, "omega": p.omega, "rotor_speed": p.rotor_speed} for p in found.special[k]],
+        }
+        for k, value in enumerate(found.value)
+    ]
+
+    def text() -> str:
+        shown = [[f"{row['value']:.6g}", f"{100.0 * row['stable_share']:.3g} %", _special(row["special"])] for row in rows]
+        return table(f"exact jams over {vary}", [vary, "of load speeds stable", "where stability changes, rad/s"], shown)
+
+    output.done({"vary": vary, "map": rows}, text, "stability_map", found)
+
+
+def _special(points: list[dict]) -> str:
+    return ", ".join(f"{p['kind'].replace('_', ' ')} {p['omega']:.5g}" for p in points) or "nowhere"
+
+
+@app.command("onset")
+@click.argument("scene", type=click.Path(path_type=Path))
+@_VARY
+@click.option("--kind", required=True, help="What begins: fold, torus, symmetry or another kind of special point.")
+@click.option("--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without it and one with it.")
+@_OMEGA
+@_POINTS
+@click.option("--accuracy", type=float, default=1e-3, show_default=True, help="Of the value, relative.")
+@WITHOUT
+@shared
+def onset(
+    scene: Path,
+    vary: str,
+    kind: str,
+    between: tuple[str, str],
+    omega: tuple[str, str],
+    points: int,
+    accuracy: float,
+    without: tuple[str, ...],
+    output: Output,
+) -> None:
+    """From which value of one of its numbers on an exact diagram of SCENE has a torus bifurcation, or another special point."""
+    make, read = _varied(loaded_scene(scene, without), vary)
+    low, high = (read(value, "--between") for value in between)
+    found = jv.stability_onset(make, kind, (low, high), omega=_range(omega), points=points, accuracy=accuracy)
+    document = {"vary": vary, "kind": kind, "value": found, "accuracy": accuracy, "between": [low, high]}
+    output.done(document, lambda: f"{kind.replace('_', ' ')} from {vary} = {found:.6g} on (to {accuracy:g}, SI units)", "onset")
+
+
+def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
+    """What makes the scene at a value of the number of that name, and what reads such a value."""
+    import jax.numpy as jnp
+
+    from optimize.space.numbers import changed, places_of, value_of
+
+    place = places_of(scene, name, "--vary")
+
+    def read(value: str, option: str) -> float:
+        try:
+            return value_of(name, value)
+        except InputError as error:
+            raise InputError(option, str(error)) from error
+
+    return lambda x: changed(scene, place, jnp.full(place.size, x)), read
+
+
+def _range(omega: tuple[str, str]) -> tuple[float, float]:
+    from jaxvib.units import number
+
+    low, high = (float(number(value, "rad/s", "--omega", low=0.0)) for value in omega)
+    if not low < high:
+        raise InputError("--omega", f"is {low:g} to {high:g} rad/s; the second must be larger than the first")
+    return low, high

@@ -1,0 +1,134 @@
+"""Where a command's results go: stdout, files in a folder, a report."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import jaxvib as jv
+from jaxvib.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from jaxvib.results.result import Result
+
+__all__ = ["CSV", "Output"]
+
+CSV = click.option("--csv", type=click.Path(path_type=Path, dir_okay=False), help="Write the curves into this CSV file.")
+"""The option of commands that have curves."""
+
+
+class Output:
+    """Where a command's results go: a JSON document or text on stdout, files in a folder, a report of one HTML page.
+
+    **Arguments**: `as_json`; the `folder` of `--out`; the `report` file; the `scene` file that the command is about.
+    """
+
+    def __init__(self, as_json: bool, folder: Path | None, report: Path | None = None, scene: Path | None = None):
+        self.as_json = as_json
+        self.folder = folder
+        self.report = report
+        self.scene = scene
+        self.files: list[str] = []
+        self.figures: list[tuple[str, Figure]] = []
+        if report is not None:
+            if report.suffix.lower() not in (".html", ".htm"):
+                raise InputError("--report", f"is {str(report)!r}; a report is a web page, name a file that ends in .html")
+            self._make(report.parent, "--report")
+        if folder is not None:
+            self._make(folder, "--out")
+
+    @staticmethod
+    def _make(folder: Path, option: str) -> None:
+        """Before anything is computed: a result that has nowhere to go is lost."""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(option, f"is {str(folder)!r}, which cannot be made a folder ({error.strerror})") from error
+
+    def file(self, name: str) -> Path | None:
+        """The path of a result file; None where no folder was asked for."""
+        if self.folder is None:
+            return None
+        self.files.append(str(self.folder / name))
+        return self.folder / name
+
+    def picture(self, name: str, draw: Callable[[], Figure]) -> None:
+        """Draws a figure where a folder or a report was asked for: into the file of that name, and onto the report."""
+        path = self.file(name)
+        if path is None and self.report is None:
+            return
+        figure = draw()
+        if path is not None:
+            figure.savefig(path)
+        if self.report is not None:
+            self.figures.append((Path(name).stem.replace("_", " "), figure))
+
+    def csv(self, path: Path | None, result: Result, axis: str) -> None:
+        """Writes what a result holds along an axis into a CSV file, where one was asked for."""
+        if path is None:
+            return
+        from jaxvib.results.csv import write_csv  # slow to import, and --help needs none of it
+
+        write_csv(result, axis, path)
+        self.files.append(str(path))
+
+    def done(self, document: dict[str, Any], text: Callable[[], str], name: str, result: Result | None = None) -> None:
+        """Prints the document or the text, and writes the document to NAME.json in the folder and the report.
+
+        The units of the document's numbers in the report are those of the `result` that they are from."""
+        path = self.file(f"{name}.json")
+        document = _plain(document)
+        body = json.dumps(document, indent=2, allow_nan=False)
+        if path is not None:
+            path.write_text(body + "\n", encoding="utf-8")
+        if self.report is not None:
+            self._reported(self.report, document, text, name, result)
+        if self.as_json:
+            click.echo(body)
+            return
+        click.echo(text())
+        for written in self.files:
+            click.echo(f"wrote {written}")
+
+    def _reported(
+        self, path: Path, document: dict[str, Any], text: Callable[[], str], name: str, result: Result | None
+    ) -> None:
+        from jaxvib.machine.files import load_scene
+        from jaxvib.machine.scene import Scene
+        from jaxvib.report.page import Report, units_of
+
+        scene = getattr(result, "scene", None)
+        if not isinstance(scene, Scene):
+            scene = None if self.scene is None else load_scene(self.scene)
+        draws = getattr(jv, "sketch", None)
+        asked = click.get_current_context().find_root().obj or [name]
+        found = Report(
+            title=f"jaxvib {name}",
+            command=" ".join(["jaxvib", *asked]),
+            document=document,
+            units={} if result is None else units_of(result),
+            text=text(),
+            scene=scene,
+            sketch=None if scene is None or draws is None else draws(scene),
+            figures=self.figures,
+        )
+        path.write_text(found.html(), encoding="utf-8")
+        self.files.append(str(path))
+
+
+def _plain(value: Any) -> Any:
+    """The value for JSON; a number that is not finite becomes null, which a reader cannot mistake for one."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

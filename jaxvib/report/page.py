@@ -1,0 +1,196 @@
+"""One web page with a result: what was asked, what came out, what it is worth, the machine, the figures."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import datetime
+import io
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.report.tables import Units, escaped, parameters, results, worth
+from jaxvib.results.fields import Plain
+from jaxvib.results.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Report", "html_report", "units_of"]
+
+_LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy")
+
+
+@dataclass
+class Report:
+    """What a page is made of.
+
+    **Arguments**: `title`; the `document`, plain values as in JSON, and the `units` of its numbers by name; the `command` that
+    it came from; its `text` as a terminal shows it; the `scene` that it is about and a `sketch` of it; `figures` by name.
+    """
+
+    title: str
+    document: Mapping[str, Plain]
+    units: Units = field(default_factory=dict)
+    command: str = ""
+    text: str = ""
+    scene: Scene | None = None
+    figures: Sequence[tuple[str, Figure]] = ()
+    sketch: Figure | None = None
+
+    def html(self) -> str:
+        """The page: HTML with its style and its figures in it, which asks no network for anything. All text is escaped."""
+        parts = [f"<h1>{escaped(self.title)}</h1>"]
+        if self.command:
+            parts.append(f'<p class="command"><code>{escaped(self.command)}</code></p>')
+        units = self.units if self.scene is None else _of_coordinates(self.units, self.scene)
+        parts += [_section("What it is worth", worth(self.document, units))]
+        parts += [_section("Figures", "".join(_figure(name, figure) for name, figure in self.figures))]
+        parts += [_section("Results", results(self.document, units))]
+        if self.scene is not None:
+            sketch = "" if self.sketch is None else _figure("sketch", self.sketch)
+            parts += [_section("Machine", sketch + parameters(self.scene))]
+        if self.text:
+            parts.append(f"<details><summary>As the terminal shows it</summary><pre>{escaped(self.text)}</pre></details>")
+        parts.append(_section("Made with", _versions()))
+        return _PAGE.format(title=escaped(self.title), style=_STYLE, body="\n".join(filter(None, parts)))
+
+
+def html_report(
+    result: Result,
+    path: str | Path,
+    *,
+    title: str = "",
+    scene: Scene | None = None,
+    figures: Sequence[tuple[str, Figure]] | None = None,
+) -> Path:
+    """Writes a result as one web page that holds all of it: numbers with units, figures, machine, what it is worth, versions.
+
+    The page asks no network for anything; it reads on a phone and prints.
+
+    **Arguments**: `result` of any kind; `path` of the file, which is overwritten; `title`, the result's kind unless said
+    otherwise; `scene` whose parameters are listed, that of the result where it has one; `figures` with their names, the
+    result's own where none are given.
+
+    **Returns** the path. **Raises** `InputError` for something that is no result, and for a path that cannot be written to.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
+    ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.ConstantSpeed(60.0))
+    >>> path = jv.html_report(jv.critical_speeds(scene), pathlib.Path(tempfile.mkdtemp()) / "report.html", scene=scene)
+    >>> "<!doctype html>" in path.read_text()
+    True
+    """
+    if not isinstance(result, Result):
+        raise InputError("result", f"is a {type(result).__name__}; give a result, such as that of jv.simulate")
+    kind, path = type(result).__name__, Path(path)
+    if scene is None and isinstance(getattr(result, "scene", None), Scene):
+        scene = result.scene  # pyright: ignore[reportAttributeAccessIssue]
+    drawn = [(kind, result.plot())] if figures is None else figures
+    page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
+    try:
+        path.write_text(page.html(), encoding="utf-8")
+    except OSError as error:
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
+    return path
+
+
+def units_of(result: eqx.Module) -> dict[str, str]:
+    """The units of a result's numbers by the names of its fields, those of its parts too."""
+    found: dict[str, str] = {}
+    for each in dataclasses.fields(result):
+        value = getattr(result, each.name)
+        if each.metadata.get("unit"):
+            found.setdefault(each.name, each.metadata["unit"])
+        elif "part" in each.metadata and isinstance(value, eqx.Module):
+            for name, unit in units_of(value).items():
+                found.setdefault(name, unit)
+    return found
+
+
+def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
+    """Of "m or rad" the unit that all coordinates of the scene's machine have, where they are alike."""
+    alike = set(scene.machine.structure().units)
+    choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
+    return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{escaped(title)}</h2>{body}</section>" if body else ""
+
+
+def _figure(name: str, figure: Figure) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="png", metadata={"Software": None})
+    text = base64.b64encode(data.getvalue()).decode("ascii")
+    picture = f'<img alt="{escaped(name)}" src="data:image/png;base64,{text}">'
+    return f"<figure>{picture}<figcaption>{escaped(name)}</figcaption></figure>"
+
+
+def _versions() -> str:
+    said = []
+    for name in _LIBRARIES:
+        try:
+            said.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    when = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    where = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    return f"<p>{escaped(', '.join([*said, where]))}</p><p>{escaped(when)}</p>"
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c2430; background: #fff; }
+body { max-width: 60rem; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.6rem; margin: 0.5rem 0; }
+h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; border-bottom: 2px solid #1f5aa6; }
+h3 { font-size: 1rem; margin: 1.2rem 0 0.3rem; }
+.command { color: #555; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 0.3rem 0; }
+th, td { padding: 0.2rem 0.7rem 0.2rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd; }
+th { font-weight: 600; }
+td.n, th.n { text-align: right; white-space: nowrap; }
+td.unit { color: #555; white-space: nowrap; }
+td.below { color: #555; padding-left: 1.5rem; }
+figure { margin: 1rem 0; break-inside: avoid; overflow-x: auto; }
+figure img { max-width: 100%; height: auto; }
+figcaption { color: #555; font-size: 0.9rem; }
+pre { overflow-x: auto; font-size: 0.75rem; line-height: 1.25; }
+details { margin-top: 2rem; }
+summary { cursor: pointer; }
+@media screen and (max-width: 40rem) { figure img { max-width: none; width: 44rem; } }
+@media print {
+  body { font-size: 10pt; max-width: none; padding: 0; }
+  .wide { overflow: visible; }
+  table { font-size: 8pt; }
+  tr, figure { break-inside: avoid; }
+  figure img { max-height: 19cm; }
+  h2, h3 { break-after: avoid; }
+  details { display: none; }
+}
+"""

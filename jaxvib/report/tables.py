@@ -1,0 +1,158 @@
+"""Plain values and scenes as tables of a web page; every text in them is escaped."""
+
+from __future__ import annotations
+
+import html
+import tomllib
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+from jaxvib.machine.files import scene_to_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.report.arguments import units_of_fields
+from jaxvib.results.fields import Plain
+
+__all__ = ["Units", "escaped", "parameters", "results", "worth"]
+
+Units: TypeAlias = Mapping[str, str]
+"""Units of numbers by their names."""
+
+WORTH = (
+    "status", "message", "error", "reference_error", "uncertainty", "resolution", "residual", "drift", "ripple", "settled",
+    "judged", "unverified", "converged", "starts", "steps", "rejected", "evaluations", "seconds",
+)  # fmt: skip
+"""Names of what says how good a result is and what it cost."""
+
+_HIDDEN = ("scene", "toml")
+"""Texts that the page shows in another way."""
+
+_MOST = 12
+"""So many numbers of a list are shown one by one."""
+
+_LONG = 40
+"""A text of more characters than that stands below its row."""
+
+_ROWS = 200
+"""So many rows of a table are shown."""
+
+
+def escaped(text: object) -> str:
+    """Text as HTML shows it, whatever it holds."""
+    return html.escape(str(text), quote=True)
+
+
+def worth(document: Mapping[str, Plain], units: Units) -> str:
+    """A table of what a document says about its own worth: status, error, cost."""
+    return _pairs([(name, document[name]) for name in WORTH if name in document and _plain(document[name])], units)
+
+
+def results(document: Mapping[str, Plain], units: Units, depth: int = 0) -> str:
+    """A document as tables: single values in one, lists of like entries in a table each, all else below headings."""
+    single, below = [], []
+    for name, value in document.items():
+        if name in _HIDDEN or (depth == 0 and name in WORTH and _plain(value)):
+            continue
+        if _plain(value):
+            single.append((name, value))
+        elif isinstance(value, Mapping):
+            below.append((name, results(value, units, depth + 1)))
+        elif isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
+            below.append((name, _rows(value, units)))  # pyright: ignore[reportArgumentType]
+        elif isinstance(value, list) and value:
+            below.append((name, _grid(value)))
+    heads = "".join(f"<h3>{escaped(_words(name))}{_unit_of(name, units)}</h3>{body}" for name, body in below if body)
+    return _pairs(single, units) + heads
+
+
+def parameters(scene: Scene) -> str:
+    """The numbers of a scene with their units, a table for each of its parts."""
+    tables = tomllib.loads(scene_to_toml(scene))
+    parts = []
+    for section in ("machine", "loads", "drive"):
+        kind = str(tables[section].pop("kind"))
+        parts.append((f"{section}: {_words(kind)}", tables[section], units_of_fields(section, kind)))
+    for name, value in tables["effects"].items():
+        for each in value if isinstance(value, list) else [value]:
+            parts.append((f"effect: {_words(name)}", each, units_of_fields("effects", name)))
+    return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in parts)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _plain(value: Plain) -> bool:
+    """Whether a value goes into one cell."""
+    if isinstance(value, list):
+        return len(value) <= _MOST and all(not isinstance(x, (list, dict)) for x in value)
+    return not isinstance(value, dict)
+
+
+def _unit_of(name: str, units: Units) -> str:
+    return f", {escaped(units[name])}" if units.get(name) else ""
+
+
+def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
+    if not pairs:
+        return ""
+    rows = "".join(
+        f"<tr><th>{escaped(_words(name))}</th><td>{_cell(value)}</td><td class='unit'>{escaped(units.get(name, ''))}</td></tr>"
+        for name, value in pairs
+    )
+    return f"<div class='wide'><table>{rows}</table></div>"
+
+
+def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
+    """A row for each entry; what is long stands below it, over the whole width."""
+    every = list(dict.fromkeys(name for row in rows for name in row))
+    long = [name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _LONG for row in rows)]
+    names = [name for name in every if name not in long]
+    heads = "".join(f"<th{_side(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
+    body = ""
+    for row in rows[:_ROWS]:
+        body += "<tr>" + "".join(f"<td{_side(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
+        for name in long:
+            if row.get(name):
+                body += f"<tr><td class='below' colspan='{len(names)}'>{escaped(_words(name))}: {_cell(row[name])}</td></tr>"
+    return f"<div class='wide'><table><tr>{heads}</tr>{body}</table></div>{_more(len(rows))}"
+
+
+def _side(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
+    """Numbers stand at the right."""
+    values = [row.get(name) for row in rows]
+    numeric = all(v is None or (isinstance(v, (int, float)) and not isinstance(v, bool)) for v in values)
+    return " class='n'" if numeric else ""
+
+
+def _grid(values: Sequence[Plain]) -> str:
+    """A long list, or one of lists."""
+    if all(isinstance(x, list) and _plain(x) for x in values):
+        body = "".join(
+            "<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>"  # pyright: ignore
+            for row in values[:_ROWS]
+        )
+        return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"
+    numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
+    if not numbers:
+        return f"<p>{len(values)} values; --json and --out have them</p>"
+    return f"<p>{len(values)} numbers from {_cell(min(numbers))} to {_cell(max(numbers))}; --json and --out have them</p>"
+
+
+def _more(count: int) -> str:
+    return f"<p>{count - _ROWS} rows more; --json and --out have them</p>" if count > _ROWS else ""
+
+
+def _cell(value: Plain) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return escaped(f"{value:.6g}")
+    if isinstance(value, (list, tuple)) and value and isinstance(value[0], Mapping):
+        return _rows(value, {})  # pyright: ignore[reportArgumentType]
+    if isinstance(value, (list, tuple)):
+        return ", ".join(_cell(x) for x in value) or "none"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{escaped(_words(k))} {_cell(v)}" for k, v in value.items())
+    return escaped(value)

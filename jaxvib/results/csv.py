@@ -1,0 +1,79 @@
+"""What a result holds along one axis, as a table in a file."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.results.fields import Labels, columns, labels_of
+
+__all__ = ["write_csv"]
+
+
+def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
+    """Writes everything that a result has along an axis into a CSV file, a row for each of its points.
+
+    The head of a column is the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9 digits,
+    complex ones a column each for the real and the imaginary part.
+
+    **Arguments**: `axis` as in the metadata of the fields, such as "time" or "point"; `path` of the file, which is overwritten.
+
+    **Returns** the path. **Raises** `InputError` for an axis that the result does not have, and for a path that cannot be
+    written to.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> scene = jv.Scene(jv.planar_rotor(mass=20.0, stiffness=4e4, damping=60.0),
+    ...                  jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5), jv.ConstantSpeed(60.0))
+    >>> path = write_csv(jv.whirl(scene, [10.0, 20.0]), "rotor_speed", pathlib.Path(tempfile.mkdtemp()) / "campbell.csv")
+    >>> path.read_text().splitlines()[0]
+    'rotor_speed (rad/s),speed 1 (rad/s),speed 2 (rad/s),decay 1 (1/s),decay 2 (1/s),forward 1,forward 2'
+    """
+    labels = labels_of(result)
+    units = labels.get("unit", ())
+    heads: list[str] = []
+    rows: list[np.ndarray] = []
+    for name, axes, values, unit in columns(result):
+        if axes[:1] != (axis,) or values.ndim != len(axes):
+            continue
+        for place in np.ndindex(values.shape[1:]):
+            said = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
+            own = _own_unit(unit, axes[1:], place, units)
+            head, column = " ".join([name, *filter(None, said)]), values[(slice(None), *place)]
+            parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
+            for part, numbers in parts:
+                heads.append(f"{part}{head} ({own})" if own else part + head)
+                rows.append(numbers)
+    if not rows:
+        raise InputError("axis", f"is {axis!r}; {type(result).__name__} holds nothing along it")
+    path = Path(path)
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(heads)
+            writer.writerows([_shown(x) for x in row] for row in zip(*rows, strict=True))
+    except OSError as error:
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
+    return path
+
+
+def _label(labels: Labels, axis: str, k: int, n: int) -> str:
+    """What the k-th of n along an axis is called; the only one needs no name."""
+    known = labels.get(axis, ())
+    return str(known[k]) if len(known) == n else "" if n == 1 else str(k + 1)
+
+
+def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
+    """Of "m or rad" the unit of this coordinate."""
+    choices = unit.split(" or ")
+    if len(choices) == 2 and "coordinate" in axes and units:
+        return choices[("m", "rad").index(units[place[axes.index("coordinate")]])]
+    return unit
+
+
+def _shown(value: np.generic) -> str:
+    return f"{value:.9g}" if isinstance(value, np.floating) else str(int(value) if isinstance(value, np.bool_) else value)

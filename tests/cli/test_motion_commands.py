@@ -1,0 +1,195 @@
+"""Commands about motion and stability, listings of what scene files hold, curves as CSV."""
+
+import csv
+import json
+import pathlib
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.cli.app import _HOMES, app, run
+from jaxvib.machine.files import EFFECTS, SECTIONS
+from jaxvib.report.arguments import GROUPS, arguments_of
+
+DATA = pathlib.Path(__file__).parents[1] / "data"
+
+
+@pytest.fixture
+def typed(capsys, tmp_path, monkeypatch):
+    """Runs a command line in an empty folder that holds machine.toml; gives exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    jv.save_scene(scene("two_mass", speed=150.0), tmp_path / "machine.toml")
+
+    def type_(*words):
+        code = run(list(words))
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return type_
+
+
+def read(path):
+    with path.open() as file:
+        return list(csv.reader(file))
+
+
+def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
+    kept = jv.load(DATA / "run_0_1.npz")
+    monkeypatch.setattr("jaxvib.simulate", lambda *a, **b: kept)
+    code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--json")
+    assert code == 0 and err == ""
+    head, *rows = read(tmp_path / "run.csv")
+    assert head[:3] == ["time (s)", "displacement y1 (m)", "velocity y1 (m/s)"] and "rotor_speed (rad/s)" in head
+    numbers = np.array(rows, dtype=float)
+    np.testing.assert_allclose(numbers[:, 0], kept.trajectory.time, rtol=1e-8)
+    np.testing.assert_allclose(numbers[:, head.index("angle 2 (rad)")], kept.trajectory.state.angle[0][:, 1], rtol=1e-8)
+    code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "run.csv", "--window")
+    assert code == 2 and "--csv goes without --window, which keeps no trajectory to write" in err
+    code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "none/run.csv")
+    assert code == 2 and "none/run.csv" in err and "cannot be written" in err
+    with pytest.raises(jv.InputError, match="axis is 'point'; Run holds nothing along it"):
+        jv.write_csv(kept, "point", tmp_path / "none.csv")
+
+
+def test_branches_as_csv(typed, tmp_path):
+    assert typed("modes", "machine.toml", "--csv", "branches.csv")[0] == 0
+    head, *rows = read(tmp_path / "branches.csv")
+    at = {name: k for k, name in enumerate(head)}
+    numbers = [[float(row[at[name]]) for row in rows] for name in ("omega (rad/s)", "rotor_speed (rad/s)")]
+    branch = jv.branches(jv.load_scene("machine.toml"))
+    np.testing.assert_allclose(numbers, [branch.omega, branch.rotor_speed], rtol=1e-8)
+
+
+def test_settle_and_growth_ask_what_is_typed(typed, tmp_path, monkeypatch):
+    asked = []
+
+    def noted(scene, *positional, **named):
+        asked.append((*positional, named))
+        return jv.load(DATA / "run_0_1.npz")
+
+    monkeypatch.setattr("jaxvib.settle", noted)
+    words = ("settle", "machine.toml", "--mode", "3", "--tolerance", "1e-7", "--drift", "1e-5", "--stretches", "9")
+    code, out, _ = typed(*words, "--json", "--out", "o")
+    assert code == 0 and json.loads(out)["omega"] == 26.198174990667866 and (tmp_path / "o" / "run.npz").exists()
+    (named,) = asked[0]
+    assert (named["mode"], named["drift"], named["stretches"], named["start"]) == (3, 1e-5, 9, None)
+    assert named["stepsize_controller"] == jv.Tolerance(1e-7)
+    code, _, err = typed("growth", "machine.toml", "--until", "4s", "--stretches", "5")
+    assert code == 2 and "stretches is 5; at least 8 are needed" in err
+    code, _, err = typed("growth", "machine.toml", "--until", "4s", "--start", "spin_up")
+    assert code == 2 and "--start is 'spin_up'" in err
+
+
+@pytest.mark.slow
+def test_settle_envelope_growth_and_run_ups_answer_as_python_does(typed, tmp_path):
+    loaded = jv.load_scene("machine.toml")
+    mode = jv.jam_modes(loaded).mode_numbers()[0]
+    code, out, _ = typed("settle", "machine.toml", "--mode", str(mode), "--json")
+    document = json.loads(out)
+    assert code == 0 and document["omega"] == float(jv.settle(loaded, mode=mode).omega) and document["settled"]
+    code, out, _ = typed("envelope", "machine.toml", "--until", "20s", "--mode", str(mode), "--out", "o")
+    assert code == 0 and "averaged: relative error" in out and (tmp_path / "o" / "envelope.npz").exists()
+    assert abs(json.loads((tmp_path / "o" / "envelope.json").read_text())["omega"] / document["omega"] - 1.0) < 0.05
+    code, out, _ = typed("growth", "machine.toml", "--until", "20s", "--mode", str(mode), "--json")
+    assert code == 0 and json.loads(out)["status"] == "regular"
+    words = ("run-ups", "machine.toml", "--until", "0.5s", "--drag", "0.05", "--drag", "5 N s/m", "--tolerance", "1e-5")
+    code, out, err = typed(*words, "--json")
+    rows = json.loads(out)["run_ups"]
+    assert code == 0 and err == "" and [row["drag"] for row in rows] == [0.05, 5.0]
+    assert all(abs(sum(row["shares"].values()) - 1.0) < 1e-12 for row in rows)
+
+
+def test_numbers_that_stability_commands_vary_are_checked(typed):
+    asked = ("--omega", "20", "40", "--points", "8")
+    code, _, err = typed("stability-map", "machine.toml", "--vary", "loads.mas", "--value", "0.1", *asked)
+    assert code == 2 and "--vary.loads.mas is no number of this scene; did you mean 'loads.mass'?" in err
+    code, _, err = typed("stability-map", "machine.toml", "--vary", "loads.mass", "--value", "2 m", *asked)
+    assert code == 2 and "--value" in err and "not in kg" in err
+    words = (
+        "onset",
+        "machine.toml",
+        "--vary",
+        "loads.mass",
+        "--kind",
+        "torus",
+        "--between",
+        "0.1",
+        "0.2",
+        "--omega",
+        "40",
+        "20",
+    )
+    code, _, err = typed(*words)
+    assert code == 2 and "--omega is 40 to 20 rad/s; the second must be larger" in err
+
+
+def test_the_map_is_that_of_the_function(monkeypatch, typed):
+    """The scenes that the command makes, at the values that are named."""
+    asked = []
+
+    def noted(make, values, *, omega, points):
+        asked.append(([float(make(v).loads.mass) for v in values], omega, points))
+        raise jv.ComputationError("stopped", "no more is needed")
+
+    monkeypatch.setattr("jaxvib.stability_map", noted)
+    words = ("--value", "100 g", "--value", "0.2", "--omega", "120 rpm", "40", "--points", "9")
+    assert typed("stability-map", "machine.toml", "--vary", "loads.mass", *words)[0] == 1
+    masses, omega, points = asked[0]
+    np.testing.assert_allclose([*masses, *omega], [0.1, 0.2, 4.0 * np.pi, 40.0])
+    assert points == 9
+
+
+def test_drags_of_run_ups_are_checked(typed):
+    code, _, err = typed("run-ups", "machine.toml", "--until", "1s", "--drag", "5 kg")
+    assert code == 2 and "--drag is '5 kg', which is not in N s/m" in err
+
+
+@pytest.mark.parametrize(("group", "kind"), [(g, kind) for g, kinds in GROUPS.items() for kind in kinds])
+def test_every_argument_of_a_part_is_listed_as_a_file_takes_it(group, kind):
+    """Numbers of templates with units say which unit an argument is read in; what a constructor needs has no default."""
+    listed = {argument.name: argument for argument in arguments_of(GROUPS[group][kind])}
+    units = {
+        "mass": "kg",
+        "stiffness": {"cubic_support": "N/m^3"}.get(kind, "N/m"),
+        "speed": "rad/s",
+        "gap": "m",
+        "drag": "N s/m",
+    }
+    for name, unit in units.items():
+        if name in listed:
+            assert listed[name].unit == unit
+    assert {"rotor": "N/m, N, N m"}.get(kind, "") == getattr(listed.get("stiffness_terms"), "unit", "")
+
+
+def test_describe(typed):
+    code, out, _ = typed("describe")
+    assert code == 0 and "effects: gravity, static_imbalance" in out
+    code, out, _ = typed("describe", "effects", "--json")
+    listed = {part["kind"]: part for part in json.loads(out)["effects"]}
+    assert code == 0 and set(listed) == set(EFFECTS)
+    reaction = next(a for a in listed["dry_friction"]["arguments"] if a["name"] == "reaction")
+    assert reaction["allowed"] == ["exact", "run_up", "steady"] and reaction["default"] == "exact" and not reaction["needed"]
+    code, out, _ = typed("describe", "drives", "dc_motor")
+    assert code == 0 and "stall_torque" in out and "N m" in out and "**Arguments**" in out
+    code, _, err = typed("describe", "drives", "dc_motr")
+    assert code == 2 and "name is 'dc_motr'; did you mean 'dc_motor'?" in err
+    assert set(SECTIONS["machine"]) == set(GROUPS["machines"])
+
+
+def test_help_is_fast_and_says_of_each_command_what_the_command_itself_says():
+    begun = time.process_time()
+    assert run(["--help"]) == 0
+    assert time.process_time() - begun < 0.3
+    code = "import sys; sys.argv = ['jaxvib', '--help']; from jaxvib.cli import main\ntry: main()\n"
+    code += "except SystemExit: print('jax' in sys.modules, 'numpy' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.endswith("False False\n")
+    for name in _HOMES:
+        command = app.get_command(None, name)
+        begins = command.get_short_help_str(30).removesuffix("...").split()[:4]
+        assert " ".join(begins) in " ".join(said.split())

@@ -1,0 +1,113 @@
+"""Reports: one web page that asks for nothing, whose text cannot be code, with units and what the result is worth."""
+
+import html.parser
+import math
+
+import pytest
+from matplotlib.figure import Figure
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.cli.app import run
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.report.page import Report, units_of
+from jaxvib.study.stress.case import StressRow
+from jaxvib.study.stress.result import stress_of
+
+HOSTILE = "<script>alert('x')</script>&\"<img src=http://evil.example/x onerror=alert(1)>"
+
+
+class Page(html.parser.HTMLParser):
+    """What tags a page has, whether each is closed, and what its attributes point at."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.links, self.text = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        assert not any(name.startswith("on") for name, _ in attrs)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def checked(text):
+    """The page, after a look at what no report may have."""
+    page = Page(text)
+    assert page.open == [] and text.startswith("<!doctype html>")
+    assert not {"script", "link", "iframe", "object", "embed", "base", "form"} & set(page.tags)
+    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert "default-src 'none'" in text and "@import" not in text and "url(" not in text
+    return page
+
+
+def test_text_cannot_become_code():
+    """Names, commands, keys and values of a document, figure names: all of them hostile."""
+    figure = Figure(figsize=(1.0, 1.0))
+    document = {HOSTILE: HOSTILE, "status": HOSTILE, "rows": [{HOSTILE: HOSTILE}], "inner": {HOSTILE: [HOSTILE] * 20}}
+    report = Report(HOSTILE, document, {HOSTILE: HOSTILE, "rows": HOSTILE}, HOSTILE, HOSTILE, None, [(HOSTILE, figure)])
+    text = report.html()
+    page = checked(text)
+    assert "evil.example" not in "".join(page.links) and "<script" not in text
+    assert HOSTILE in "".join(page.text)
+
+
+def test_a_scene_file_with_a_hostile_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = "a<script>alert(1)<b>.toml"
+    (tmp_path / name).write_text("# " + HOSTILE + "\n" + jv.scene_to_toml(scene("two_mass", speed=150.0)))
+    monkeypatch.setattr("jaxvib.sketch", lambda scene: Figure(figsize=(1.0, 1.0)), raising=False)
+    assert run(["modes", name, "--report", "deep/er/report.html"]) == 0
+    assert "wrote deep/er/report.html" in capsys.readouterr().out
+    text = (tmp_path / "deep" / "er" / "report.html").read_text()
+    page = checked(text)
+    said = " ".join(page.text)
+    assert name in said and "evil.example" not in text
+    assert "Machine" in said and "N s/m" in said and "by slope, for light loads" in said and len(page.links) == 2
+    assert "amplitude, m" in said and "m or rad" not in said and "omega, rad/s" in said and "jaxvib" in said
+
+
+def test_numbers_that_are_not_finite_and_long_lists():
+    document = {"error": math.nan, "omega": list(range(40)), "table": [[1.0, 2.0]] * 300, "empty": [], "flag": True}
+    page = checked(Report("x", {**document, "error": None}, {"omega": "rad/s"}).html())
+    said = " ".join(page.text)
+    assert "40 numbers from 0 to 39" in said and "100 rows more" in said and "yes" in said and "omega, rad/s" in said
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_parameters_of_every_template_have_units(kind, tmp_path):
+    result = stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)])
+    path = jv.html_report(result, tmp_path / "r.html", scene=jv.scene_from_toml(TEMPLATES[kind]), figures=[])
+    text = path.read_text()
+    checked(text)
+    assert "<td class='unit'>kg</td>" in text and "<td class='unit'>rad/s</td>" in text
+    assert "every case ended in a right answer" in text
+
+
+def test_units_are_those_of_the_fields():
+    run = jv.load(__file__.replace("report/test_page.py", "data/run_0_1.npz"))
+    units = units_of(run)
+    assert units["omega"] == "rad/s" and units["foundation_force"] == "N" and units["time"] == "s" and "steps" not in units
+
+
+def test_wrong_input(tmp_path, capsys):
+    with pytest.raises(jv.InputError, match="result is a dict; give a result"):
+        jv.html_report({}, tmp_path / "r.html")
+    run_ = stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)])
+    with pytest.raises(jv.InputError, match="cannot be written"):
+        jv.html_report(run_, tmp_path / "none" / "r.html", figures=[])
+    assert run(["describe", "--report", str(tmp_path / "r.pdf")]) == 2
+    assert "--report is" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert run(["describe", "--report", str(tmp_path / "file" / "r.html")]) == 2
+    assert "cannot be made a folder" in capsys.readouterr().err
