@@ -10,13 +10,19 @@ import nbformat
 import pytest
 
 FOLDER = pathlib.Path(__file__).parents[2] / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+FIRST = FOLDER / "first_machine.ipynb"
+OTHERS = sorted(set(FOLDER.glob("*.ipynb")) - {FIRST})
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
 
 
-def printed(notebook):
-    texts = [o.text for c in notebook.cells if c.cell_type == "code" for o in c.outputs if o.output_type == "stream"]
-    return "".join(texts)
+def printed(notebook, but=()):
+    """What code cells print, those apart that have a tag of `but`."""
+    cells = [c for c in notebook.cells if c.cell_type == "code" and not set(but) & set(c.metadata.get("tags", []))]
+    return "".join(o.text for c in cells for o in c.outputs if o.output_type == "stream")
+
+
+def numbers(text):
+    return [float(x) for x in NUMBER.findall(text)]
 
 
 def figures(notebook):
@@ -24,12 +30,8 @@ def figures(notebook):
     return sum("image/png" in o.get("data", {}) for o in outputs)
 
 
-def test_there_are_notebooks():
-    assert NOTEBOOKS
-
-
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [FIRST, *(pytest.param(path, marks=pytest.mark.slow) for path in OTHERS)], ids=lambda p: p.stem)
 def test_notebook_runs_and_shows_what_it_showed(path):
     kept = nbformat.read(path, as_version=4)
     fresh = nbformat.read(path, as_version=4)
@@ -38,8 +40,9 @@ def test_notebook_runs_and_shows_what_it_showed(path):
     shared["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
     nbclient.NotebookClient(fresh, timeout=900, kernel_name="python3").execute(env=shared)
     assert figures(fresh) == figures(kept) > 0
-    # Words must be the same; numbers may differ in the digits that another processor rounds otherwise.
+    # Words must be the same; numbers may differ in the digits that another processor rounds otherwise, and cells with the tag
+    # "varies" print times and counts.
     assert NUMBER.sub("#", printed(fresh)) == NUMBER.sub("#", printed(kept))
-    table = re.compile(r"  jam frequency, .*?  force per amplitude[^\n]*", re.S)
-    settled, before = ([float(x) for x in NUMBER.findall(table.search(printed(shown))[0])] for shown in (fresh, kept))
+    settled, before = (numbers(printed(shown, but=["varies"])) for shown in (fresh, kept))
+    assert len(before) > 0
     assert settled == pytest.approx(before, rel=1e-3)
