@@ -95,6 +95,10 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
+# Many cases
+from jaxvib.sweeps.status import CaseStatus, SweepStatus
+from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
+
 # Results
 from jaxvib.report.page import html_report
 from jaxvib.results.csv import write_csv

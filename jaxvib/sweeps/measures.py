@@ -61,17 +61,45 @@ def _settling(run: WatchedRun) -> Array:
     return jnp.where(run.regime.change < _NEAR, late, run.window.time[-1])
 
 
+def _mode(run: WatchedRun) -> Array:
+    return run.regime.mode
+
+
+def _load_speed(run: WatchedRun) -> Array:
+    return run.measured.omega
+
+
+def _amplitude(run: WatchedRun) -> Array:
+    return run.measured.amplitude
+
+
+def _force(run: WatchedRun) -> Array:
+    return run.measured.foundation_force
+
+
+def _ripple(run: WatchedRun) -> Array:
+    return run.regime.ripple
+
+
+def _rotor_speed(run: WatchedRun) -> Array:
+    return run.regime.rotor_speed
+
+
+def _drift(run: WatchedRun) -> Array:
+    return run.measured.drift
+
+
 RUN_MEASURES = {
     measure.name: measure
     for measure in (
         RunMeasure("run.regime", "", _regime, meanings=REGIMES),
-        RunMeasure("run.mode", "", lambda run: run.regime.mode),
-        RunMeasure("run.load_speed", "rad/s", lambda run: run.measured.omega),
-        RunMeasure("run.amplitude", "m or rad", lambda run: run.measured.amplitude, axis="coordinate"),
-        RunMeasure("run.foundation_force", "N", lambda run: run.measured.foundation_force),
-        RunMeasure("run.ripple", "rad/s", lambda run: run.regime.ripple),
-        RunMeasure("run.rotor_speed", "rad/s", lambda run: run.regime.rotor_speed),
-        RunMeasure("run.drift", "", lambda run: run.measured.drift),
+        RunMeasure("run.mode", "", _mode),
+        RunMeasure("run.load_speed", "rad/s", _load_speed),
+        RunMeasure("run.amplitude", "m or rad", _amplitude, axis="coordinate"),
+        RunMeasure("run.foundation_force", "N", _force),
+        RunMeasure("run.ripple", "rad/s", _ripple),
+        RunMeasure("run.rotor_speed", "rad/s", _rotor_speed),
+        RunMeasure("run.drift", "", _drift),
         RunMeasure("run.settling_time", "s", _settling),
     )
 }

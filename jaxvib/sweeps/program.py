@@ -124,7 +124,9 @@ def _computed(study: Study, values: np.ndarray, which: np.ndarray, errors: dict[
     try:
         found, finite = _cases(study.scene, jnp.asarray(filled), *study.program)
         return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
-    except Exception as error:  # whatever a user's own function raises
+    except RuntimeError as error:  # what a running program raises; a program that cannot be made is no case's fault
+        if "RESOURCE_EXHAUSTED" in str(error):
+            raise
         if len(which) == 1:
             errors[int(which[0])] = _sentence(error)
             return study.nothing(len(values)), np.ones(len(values), bool)

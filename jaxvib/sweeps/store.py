@@ -99,6 +99,11 @@ class Store:
             shutil.rmtree(part, ignore_errors=True)
         return cls(path, writable=True)
 
+    @property
+    def coordinates(self) -> int:
+        """How many coordinates the scene's machine has."""
+        return int(self.attributes["coordinates_of_machine"])
+
     def require_same(self, study: Study) -> None:
         """**Raises** `InputError` where the store is of another study, or was begun with other versions."""
         mine, its = json.loads(json.dumps(study.record)), self.record
@@ -188,6 +193,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
         "study": study.record,
         "versions": versions(),
         "key": study.key,
+        "coordinates_of_machine": len(study.scene.machine.structure().coordinates),
     }
     coordinates = [axis.name for axis in sampled]
     if coordinates:
