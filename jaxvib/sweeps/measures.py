@@ -56,7 +56,7 @@ def _regime(run: WatchedRun) -> Array:
 def _settling(run: WatchedRun) -> Array:
     """The end of the last part in which the speed of some load is not yet near its last one."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
-    away = jnp.any(jnp.abs(run.part_speed - last) > _NEAR * jnp.abs(rotor), axis=1)
+    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _NEAR * jnp.abs(rotor), axis=1)
     late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
     return jnp.where(run.regime.change < _NEAR, late, run.window.time[-1])
 

@@ -52,7 +52,7 @@ def versions() -> dict[str, str]:
 class Store:
     """A store that was opened, or made.
 
-    **Attributes**: `path`; `attributes` the record of it: the study, versions, seed.
+    **Attributes**: `path`; `attributes` the record of it: the study, versions, seed; `arrays` by name.
     """
 
     def __init__(self, path: Path, writable: bool = False):
@@ -66,6 +66,9 @@ class Store:
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {str(path)!r}, which is no store of a sweep; name another one")
             self.record: dict[str, Any] = self.attributes["study"]
+            # Where a chunk has no answer at all its file is written too: one that is missing is a damage.
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
             self.tile = tuple(int(n) for n in self.record["tile"])
             self.names = tuple(self.record["measure"])
@@ -142,15 +145,15 @@ class Store:
                 drawn = study.grid.drawn(region[-1])
                 sampled = [axis.name for axis in study.grid.axes if axis.values is None]
                 for k, name in enumerate(sampled):
-                    self.group[name][region[-1]] = drawn[:, k]
+                    self.arrays[name][region[-1]] = drawn[:, k]
             for name, leaf in cases.found.items():
-                self.group[name][region] = leaf.reshape(*shape, *leaf.shape[1:])
+                self.arrays[name][region] = leaf.reshape(*shape, *leaf.shape[1:])
             if cases.errors:
                 said = np.full(int(np.prod(shape)), "", dtype=object)
                 for place, words in cases.errors.items():
                     said[place] = words
                 self.group["error"][region] = said.reshape(shape)
-            self.group["status"][region] = cases.status.reshape(shape)
+            self.arrays["status"][region] = cases.status.reshape(shape)
         except OSError as error:
             raise cannot_write(self.path, error) from error
 
@@ -187,7 +190,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
 
     grid = study.grid
     sampled = [axis for axis in grid.axes if axis.values is None]
-    fixed: dict[str, Any] = {"compressors": ZstdCodec(level=1, checksum=True), "config": {"write_empty_chunks": True}}
+    fixed: dict[str, Any] = {"compressors": ZstdCodec(level=1, checksum=True)}
     attributes: dict[str, Any] = {
         "jaxvib_sweep": _FORMAT,
         "study": study.record,
@@ -224,7 +227,6 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
         for dim, size in zip(extra, form.shape, strict=True):
             if dim not in group and len(extra_names.get(dim, ())) == size:
                 add(dim, (dim,), (size,), (size,), str, fill="")[:] = np.asarray(extra_names[dim], dtype=object)
-    fixed["config"] = {}
     add("error", grid.dims, grid.shape, grid.tile, str, fill="", long_name="why a case failed")
     meanings = {
         "flag_values": list(range(len(CASE_STATUSES))),

@@ -72,9 +72,9 @@ class Study:
 
     @property
     def size(self) -> int:
-        """How many cases the program computes at a time."""
-        most = int(np.prod(self.grid.tile, dtype=np.int64))
-        return -(-most // LANES) * LANES if most > LANES else most
+        """How many cases the program computes at a time: whole groups of lanes, for in the rest of one that does not fill the
+        processor's vectors a case would be computed by other instructions."""
+        return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // LANES) * LANES
 
     @property
     def record(self) -> dict[str, Plain]:
