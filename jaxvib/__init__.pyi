@@ -96,6 +96,8 @@ from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Many cases
+
+# Many cases
 from jaxvib.sweeps.status import CaseStatus, SweepStatus
 from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
 
@@ -253,6 +255,12 @@ __all__ = [
     "CaptureStatus",
     "threshold_curve",
     "ThresholdCurve",
+    # Many cases
+    "sweep",
+    "open_sweep",
+    "Sweep",
+    "SweepStatus",
+    "CaseStatus",
     # Results
     "Result",
     "load",

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from small_machine import small_sweep
 
 import jaxvib as jv
 from jaxvib.motion.growth import Growth, GrowthStatus
@@ -176,6 +177,7 @@ RESULTS = {
     "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Audit": audited,
     "GradientCheck": checked_gradients,
+    "Sweep": cached(lambda: small_sweep(SCENE)),
     "Synthesis": synthesis,
     "Front": lambda: Front(np.array([[1.0, 2.0], [2.0, 1.0]]), ("force", "power"), ("N", "W"), (jv.scene_to_toml(SCENE),) * 2),
 }

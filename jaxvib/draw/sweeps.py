@@ -169,7 +169,7 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax
 
 
 def tornado_chart(
-    names: Sequence[str], low: np.ndarray, high: np.ndarray, middle: float, *, across: str, ax: Axes | None = None
+    names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, across: str, ax: Axes | None = None
 ) -> Figure:
     """Bars from `low` to `high` (n,) about a middle, the longest on top: what a quantity is where a number is small and large.
 

@@ -45,8 +45,8 @@ def advance(motion: PackedSystem, held: Held, begin: Array, length: Array, step:
 class Plan(NamedTuple):
     """How watched runs advance, the same for all that go side by side.
 
-    **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly apart;
-    `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next.
+    **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly
+    apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next.
     """
 
     until: float

@@ -71,8 +71,8 @@ class Axis(NamedTuple):
 class Grid(NamedTuple):
     """All cases of a study: every combination of the axes' values, and for each of them every sample.
 
-    **Attributes**: `axes`; `samples` how many, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile` how many cases
-    along each dimension are computed together.
+    **Attributes**: `axes`; `samples` how many, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile` how many
+    cases along each dimension are computed together.
     """
 
     axes: tuple[Axis, ...]

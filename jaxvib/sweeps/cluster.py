@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
 from jaxvib.sweeps.status import CASE_STATUSES
 from jaxvib.sweeps.store import versions
-from jaxvib.sweeps.study import Study
 from jaxvib.units import Number, number
 
 __all__ = ["on_a_cluster"]
@@ -28,7 +28,7 @@ _STUDIES: dict[str, Study] = {}
 
 def on_a_cluster(
     study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
-) -> Iterator[tuple[int, Chunk]]:
+) -> Generator[tuple[int, Chunk], None, None]:
     """Lets workers compute the chunks; gives each with its number as it is finished. This process alone writes.
 
     A worker that dies loses the chunks that it held, which others compute again. A chunk whose workers died several times is
@@ -47,9 +47,8 @@ def on_a_cluster(
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:
-            address = stack.enter_context(
-                LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50)
-            )
+            options = {"dashboard_address": None, "silence_logs": 50}
+            address = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options))
         else:
             address = scheduler
         try:

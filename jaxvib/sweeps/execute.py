@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
-from jaxvib.sweeps.study import Study
 
 __all__ = ["Progress", "Report", "cores", "in_this_process", "timed"]
 
@@ -33,7 +33,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-def in_this_process(study: Study, todo: Iterable[int], threads: int | None = None) -> Iterator[tuple[int, Chunk]]:
+def in_this_process(study: Study, todo: Iterable[int], threads: int | None = None) -> Generator[tuple[int, Chunk], None, None]:
     """Computes chunks on all cores, by one program that all threads share; gives each with its number as it is finished.
 
     No more chunks are held than twice the threads. The first chunk is computed alone, so that the program is compiled once.

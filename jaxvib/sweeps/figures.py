@@ -59,8 +59,8 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
 
 
 def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Figure:
-    """The figure that fits a study: over two axes a map, of regimes where they were measured; over samples alone the distribution
-    of what was measured first; over one axis that as points."""
+    """The figure that fits a study: over two axes a map, of regimes where they were measured; over samples alone the
+    distribution of what was measured first; over one axis that as points."""
     opened = Store(Path(store))
     dims = _dims(opened)
     if len([d for d in dims if d != SAMPLE]) >= 2:
@@ -193,7 +193,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Figure:
-    """What a measure is on average where each of the numbers that change is in the lowest and in the highest fifth of its range.
+    """What a measure is on average where each of the numbers that change is in the lowest and the highest fifth of its range.
 
     **Returns** a matplotlib figure, the number with the largest influence on top.
     """
@@ -255,10 +255,10 @@ def _axis_label(store: Store, axis: str) -> str:
 def _measure(store: Store, name: str | None) -> str:
     """The name of a measure with numbers, the first one unless said otherwise."""
     plain = [n for n in store.names if not _is_label(store, n)]
-    name = name or next(iter(plain or store.names), None)
-    if name not in store.names:
-        raise InputError("measure", f"is {name!r}; {closest(str(name), list(store.names))}")
-    return name
+    found = name or next(iter(plain or store.names))
+    if found not in store.names:
+        raise InputError("measure", f"is {found!r}; {closest(found, list(store.names))}")
+    return found
 
 
 def _measure_label(store: Store, name: str) -> str:
@@ -328,6 +328,10 @@ def _theory(
         if len(counts) == 1:  # the same points in every row: lines through them
             parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
         else:
-            parts = [(np.asarray([n]), np.asarray([row])) for kinds, row in zip(found, rows, strict=True) for n in kinds.get(kind, [])]
+            parts = [
+                (np.asarray([n]), np.asarray([row]))
+                for kinds, row in zip(found, rows, strict=True)
+                for n in kinds.get(kind, [])
+            ]
         lines[kind] = parts if across == _SPEED else [(b, a) for a, b in parts]
     return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,17 +15,12 @@ from jaxvib.motion.lanes import PARTS, Plan, watched_run
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
+from jaxvib.sweeps.definition import LANES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from jaxvib.sweeps.status import CASE_STATUSES
 from optimize.wishes.answers import Answers
 
-if TYPE_CHECKING:
-    from jaxvib.sweeps.study import Study
-
-__all__ = ["LANES", "Chunk", "compute", "planned", "shapes"]
-
-LANES = 64
-"""Cases that are computed side by side: vectors are full, and the numbers of a run stay in the processor's cache."""
+__all__ = ["Chunk", "compute", "planned", "shapes"]
 
 _SAMPLES = 1024
 """States in the window over which a run is measured."""
@@ -48,8 +43,7 @@ class Chunk(NamedTuple):
     errors: dict[int, str]
 
 
-@cached
-def _cases(
+def _each(
     scene: Scene,
     values: Array,
     spots: tuple[Spot, ...],
@@ -70,6 +64,9 @@ def _cases(
         return tuple(map(jnp.asarray, found)), jnp.asarray(True) if run is None else run.finite
 
     return jax.lax.map(one, values, batch_size=LANES)
+
+
+_cases = cached(_each)
 
 
 @cached
@@ -98,7 +95,7 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
 def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:
     """Shape and type of each measure of one case, without computing any. Raises what tracing the program raises."""
     values = jnp.zeros((1, len(study.spots)))
-    found, _ = jax.eval_shape(lambda v: _cases.function(study.scene, v, *study.program), values)
+    found, _ = jax.eval_shape(lambda v: _each(study.scene, v, *study.program), values)
     return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found]
 
 
@@ -117,7 +114,9 @@ def compute(study: Study, chunk: int) -> Chunk:
     return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
 
 
-def _computed(study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]) -> tuple[list[np.ndarray], np.ndarray]:
+def _computed(
+    study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
+) -> tuple[list[np.ndarray], np.ndarray]:
     """What is found in the cases `which` of a chunk, NaN (labels: -1) in the others and in those that raise an error."""
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]

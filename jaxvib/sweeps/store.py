@@ -19,12 +19,12 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.results.fields import Plain
+from jaxvib.results.status import member, sentence
 from jaxvib.sweeps.axes import SAMPLE
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
 from jaxvib.sweeps.status import CASE_STATUSES, CaseStatus
-from jaxvib.sweeps.study import Study
-from jaxvib.results.status import member, sentence
 
 __all__ = ["Store", "require_zarr", "versions"]
 
@@ -83,7 +83,9 @@ class Store:
 
     def damaged(self, what: str) -> InputError:
         """The error to raise for a store that cannot be used."""
-        return InputError("store", f"is {str(self.path)!r}, which is no store of a sweep, or a damaged one ({what}); name another")
+        return InputError(
+            "store", f"is {str(self.path)!r}, which is no store of a sweep, or a damaged one ({what}); name another"
+        )
 
     @classmethod
     def made(cls, path: Path, study: Study) -> Store:
@@ -206,7 +208,14 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     def add(name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: Any, **more: Any) -> Any:
         told = {key: value for key, value in more.items() if key != "fill" and value}
         return group.create_array(
-            name, shape=shape, chunks=chunks, dtype=kind, dimension_names=dims, fill_value=more["fill"], attributes=told, **fixed
+            name,
+            shape=shape,
+            chunks=chunks,
+            dtype=kind,
+            dimension_names=dims,
+            fill_value=more["fill"],
+            attributes=told,
+            **fixed,
         )
 
     for axis in grid.axes:

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, cast
 
-import jax
-import numpy as np
-
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
-from jaxvib.machine.files import closest, load_scene, read_toml, scene_to_toml
+from jaxvib.machine.files import closest, load_scene, read_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.lanes import Plan
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
-from jaxvib.sweeps.axes import AxisSpec, Grid, Spot, axis_of, corners, require_apart, tile_of
-from jaxvib.sweeps.measures import Measure, RunMeasure, identity, measure_of
-from jaxvib.sweeps.program import LANES, planned, shapes
+from jaxvib.sweeps.axes import AxisSpec, Grid, axis_of, corners, require_apart, tile_of
+from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
+from jaxvib.sweeps.program import planned, shapes
 from jaxvib.sweeps.samples import SAMPLINGS
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
 from optimize.quantities import Quantity
 from optimize.wishes.quantity import TIERS, Tier
 
-__all__ = ["TEMPLATE", "Measures", "Study", "load_study", "study"]
+__all__ = ["TEMPLATE", "Measures", "load_study", "study"]
 
 Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
 """What is measured, or by the names that it shall have."""
@@ -39,67 +33,6 @@ _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Cases of a chunk: about a second's work, less than that is taken up by keeping books."""
 
 _RESERVED = ("status", "error")
-
-
-@dataclass(frozen=True)
-class Study:
-    """A study that was checked, see `study`.
-
-    **Attributes**: `scene`; `grid` of the cases; `names` and `measures` of what is measured, with the `dtypes` and shapes
-    (`extra`) that one case has; `plan` of the runs, None where there are none; `start` and `mode` they start from; `tier`.
-    """
-
-    scene: Scene
-    grid: Grid
-    names: tuple[str, ...]
-    measures: tuple[Measure, ...]
-    plan: Plan | None
-    start: Start
-    mode: int | None
-    tier: Tier
-    specs: dict[str, Plain]
-    forms: tuple[jax.ShapeDtypeStruct, ...] = ()
-
-    @property
-    def spots(self) -> tuple[Spot, ...]:
-        """Where the axes' numbers stand."""
-        return tuple(axis.spot for axis in self.grid.axes)
-
-    @property
-    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], Plan | None, Start, int | None]:
-        """What the compiled program depends on beside the scene and the cases."""
-        return self.spots, self.measures, self.plan, self.start, self.mode
-
-    @property
-    def size(self) -> int:
-        """How many cases the program computes at a time: whole groups of lanes, for in the rest of one that does not fill the
-        processor's vectors a case would be computed by other instructions."""
-        return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // LANES) * LANES
-
-    @property
-    def record(self) -> dict[str, Plain]:
-        """All that the results depend on, ready for JSON."""
-        return {
-            "scene": scene_to_toml(self.scene),
-            "axes": self.specs,
-            "samples": self.grid.samples,
-            "sampling": self.grid.sampling,
-            "seed": self.grid.seed,
-            "tier": self.tier,
-            "measure": {name: cast(Plain, identity(m)) for name, m in zip(self.names, self.measures, strict=True)},
-            "run": None if self.plan is None else {**self.plan._asdict(), "start": self.start, "mode": self.mode},
-            "tile": list(self.grid.tile),
-            "precision": str(self.scene.drive.speed.dtype),
-        }
-
-    @property
-    def key(self) -> str:
-        """A text that differs from that of every other study."""
-        return hashlib.sha256(json.dumps(self.record, sort_keys=True).encode()).hexdigest()
-
-    def nothing(self, cases: int) -> list[np.ndarray]:
-        """What stands for measures of cases that have none: NaN, of whole numbers -1."""
-        return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]
 
 
 def study(
@@ -250,9 +183,10 @@ def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]
     if "function" in rest:
         return name, _function(rest, name, field)
     if str(rest.get("quantity", "")).startswith("run."):
+        read = measure_of(rest["quantity"], f"{field}.quantity")
         if len(rest) > 1:
             raise InputError(f"{field}.{next(k for k in rest if k != 'quantity')}", "is no field of what is read off a run")
-        return name, measure_of(rest["quantity"], f"{field}.quantity")
+        return name, read
     quantity, _ = quantity_from_table(rest, field, ())
     return name, quantity
 
@@ -268,7 +202,7 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     return Quantity(name or function, str(table.get("unit", "")), found)
 
 
-TEMPLATE = """# A study: which numbers change from case to case, and what is measured in each. Run it with: jaxvib sweep study.toml
+TEMPLATE = """# A study: which numbers change from case to case, and what is measured in each. Run it: jaxvib sweep study.toml
 scene = "machine.toml"            # path of the scene file, from here
 # tier = "exact"                  # of quantities of a jam: leading (of light loads), exact, time [leading]
 # chunk = 1024                    # cases that are computed, and written, together

@@ -17,12 +17,13 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.results.status import member, sentence
 from jaxvib.sweeps.axes import AxisSpec
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.execute import Report, in_this_process, timed
 from jaxvib.sweeps.status import CASE_STATUSES, CaseStatus, SweepStatus
 from jaxvib.sweeps.store import Store
-from jaxvib.sweeps.study import Measures, Study, study
-from jaxvib.results.status import member, sentence
+from jaxvib.sweeps.study import Measures, study
 from jaxvib.units import Number
 from optimize.wishes.quantity import Tier
 
@@ -51,7 +52,7 @@ class Sweep(Result):
     status: SweepStatus
     store: str
     cases: int = eqx.field(metadata=in_unit(""))
-    counts: tuple[CaseCount, ...] = eqx.field(metadata=in_unit("", "status"))
+    counts: tuple[CaseCount, ...] = eqx.field(metadata=in_unit("", "kind"))
     computed: int = eqx.field(metadata=in_unit(""))
     seconds: float = eqx.field(metadata=in_unit("s"))
 
@@ -111,8 +112,8 @@ def sweep(
 ) -> Sweep:
     """Computes every case of a study and keeps it in a store on disk; where the store is there already, goes on with it.
 
-    Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk is
-    written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on the
+    Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk
+    is written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on the
     cases beside it, on the order, on how many workers there are, or on restarts.
 
     **Arguments**
@@ -120,16 +121,16 @@ def sweep(
     - `scene`: what all cases have in common
     - `axes`: what changes: a number of the scene by the name that designs have for it ("machine.stiffness[0]", "loads.drag",
       "drive.speed"), or of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]"
-      m/s; without an entry of all alike), each with a list of values, or a table of `from`, `to`, `count` and `scale` ("even" or
-      "log"). Cases are all combinations. Numbers whose table has no `count` are sampled together, `samples` times for each
+      m/s; without an entry of all alike), each with a list of values, or a table of `from`, `to`, `count` and `scale` ("even"
+      or "log"). Cases are all combinations. Numbers whose table has no `count` are sampled together, `samples` times for each
       combination of the others
     - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of what is read
       off a run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
       "run.foundation_force", "run.settling_time", ... ; or a mapping of names that they shall have
     - `store`: a folder, by custom with the ending ".zarr"
     - `tier`: how quantities of a jam are computed: "leading", "exact" or "time"; their own unless said otherwise
-    - `until`, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in it, to
-      `until`, s, by so many equal steps, the same in all cases; by default one for each radian of what moves fastest in any case
+    - `until`, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in it,
+      to `until`, s, by so many equal steps, the same in all cases; by default one for each radian of what moves fastest
     - `samples`, `seed`, `sampling`: how many, and how they are drawn: "low_discrepancy" or "random"
     - `chunk`: cases that are computed and written together; it is part of the store's record
     - `workers`: so many processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),

@@ -1,8 +1,12 @@
 """A machine whose motion is of order 1 in 20 s, and its runs: all of one length and of so many samples, for one program."""
 
+import pathlib
+import tempfile
+
 import jax.numpy as jnp
 
 import jaxvib as jv
+from optimize import Quantity
 
 GRAVITY = 9.81
 
@@ -23,3 +27,13 @@ def small_start():
 def small_run(effects=(), **given):
     """20 s of it, 21 samples unless only the window is saved."""
     return jv.simulate(small_machine(effects), 20.0, **{"start": small_start(), "samples": 21, **given})
+
+
+def heaviness(scene):
+    return scene.machine.mass[0] * scene.drive.speed
+
+
+def small_sweep(scene):
+    """A sweep of three cases that is computed at once."""
+    store = pathlib.Path(tempfile.mkdtemp()) / "study.zarr"
+    return jv.sweep(scene, {"drive.speed": [40.0, 60.0, 80.0]}, [Quantity("heaviness", "kg rad/s", heaviness)], store)

@@ -87,7 +87,10 @@ RUN = ["run.mode"]
         (dict(axes={"drive.sped": [1.0]}), "is no number of this scene; did you mean 'drive.speed'"),
         (dict(axes={"start.rat": [1.0]}), "is no number of a start; did you mean 'start.rate'"),
         (dict(axes={"start.rate[3]": [1.0]}), "start.rate has 3 entries"),
-        (dict(axes={"machine.mass": [40.0], "machine.mass[0]": [50.0]}), r"changes a number that axes.machine.mass changes too"),
+        (
+            dict(axes={"machine.mass": [40.0], "machine.mass[0]": [50.0]}),
+            r"changes a number that axes.machine.mass changes too",
+        ),
         (
             dict(axes={"start.rate": [1.0], "start.rate[1]": [2.0]}, measure=RUN, until=1.0),
             r"axes.start.rate\[1\] changes a number",

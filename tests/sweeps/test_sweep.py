@@ -14,8 +14,8 @@ from scenes import published, scene
 
 import jaxvib as jv
 from jaxvib.sweeps import execute, program
-from jaxvib.sweeps.sweep import run_study
 from jaxvib.sweeps.study import study
+from jaxvib.sweeps.sweep import run_study
 from optimize import Quantity, jam_frequency
 
 SCENE = scene("one_mass", "balls", speed=60.0)
@@ -162,7 +162,10 @@ def other_version(store):
         (lambda store: shutil.rmtree(store / "beyond" / "c"), "beyond of chunk 0 is missing"),
         (lambda store: (store / "zarr.json").write_text("{"), "damaged one"),
         (lambda store: (store / "zarr.json").unlink(), "no store of a sweep"),
-        (lambda store: (store / "zarr.json").write_text(json.dumps({"zarr_format": 3, "node_type": "group"})), "no store of a sweep"),
+        (
+            lambda store: (store / "zarr.json").write_text(json.dumps({"zarr_format": 3, "node_type": "group"})),
+            "no store of a sweep",
+        ),
         (broken_status, "status: .*checksum"),
         (other_version, f"begun with jax 0.1.0, and this is {jax.__version__}: digits would differ"),
     ],
@@ -226,7 +229,9 @@ def runs(tmp_path_factory):
     """Captures of the published machine: its torus of mode 1 lies at n = 0.42, the fold below mode 5 at 1.39."""
     axes = {"drive.speed": [0.35, 0.9, 2.0, 2.9], "start.rate": [0.0, 0.6, 1.6]}
     measure = ["run.regime", "run.mode", "run.load_speed", "run.amplitude", "run.settling_time"]
-    return jv.sweep(published(eps=0.05).scene(), axes, measure, tmp_path_factory.mktemp("runs") / "runs.zarr", until=400.0, chunk=12)
+    return jv.sweep(
+        published(eps=0.05).scene(), axes, measure, tmp_path_factory.mktemp("runs") / "runs.zarr", until=400.0, chunk=12
+    )
 
 
 def test_runs_come_to_the_jams_that_are_there(runs):
