@@ -113,8 +113,8 @@ def sweep(
     """Computes every case of a study and keeps it in a store on disk; where the store is there already, goes on with it.
 
     Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk
-    is written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on the
-    cases beside it, on the order, on how many workers there are, or on restarts.
+    is written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on
+    the cases beside it, on the order, on how many workers there are, or on restarts.
 
     **Arguments**
 
