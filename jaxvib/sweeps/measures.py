@@ -122,7 +122,7 @@ def identity(measure: Measure) -> dict[str, str]:
     """What tells a measure from another one in a store's record; of a function of the user's own also what it says."""
     found = {"words": measure.words, "unit": measure.unit}
     function = measure.function
-    if function is not None and not function.__module__.startswith(("jaxvib.", "optimize.")):
+    if function is not None and not str(function.__module__).startswith(("jaxvib.", "optimize.")):
         found["function"] = f"{function.__module__}.{function.__qualname__}"
         try:
             found["source"] = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:16]
