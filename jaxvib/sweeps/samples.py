@@ -18,7 +18,7 @@ def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.nd
     are the numbers of a counter-based generator (Philox) with the key `seed`.
 
     >>> samples(0, 4, 1, 0, "low_discrepancy").round(3).ravel().tolist()
-    [0.931, 0.549, 0.167, 0.785]
+    [0.012, 0.63, 0.248, 0.866]
     >>> bool((samples(2, 4, 3, 7, "random") == samples(0, 4, 3, 7, "random")[2:]).all())
     True
 
