@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from small_machine import small_sweep
+from small_machine import checked_gradients, small_sweep
 
 import jaxvib as jv
 from jaxvib.motion.growth import Growth, GrowthStatus
@@ -105,14 +105,6 @@ def audited():
     own = dict(kind="jam mode 1", omega=27.0, amplitude=np.ones(1), foundation_force=9.0, fold=90.0, coordinates=("y1",))
     cost = dict(operations=200, seconds=0.1, compile=2.0, effects=rows, tiers=tiers, numbers=numbers)
     return jv.Audit(status=AuditStatus.done, accuracy=0.01, question="jam mode 1 at 60 rad/s", **own, **cost)
-
-
-def checked_gradients():
-    shape = np.array([[1.0, 2.0], [1.0, 2.1]])
-    found = dict(gradient=shape, error=0.1 * shape, difference=shape[0], noise=1e-9 * shape[0], step=np.array([1e-4, 1e-3]))
-    names = dict(numbers=("machine.mass", "loads.drag"), at=np.ones(2), routes=("forward", "reverse"))
-    swept = dict(steps=np.array([1e-2, 1e-3, 1e-4]), sweep=np.ones((2, 3)), tolerance=1e-5, left_out=("machine.damping",))
-    return jv.GradientCheck(status=jv.GradientStatus.differ, value=3.0, **names, **found, **swept)
 
 
 def cached(make):

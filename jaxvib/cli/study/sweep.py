@@ -65,24 +65,22 @@ def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory:
     """Say what is in STORE, which `jaxvib sweep` wrote; --out adds its figures: map.png, shares.png, distribution.png,
     tornado.png, as far as they fit the study."""
     found = open_sweep(store)
-    if output.folder is not None:
+    if output.folder is not None or output.report is not None:
         from jaxvib.sweeps.figures import figures
 
         x, y = over or (None, None)
         for name, figure in figures(store, measure, x=x, y=y, theory=theory):
-            picture = output.file(f"{name}.png")
-            assert picture is not None
-            figure.savefig(picture)
+            output.picture(f"{name}.png", lambda drawn=figure: drawn)
     _tell(found, output, "show")
 
 
 def _tell(found: Sweep, output: Output, name: str) -> None:
     if name == "sweep":
-        picture = output.file("sweep.png")
-        if picture is not None:
-            found.plot().savefig(picture)
+        output.picture("sweep.png", found.plot)
     rows = [[status, str(cases), f"{100.0 * cases / found.cases:.3g} %"] for status, cases in found.counts]
-    output.done(found.as_dict(), lambda: f"{table(found.store, ['status', 'cases', 'share'], rows)}\n{found.summary()}", name)
+    output.done(
+        found.as_dict(), lambda: f"{table(found.store, ['status', 'cases', 'share'], rows)}\n{found.summary()}", name, found
+    )
 
 
 class _Lines:
