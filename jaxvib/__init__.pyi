@@ -95,6 +95,12 @@ from jaxvib.study.bearing.swing import BearingPendulum, Swing, SwingStatus, swin
 from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
+# Many cases
+
+# Many cases
+from jaxvib.sweeps.status import CaseStatus, SweepStatus
+from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
+
 # Results
 from jaxvib.report.page import html_report
 from jaxvib.results.csv import write_csv
@@ -249,6 +255,12 @@ __all__ = [
     "CaptureStatus",
     "threshold_curve",
     "ThresholdCurve",
+    # Many cases
+    "sweep",
+    "open_sweep",
+    "Sweep",
+    "SweepStatus",
+    "CaseStatus",
     # Results
     "Result",
     "load",

@@ -17,7 +17,7 @@ from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
 from optimize.wishes.quantity import Demand
 
-__all__ = ["TEMPLATE", "Design", "load_design"]
+__all__ = ["TEMPLATE", "Design", "load_design", "quantity_from_table"]
 
 _QUANTITIES = {
     name: getattr(quantities, name)
@@ -98,13 +98,13 @@ def load_design(path: str | Path) -> Design:
         if not isinstance(tables.get(name, []), list):
             raise InputError(name, f"is not a list of tables; write [[{name}]] for each quantity")
     scene = load_scene(Path(path).parent / tables["scene"])
-    values = [_quantity(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
+    values = [quantity_from_table(table, f"hold[{k}]", ("value",)) for k, table in enumerate(tables.get("hold", []))]
     held = [hold(q, more.get("value")) for q, more in values]
     ties = {name: tuple(v) if isinstance(v, list) else v for name, v in tables.get("ties", {}).items()}
     free, choices = dict(tables.get("free", {})), dict(tables.get("choices", {}))
     space = DesignSpace(scene, free, held, ties=ties, choices=choices)
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
-    objective, more = _quantity(tables["objective"], "objective", ("maximize",))
+    objective, more = quantity_from_table(tables["objective"], "objective", ("maximize",))
     if not isinstance(more.get("maximize", False), bool):
         raise InputError("objective.maximize", f"is {more['maximize']!r}; write true or false, without quotes")
     if more.get("maximize", False):
@@ -124,14 +124,18 @@ def load_design(path: str | Path) -> Design:
 
 
 def _demands(table: Any, section: str) -> list[Demand]:
-    quantity, more = _quantity(table, section, ("at_most", "at_least"))
+    quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
         raise InputError(section, "has no limit; give at_most or at_least, or both")
     made = {"at_most": quantity.__lt__, "at_least": quantity.__gt__}
     return [made[name](limit) for name, limit in more.items()]
 
 
-def _quantity(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity, dict[str, Any]]:
+def quantity_from_table(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity, dict[str, Any]]:
+    """A quantity from a table of a file, the part `section` of it, and the values of the fields `more` that are not its own.
+
+    **Raises** `InputError` for an unknown quantity, and for values that are not allowed.
+    """
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {table!r}; it must be a table with a quantity")
     name = table.get("quantity")

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from small_machine import checked_gradients, small_sweep
 
 import jaxvib as jv
 from jaxvib.motion.growth import Growth, GrowthStatus
@@ -106,14 +107,6 @@ def audited():
     return jv.Audit(status=AuditStatus.done, accuracy=0.01, question="jam mode 1 at 60 rad/s", **own, **cost)
 
 
-def checked_gradients():
-    shape = np.array([[1.0, 2.0], [1.0, 2.1]])
-    found = dict(gradient=shape, error=0.1 * shape, difference=shape[0], noise=1e-9 * shape[0], step=np.array([1e-4, 1e-3]))
-    names = dict(numbers=("machine.mass", "loads.drag"), at=np.ones(2), routes=("forward", "reverse"))
-    swept = dict(steps=np.array([1e-2, 1e-3, 1e-4]), sweep=np.ones((2, 3)), tolerance=1e-5, left_out=("machine.damping",))
-    return jv.GradientCheck(status=jv.GradientStatus.differ, value=3.0, **names, **found, **swept)
-
-
 def cached(make):
     made = []
 
@@ -176,6 +169,7 @@ RESULTS = {
     "Cost": lambda: jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", 1e-3, 0.1, 1.0)] * 2),
     "Audit": audited,
     "GradientCheck": checked_gradients,
+    "Sweep": cached(lambda: small_sweep(SCENE)),
     "Synthesis": synthesis,
     "Front": lambda: Front(np.array([[1.0, 2.0], [2.0, 1.0]]), ("force", "power"), ("N", "W"), (jv.scene_to_toml(SCENE),) * 2),
 }

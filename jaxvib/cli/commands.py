@@ -22,16 +22,19 @@ if TYPE_CHECKING:
 
 
 @app.command("new")
-@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement"]))
+@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement", "sweep"]))
 @shared
 def new(kind: str, output: Output) -> None:
-    """Print a commented scene file of that KIND of machine, a design file, or a measurement file for `identify`."""
+    """Print a commented scene file of that KIND of machine, a design file, a measurement file for `identify`, or a study
+    file for `sweep`."""
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
+    from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATE as DESIGN
 
-    files = {"design": DESIGN, "measurement": MEASUREMENT}
+    files = {"design": DESIGN, "measurement": MEASUREMENT, "sweep": STUDY}
     text = files[kind] if kind in files else TEMPLATES[kind.replace("-", "_")]
-    path = output.file(f"{kind}.toml" if kind in files else "machine.toml")
+    name = "study" if kind == "sweep" else kind
+    path = output.file(f"{name}.toml" if kind in files else "machine.toml")
     if path is None:
         output.done({"kind": kind, "toml": text}, lambda: text.rstrip(), "new")
         return

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, TypeAlias
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
+from jaxvib.motion.lanes import advance
 from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
@@ -273,22 +273,8 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     length = end / _PARTS
 
     def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:
-        solution = diffrax.diffeqsolve(
-            motion.term,
-            motion.method(lanes=True),
-            t0=begin,
-            t1=begin + length,
-            dt0=step,
-            y0=held,
-            args=motion.args,
-            saveat=diffrax.SaveAt(t1=True),
-            stepsize_controller=diffrax.ConstantStepSize(),
-            adjoint=diffrax.ForwardMode(),
-            max_steps=2**30,
-            throw=False,
-        )
-        held = jax.tree.map(lambda leaf: leaf[-1], solution.ys)
-        return held, (held, solution.stats["num_steps"])
+        held, taken = advance(motion, held, begin, length, step)
+        return held, (held, taken)
 
     def whole(steps: Array) -> tuple[Y, Array]:
         times = length * jnp.arange(_PARTS)

@@ -1,0 +1,112 @@
+"""jaxvib sweep, show."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import click
+
+from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.errors import InputError
+from jaxvib.sweeps.execute import Progress
+from jaxvib.sweeps.sweep import Sweep, open_sweep, run_study
+
+_QUIET = 10.0
+"""Seconds from one line of progress to the next where nobody looks on."""
+
+
+@app.command("sweep")
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option("--store", type=click.Path(path_type=Path), help="The folder to write to [STUDY with the ending .zarr].")
+@click.option("--resume/--no-resume", default=True, show_default=True, help="Go on with a store that is there already.")
+@click.option("--workers", type=click.IntRange(min=1), help="So many processes on this machine, by Dask.")
+@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://10.0.0.1:8786.")
+@click.option("--timeout", default="30 s", show_default=True, help="How long the scheduler and its workers have to answer.")
+@shared
+def sweep(
+    study: Path,
+    store: Path | None,
+    resume: bool,
+    workers: int | None,
+    scheduler: str | None,
+    timeout: str,
+    output: Output,
+) -> None:
+    """Compute all cases of STUDY, a study file, into a store on disk; interrupted, the same command goes on where it stopped.
+
+    --out adds the figure that fits the study (sweep.png).
+    """
+    from jaxvib.sweeps.study import load_study
+
+    path = store or study.with_suffix(".zarr")
+    if not resume and path.exists():
+        raise InputError("--no-resume", f"is given, and {str(path)!r} is there already; name another one with --store")
+    asked = load_study(study)
+    show = _Lines()
+    try:
+        found = run_study(asked, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
+    except KeyboardInterrupt:
+        show.end()
+        click.echo(f"stopped: what is finished is kept in {path}; the same command goes on from there", err=True)
+        raise
+    show.end()
+    _tell(found, output, "sweep")
+
+
+@app.command("show")
+@click.argument("store", type=click.Path(path_type=Path))
+@click.option("--measure", help="What is shown, by its name in STORE [regimes where they were measured, else the first].")
+@click.option("--over", nargs=2, metavar="X Y", help="The axes of the map.")
+@click.option("--theory/--no-theory", default=True, show_default=True, help="Draw folds and torus points of exact jams.")
+@shared
+def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
+    """Say what is in STORE, which `jaxvib sweep` wrote; --out adds its figures: map.png, shares.png, distribution.png,
+    tornado.png, as far as they fit the study."""
+    found = open_sweep(store)
+    if output.folder is not None or output.report is not None:
+        from jaxvib.sweeps.figures import figures
+
+        x, y = over or (None, None)
+        for name, figure in figures(store, measure, x=x, y=y, theory=theory):
+            output.picture(f"{name}.png", lambda drawn=figure: drawn)
+    _tell(found, output, "show")
+
+
+def _tell(found: Sweep, output: Output, name: str) -> None:
+    if name == "sweep":
+        output.picture("sweep.png", found.plot)
+    rows = [[status, str(cases), f"{100.0 * cases / found.cases:.3g} %"] for status, cases in found.counts]
+    output.done(
+        found.as_dict(), lambda: f"{table(found.store, ['status', 'cases', 'share'], rows)}\n{found.summary()}", name, found
+    )
+
+
+class _Lines:
+    """Progress on the terminal's last line, or where there is none as a line from time to time."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+        self.open = False
+
+    def __call__(self, now: Progress) -> None:
+        share = 100.0 * now.done / now.cases
+        text = f"{now.done} of {now.cases} cases ({share:.1f} %), {now.rate:.3g} a second, {_clock(now.left)} left"
+        if sys.stderr.isatty():
+            click.echo(f"\r\x1b[K{text}", nl=False, err=True)
+            self.open = True
+        elif time.monotonic() - self.last > _QUIET:
+            self.last = time.monotonic()
+            click.echo(text, err=True)
+
+    def end(self) -> None:
+        """Leaves the line."""
+        if self.open:
+            click.echo(err=True)
+
+
+def _clock(seconds: float) -> str:
+    whole = round(seconds)
+    hours, rest = divmod(whole, 3600)
+    return f"{hours} h {rest // 60} min" if hours else f"{rest // 60} min {rest % 60} s" if rest >= 60 else f"{rest} s"

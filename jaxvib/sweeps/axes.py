@@ -1,0 +1,246 @@
+"""What changes from case to case: numbers of the scene and of the start, over lists, ranges and samples."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import State
+from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
+from jaxvib.machine.files import closest
+from jaxvib.machine.scene import Scene
+from jaxvib.sweeps.samples import samples
+from jaxvib.units import Number, count, number
+from optimize.space.numbers import Place, changed, places_of, value_of
+
+__all__ = ["SAMPLE", "Axis", "AxisSpec", "Grid", "Spot", "axis_of", "corners", "put", "put_start", "require_apart", "tile_of"]
+
+SAMPLE = "sample"
+"""The name of the axis along which sampled numbers lie."""
+
+_START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s"}
+"""Numbers of a start, as in `State`, and their units."""
+
+_KEYS = ["from", "to", "count", "scale"]
+
+_MOST_CORNERS = 10
+"""Of more axes than this only the two opposite corners are looked at."""
+
+AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
+"""A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
+
+
+class Spot(NamedTuple):
+    """Where an axis's numbers stand: at a `place` in the scene, or, None, in the start, where they are the entry `entry` (all:
+    None) of the field `field`."""
+
+    place: Place | None
+    field: str
+    entry: int | None
+
+
+class Axis(NamedTuple):
+    """A number, or several of one name, that changes from case to case.
+
+    **Attributes**: `name`, `unit`; `values` (n,) SI that it takes one after another, None for one that is sampled between `low`
+    and `high`, by ratio where `log`; the `spot` where it stands.
+    """
+
+    name: str
+    unit: str
+    values: np.ndarray | None
+    low: float
+    high: float
+    log: bool
+    spot: Spot
+
+    def at(self, share: np.ndarray) -> np.ndarray:
+        """Values at shares in [0, 1) of the range."""
+        if self.log:
+            return self.low * (self.high / self.low) ** share
+        return self.low + (self.high - self.low) * share
+
+
+class Grid(NamedTuple):
+    """All cases of a study: every combination of the axes' values, and for each of them every sample.
+
+    **Attributes**: `axes`; `samples` how many, 0 without sampled axes; `seed`, `sampling` as in `samples`; `tile` how many
+    cases along each dimension are computed together.
+    """
+
+    axes: tuple[Axis, ...]
+    samples: int
+    seed: int
+    sampling: str
+    tile: tuple[int, ...]
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """The names of the dimensions."""
+        return (*(axis.name for axis in self.axes if axis.values is not None), *([SAMPLE] if self.samples else []))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """How many cases there are along each dimension."""
+        return (*(axis.values.size for axis in self.axes if axis.values is not None), *([self.samples] if self.samples else []))
+
+    @property
+    def cases(self) -> int:
+        """How many cases there are."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    @property
+    def tiles(self) -> tuple[int, ...]:
+        """How many tiles there are along each dimension."""
+        return tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
+
+    @property
+    def chunks(self) -> int:
+        """How many tiles there are."""
+        return int(np.prod(self.tiles, dtype=np.int64))
+
+    def region(self, chunk: int) -> tuple[slice, ...]:
+        """Where the cases of a chunk lie along the dimensions."""
+        first = [k * t for k, t in zip(np.unravel_index(chunk, self.tiles), self.tile, strict=True)]
+        return tuple(slice(int(a), min(int(a) + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
+
+    def values(self, chunk: int) -> np.ndarray:
+        """The numbers of the cases of a chunk, in C order, (cases, axes), SI."""
+        region = self.region(chunk)
+        index = np.indices([s.stop - s.start for s in region]).reshape(len(region), -1)
+        drawn = self.drawn(region[-1]) if self.samples else np.zeros((0, 0))
+        columns, grid, sampled = [], 0, 0
+        for axis in self.axes:
+            if axis.values is None:
+                columns.append(drawn[index[-1], sampled])
+                sampled += 1
+            else:
+                columns.append(axis.values[region[grid]][index[grid]])
+                grid += 1
+        return np.stack(columns, axis=1)
+
+    def drawn(self, which: slice) -> np.ndarray:
+        """The sampled numbers of some samples, (samples, sampled axes), SI."""
+        axes = [axis for axis in self.axes if axis.values is None]
+        shares = samples(which.start, which.stop, len(axes), self.seed, self.sampling)
+        return np.stack([axis.at(shares[:, k]) for k, axis in enumerate(axes)], axis=1)
+
+
+def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
+    """An axis by the name of its number and what it is given: a list of values, or a table.
+
+    **Raises** `InputError` for a name or values that the scene or a start cannot have.
+    """
+    spot, unit = _where(scene, name)
+
+    def value(given: Number, field: str) -> float:
+        if spot.place is None:
+            return float(number(given, unit, field))
+        return value_of(name, given)
+
+    if isinstance(spec, Mapping):
+        for key in spec:
+            if key not in _KEYS:
+                hint = f'; write the whole name in quotes, "{name}.{key}"' if not {"from", "to"} & set(spec) else ""
+                raise InputError(f"axes.{name}.{key}", f"is no field of an axis{hint}; {closest(key, _KEYS)}")
+        for key in ("from", "to"):
+            if key not in spec:
+                raise InputError(f"axes.{name}.{key}", "is missing; an axis is a list, or a table with from and to")
+        low, high = value(spec["from"], f"axes.{name}.from"), value(spec["to"], f"axes.{name}.to")
+        if not low < high:
+            raise InputError(f"axes.{name}", f"goes from {low:g} to {high:g}; the first must be less than the second")
+        scale = spec.get("scale", "even")
+        if scale not in ("even", "log"):
+            raise InputError(f"axes.{name}.scale", f"is {scale!r}; it must be 'even' or 'log'")
+        if scale == "log" and not low > 0.0:
+            raise InputError(f"axes.{name}.from", f"is {low:g}, and the scale 'log'; it must be greater than 0 there")
+        values = None
+        if "count" in spec:
+            size = count(spec["count"], f"axes.{name}.count", low=2)
+            values = np.geomspace(low, high, size) if scale == "log" else np.linspace(low, high, size)
+        axis = Axis(name, unit, values, low, high, scale == "log", spot)
+    else:
+        if isinstance(spec, str) or not isinstance(spec, (list, tuple, np.ndarray)) or len(spec) == 0:
+            raise InputError(f"axes.{name}", f"is {spec!r}; give a list of values, or a table with from, to and count")
+        values = np.asarray([value(v, f"axes.{name}[{k}]") for k, v in enumerate(spec)])
+        if np.unique(values).size < values.size:
+            raise InputError(f"axes.{name}", "has a value twice; name each one once")
+        axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
+    for end in (axis.low, axis.high):  # what one number may be, its constructor knows
+        checked(put(scene, (spot,), jnp.asarray([end])))
+    return axis
+
+
+def _where(scene: Scene, name: str) -> tuple[Spot, str]:
+    """Where the numbers of that name stand, in the scene or in the start, and their unit."""
+    if not str(name).startswith("start."):
+        place = places_of(scene, name, "axes")
+        return Spot(place, "", None), place.unit
+    match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
+    if match is None or match[1] not in _START:
+        raise InputError(f"axes.{name}", f"is no number of a start; {closest(str(name), [f'start.{f}' for f in _START])}")
+    size = scene.loads.count if match[1] in ("angle", "rate") else scene.machine.structure().mass.shape[0]
+    entry = None if match[2] is None else int(match[2])
+    if entry is not None and entry >= size:
+        raise InputError(f"axes.{name}", f"does not exist; start.{match[1]} has {size} entries, counted from 0")
+    return Spot(None, match[1], entry), _START[match[1]]
+
+
+def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
+    """**Raises** `InputError` where two axes change the same number."""
+    taken: dict[object, str] = {}
+    for axis in axes:
+        place, field, entry = axis.spot
+        if place is not None:
+            entries: set = place.entries
+        else:
+            size = scene.loads.count if field in ("angle", "rate") else scene.machine.structure().mass.shape[0]
+            entries = {(field, k) for k in (range(size) if entry is None else (entry,))}
+        for one in entries:
+            if one in taken:
+                raise InputError(f"axes.{axis.name}", f"changes a number that axes.{taken[one]} changes too; name it once")
+            taken[one] = axis.name
+
+
+def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
+    """The scene with a case's numbers (axes,)."""
+    for k, spot in enumerate(spots):
+        if spot.place is not None:
+            scene = changed(scene, spot.place, jnp.full(spot.place.size, values[k]))
+    return scene
+
+
+def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
+    """The state with a case's numbers (axes,)."""
+    for k, (place, field, entry) in enumerate(spots):
+        if place is None:
+            old = getattr(state, field)
+            leaf = old[0] if isinstance(old, tuple) else old
+            new = jnp.full_like(leaf, values[k]) if entry is None else leaf.at[entry].set(values[k])
+            state = eqx.tree_at(lambda s, f=field: getattr(s, f), state, (new, *old[1:]) if isinstance(old, tuple) else new)
+    return state
+
+
+def corners(axes: Sequence[Axis]) -> np.ndarray:
+    """The corners of the box that the axes span, (corners, axes), SI."""
+    ends = np.asarray([[axis.low, axis.high] for axis in axes])
+    if len(axes) > _MOST_CORNERS:
+        return ends.T
+    return np.stack([mesh.ravel() for mesh in np.meshgrid(*ends, indexing="ij")], axis=1)
+
+
+def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
+    """How many cases along each dimension make a chunk of `most` at most, the last dimension first, tiles nearly alike."""
+    tile, room = [], most
+    for n in reversed(shape):
+        parts = -(-n // max(min(n, room), 1))
+        tile.append(-(-n // parts))
+        room = room // tile[-1]
+    return tuple(reversed(tile))

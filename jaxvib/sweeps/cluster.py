@@ -1,0 +1,106 @@
+"""Chunks computed by workers of Dask: processes on this machine, or a cluster behind a scheduler's address."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Generator, Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.program import Chunk, compute
+from jaxvib.sweeps.status import CASE_STATUSES
+from jaxvib.sweeps.store import versions
+from jaxvib.units import Number, number
+
+__all__ = ["on_a_cluster"]
+
+_AHEAD = 2
+"""Chunks that are given out for each worker: one that it computes, one that waits."""
+
+_STUDIES: dict[str, Study] = {}
+"""On a worker, the study whose program is compiled already."""
+
+
+def on_a_cluster(
+    study: Study, todo: Iterable[int], *, workers: int | None, scheduler: str | None, timeout: Number
+) -> Generator[tuple[int, Chunk], None, None]:
+    """Lets workers compute the chunks; gives each with its number as it is finished. This process alone writes.
+
+    A worker that dies loses the chunks that it held, which others compute again. A chunk whose workers died several times is
+    given up: its cases are "lost".
+
+    **Raises** `InputError` where Dask is not installed, the scheduler does not answer, no worker comes, or one has other
+    versions.
+    """
+    try:
+        from distributed import Client, LocalCluster, as_completed
+        from distributed.scheduler import KilledWorker
+    except ImportError as error:
+        raise InputError("workers", "need Dask; install it with: pip install 'jaxvib[cluster]'") from error
+    if workers is not None and scheduler is not None:
+        raise InputError("scheduler", "is given together with workers, which are processes of this machine; give one of them")
+    seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
+    with contextlib.ExitStack() as stack:
+        if scheduler is None:
+            options = {"dashboard_address": None, "silence_logs": 50}
+            address = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options))
+        else:
+            address = scheduler
+        try:
+            client = stack.enter_context(Client(address, timeout=seconds, set_as_default=False))
+            client.wait_for_workers(1, timeout=seconds)
+        except (OSError, ValueError, TimeoutError) as error:
+            problem = f"is {scheduler!r}, and no scheduler with workers answers there within {seconds:g} s"
+            advice = "start one with: dask scheduler; dask worker ADDRESS"
+            raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
+        # Arrays that a worker unpacks before it is told to compute in double precision would lose half their digits.
+        plain = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
+        precise, chunks = bool(jax.config.jax_enable_x64), iter(todo)  # pyright: ignore[reportAttributeAccessIssue]
+        running, numbers = as_completed(loop=client.loop), {}
+
+        def give_out() -> None:
+            for chunk in chunks:
+                future = client.submit(_remote, plain, chunk, study.key, versions(), precise, pure=False)
+                numbers[future.key] = chunk
+                running.add(future)
+                return
+
+        for _ in range(_AHEAD * max(1, len(client.scheduler_info(n_workers=-1)["workers"]))):
+            give_out()
+        for future in running:
+            chunk = numbers.pop(future.key)
+            try:
+                found = future.result()
+            except KilledWorker:
+                found = _lost(study, chunk)
+            future.release()
+            if isinstance(found, str):
+                raise InputError("worker", f"{found}; install the same versions everywhere")
+            give_out()
+            yield chunk, found
+
+
+def _remote(study: Study, chunk: int, key: str, wanted: dict[str, str], precise: bool) -> Chunk | str:
+    """On a worker: a chunk's cases, or why it may not compute them: its versions are others than the store's."""
+    for name, version in versions().items():
+        if wanted[name] != version:
+            return f"has {name} {version}, and the store was begun with {wanted[name]}: digits would differ"
+    jax.config.update("jax_enable_x64", precise)
+    if key not in _STUDIES:  # the first copy that came here is kept, whose functions the program was compiled for
+        _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
+    return compute(_STUDIES[key], chunk)
+
+
+def _lost(study: Study, chunk: int) -> Chunk:
+    cases = int(np.prod([s.stop - s.start for s in study.grid.region(chunk)], dtype=np.int64))
+    status = np.full(cases, CASE_STATUSES.index("lost"), np.uint8)
+    return Chunk(dict(zip(study.names, study.nothing(cases), strict=True)), status, {})
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -1,0 +1,337 @@
+"""Figures of a store: which fits, what goes into it, read so that memory stays bounded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.files import closest, scene_from_toml
+from jaxvib.steady.orbits.diagram import exact_branches
+from jaxvib.sweeps.axes import SAMPLE, axis_of, put
+from jaxvib.sweeps.store import Store
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
+
+_MOST = 1500
+"""Cases along an axis of a figure; of more every so many-th is drawn: a figure has no more dots."""
+
+_ROWS = 9
+"""Values of the other axis at which folds and torus points are computed."""
+
+_BINS = 60
+
+_SPEED = "drive.speed"
+
+
+class _Table(NamedTuple):
+    """Labels of cases: `codes` (cases ...), -1 for none, of `names`."""
+
+    codes: np.ndarray
+    names: list[str]
+
+
+def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of Wilson that holds a share, of which `hits` of `cases` were seen, with 95 %; 0 to 1 without cases.
+
+    It is the set of shares p with |hits/cases - p| <= z sqrt(p (1 - p) / cases).
+
+    >>> [round(float(end), 4) for end in wilson(np.asarray(0), np.asarray(10))]
+    [0.0, 0.2775]
+
+    Source: E. B. Wilson, Probable inference, the law of succession, and statistical inference, 1927.
+    """
+    n = np.maximum(cases, 1)
+    share, more = hits / n, z**2 / n
+    middle = (share + more / 2.0) / (1.0 + more)
+    half = z * np.sqrt(share * (1.0 - share) / n + more / (4.0 * n)) / (1.0 + more)
+    none = np.asarray(cases) == 0
+    return np.where(none, 0.0, np.maximum(middle - half, 0.0)), np.where(none, 1.0, np.minimum(middle + half, 1.0))
+
+
+def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Figure:
+    """The figure that fits a study: over two axes a map, of regimes where they were measured; over samples alone the
+    distribution of what was measured first; over one axis that as points."""
+    opened = Store(Path(store))
+    dims = _dims(opened)
+    if len([d for d in dims if d != SAMPLE]) >= 2:
+        return plot_map(store, ax=ax)
+    if dims == [SAMPLE]:
+        return plot_distribution(store, ax=ax)
+    if SAMPLE in dims and _has_labels(opened):
+        return plot_shares(store, ax=ax)
+    from jaxvib.draw.sweeps import points_over
+
+    name = _measure(opened, None)
+    x, step = _thinned(opened, dims[0])
+    values = _values(opened, name, tuple(slice(None, None, step if d == dims[0] else 1) for d in dims))
+    log = _is_log(opened, dims[0])
+    label = _axis_label(opened, dims[0])
+    return points_over(x, values.reshape(x.size, -1), across=label, up=_measure_label(opened, name), log=log, ax=ax)
+
+
+def figures(
+    store: str | Path, measure: str | None = None, *, x: str | None = None, y: str | None = None, theory: bool = True
+) -> Iterator[tuple[str, Figure]]:
+    """Every figure that fits a study, by name: "map", "shares", "distribution", "tornado"; for the arguments see `plot_map`.
+
+    **Raises** `InputError` for names that the store does not have.
+    """
+    opened = Store(Path(store))
+    grid = [d for d in _dims(opened) if d != SAMPLE]
+    if len(grid) >= 2:
+        yield "map", plot_map(store, measure, x=x, y=y, theory=theory)
+    elif x or y:
+        raise InputError("--over", f"asks for a map, which needs two axes; this study has: {', '.join(grid) or 'none'}")
+    if grid and _has_labels(opened):
+        yield "shares", plot_shares(store, x)
+    if measure is not None or any(not _is_label(opened, name) for name in opened.names):
+        yield "distribution", plot_distribution(store, measure)
+        yield "tornado", plot_tornado(store, measure)
+
+
+def plot_map(
+    store: str | Path,
+    measure: str | None = None,
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    theory: bool = True,
+    ax: Axes | None = None,
+) -> Figure:
+    """A map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams drawn in, or of values.
+
+    **Arguments**: `measure` its name in the store, the regime where there is one unless said otherwise; `x`, `y` names of axes;
+    along further axes the middle one is shown. `theory`: whether lines are drawn where exact jams fold or lose their stability;
+    they are computed by `branches(scene, exact=True)` where one of the axes is the rotor's speed.
+
+    **Returns** a matplotlib figure. **Raises** `InputError` for names that the store does not have.
+    """
+    from jaxvib.draw.sweeps import label_map, value_map
+
+    opened = Store(Path(store))
+    dims = _dims(opened)
+    grid = [d for d in dims if d != SAMPLE]
+    for name, given in (("x", x), ("y", y)):
+        if given is not None and given not in grid:
+            raise InputError(name, f"is {given!r}; {closest(given, grid)}")
+    rest = [d for d in grid if d not in (x, y)]
+    across = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
+    rest = [d for d in rest if d != across]
+    up = y or (rest[0] if rest else None)
+    if across is None or up is None or across == up:
+        raise InputError("x", f"and y must be two axes; this study has: {', '.join(grid) or 'none'}")
+    (xs, step_x), (ys, step_y) = _thinned(opened, across), _thinned(opened, up)
+    steps = {across: slice(None, None, step_x), up: slice(None, None, step_y)}
+    region = tuple(steps.get(d, slice(n // 2, n // 2 + 1)) for d, n in zip(dims, opened.shape, strict=True))
+    order = sorted(range(len(dims)), key=lambda k: (dims[k] in (up, across), dims[k] == across))
+    shape = (ys.size, xs.size)
+    labels: dict[str, Any] = {"across": _axis_label(opened, across), "up": _axis_label(opened, up)}
+    labels["log"] = (_is_log(opened, across), _is_log(opened, up))
+    if measure in (None, "regime", "mode") and _has_labels(opened):
+        table = _labels(opened, region)
+        lines = _theory(opened, across, up, xs, ys) if theory else {}
+        codes = np.transpose(table.codes, order).reshape(shape)
+        return label_map(xs, ys, codes, table.names, lines=lines, **labels, ax=ax)
+    name = _measure(opened, measure)
+    values = np.transpose(_values(opened, name, region), order).reshape(shape)
+    return value_map(xs, ys, values, label=_measure_label(opened, name), **labels, ax=ax)
+
+
+def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Figure:
+    """The share of the cases that each label has (regimes with their jam modes) over one axis, all other axes taken together,
+    with the intervals of Wilson that hold it with 95 %. **Returns** a matplotlib figure."""
+    from jaxvib.draw.sweeps import shares_chart
+
+    opened = Store(Path(store))
+    dims = _dims(opened)
+    grid = [d for d in dims if d != SAMPLE]
+    over = over or (grid[0] if grid else None)
+    if over not in grid:
+        raise InputError("over", f"is {over!r}; {closest(str(over), grid)}")
+    if not _has_labels(opened):
+        raise InputError("store", "has neither regime nor mode, whose shares could be shown; measure run.regime")
+    place = dims.index(over)
+    hits: dict[str, np.ndarray] = {}
+    for rows in opened.pieces():
+        table = _labels(opened, rows)
+        codes = np.moveaxis(table.codes, place, 0).reshape(table.codes.shape[place], -1)
+        at = rows if place == 0 else slice(None)
+        for k, name in [(-1, "no answer"), *enumerate(table.names)]:
+            hits.setdefault(name, np.zeros(opened.shape[place]))[at] += np.sum(codes == k, axis=1)
+    total = np.sum(list(hits.values()), axis=0)
+    shares = {name: (n / total, *wilson(n, total)) for name, n in hits.items() if np.any(n > 0)}
+    log = _is_log(opened, over)
+    return shares_chart(opened.read(over), shares, across=_axis_label(opened, over), log=log, ax=ax)
+
+
+def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Figure:
+    """How a measure is distributed over all cases that have one. **Returns** a matplotlib figure."""
+    from jaxvib.draw.sweeps import distribution_chart
+
+    opened = Store(Path(store))
+    name = _measure(opened, measure)
+    low, high = np.inf, -np.inf
+    for rows in opened.pieces():
+        values = _values(opened, name, rows)
+        values = values[np.isfinite(values)]
+        low, high = min(low, np.min(values, initial=np.inf)), max(high, np.max(values, initial=-np.inf))
+    if not low <= high:
+        raise InputError("measure", f"is {name!r}, which no case has; name another one: {', '.join(opened.names)}")
+    edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
+    counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
+    return distribution_chart(edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
+
+
+def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Figure:
+    """What a measure is on average where each of the numbers that change is in the lowest and the highest fifth of its range.
+
+    **Returns** a matplotlib figure, the number with the largest influence on top.
+    """
+    from jaxvib.draw.sweeps import tornado_chart
+
+    opened = Store(Path(store))
+    name, dims = _measure(opened, measure), _dims(opened)
+    axes = list(opened.record["axes"])
+    ends = {axis: _fifths(opened, axis) for axis in axes}
+    sums, found = {axis: np.zeros((2, 2)) for axis in axes}, np.zeros(2)
+    for rows in opened.pieces():
+        values = _values(opened, name, rows)
+        there = np.isfinite(values)
+        found += [np.sum(values[there]), np.sum(there)]
+        for axis in axes:
+            dim = axis if axis in dims else SAMPLE
+            place = dims.index(dim)
+            along = opened.read(axis, rows if place == 0 else slice(None))
+            along = along.reshape([-1 if k == place else 1 for k in range(len(dims))])
+            for k, inside in enumerate((along <= ends[axis][0], along >= ends[axis][1])):
+                chosen = there & inside
+                sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
+    if not found[1]:
+        raise InputError("measure", f"is {name!r}, which no case has; name another one: {', '.join(opened.names)}")
+    means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
+    means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
+    label = f"mean {_measure_label(opened, name)}"
+    return tornado_chart(axes, means[:, 0], means[:, 1], found[0] / found[1], across=label, ax=ax)
+
+
+def _fifths(store: Store, axis: str) -> tuple[float, float]:
+    """Up to where the lowest fifth of an axis's values goes, and from where on the highest."""
+    values = store.read(axis, slice(0, 1 << 20))
+    return float(np.nanquantile(values, 0.2)), float(np.nanquantile(values, 0.8))
+
+
+def _dims(store: Store) -> list[str]:
+    return list(store.group["status"].metadata.dimension_names)
+
+
+def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
+    """An axis's values, no more than can be drawn, and every how many-th they are."""
+    values = store.read(axis)
+    step = -(-values.size // _MOST)
+    return values[::step], step
+
+
+def _is_log(store: Store, axis: str) -> bool:
+    spec = store.record["axes"].get(axis)
+    return isinstance(spec, Mapping) and spec.get("scale") == "log"
+
+
+def _axis_label(store: Store, axis: str) -> str:
+    unit = store.group[axis].attrs.get("units", "")
+    words = {_SPEED: "rotor speed", "start.rate": "initial speed of the loads", "start.angle": "initial angle of the loads"}
+    return f"{words.get(axis, axis)}, {unit}" if unit else words.get(axis, axis)
+
+
+def _measure(store: Store, name: str | None) -> str:
+    """The name of a measure with numbers, the first one unless said otherwise."""
+    plain = [n for n in store.names if not _is_label(store, n)]
+    found = name or next(iter(plain or store.names))
+    if found not in store.names:
+        raise InputError("measure", f"is {found!r}; {closest(found, list(store.names))}")
+    return found
+
+
+def _measure_label(store: Store, name: str) -> str:
+    attributes = store.group[name].attrs
+    words, unit = str(attributes.get("long_name", name)), attributes.get("units", "")
+    return f"{words}, {unit}" if unit else words
+
+
+def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
+    """Numbers of a measure in a region, the largest along a further dimension; NaN where there is none."""
+    values = store.read(name, region).astype(float)
+    return np.max(values, axis=-1) if values.ndim > len(store.shape) else values
+
+
+def _has_labels(store: Store) -> bool:
+    return "regime" in store.names or "mode" in store.names
+
+
+def _is_label(store: Store, name: str) -> bool:
+    return name == "mode" or "flag_meanings" in store.group[name].attrs
+
+
+def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
+    """Labels of the cases of a region: the regime's word, and where loads are jammed their mode."""
+    words: list[str] = str(store.group["regime"].attrs["flag_meanings"]).split() if "regime" in store.names else ["not jammed"]
+    first = len(words)
+    done = store.read("status", region) == 1
+    modes = store.read("mode", region) if "mode" in store.names else np.zeros(done.shape, int)
+    codes = store.read("regime", region).astype(int) if "regime" in store.names else np.zeros(done.shape, int)
+    codes = np.where(modes > 0, first + modes - 1, codes)
+    names = [*words, *(f"jammed, mode {k}" for k in range(1, 2 * store.coordinates + 2))]
+    return _Table(np.where(done, codes, -1), names)
+
+
+def _theory(
+    store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
+) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """Where exact jams of the stored scene fold or lose their stability, as lines in the plane, by kind.
+
+    Only over the rotor's speed. Where the other axis is a number of the start, which steady motions do not depend on, lines are
+    straight; where it is one of the scene, they go through the points found at some of its values.
+    """
+    if _SPEED not in (across, up):
+        return {}
+    scene = scene_from_toml(store.record["scene"])
+    if not isinstance(scene.drive, ConstantSpeed):
+        return {}
+    other, values, speeds = (up, ys, xs) if across == _SPEED else (across, xs, ys)
+    fixed = other.startswith("start.")
+    rows = values[[0, -1]] if fixed else np.quantile(values, np.linspace(0.0, 1.0, _ROWS))
+    spot = axis_of(scene, other, [float(rows[0])]).spot
+    scene = put(scene, (axis_of(scene, _SPEED, [float(speeds[-1])]).spot,), jnp.asarray([float(np.max(speeds))]))
+    found: list[dict[str, list[float]]] = []
+    for value in rows[:1] if fixed else rows:
+        try:
+            special = exact_branches(put(scene, (spot,), jnp.asarray([float(value)]))).special
+        except InputError:  # a scene that has no exact jams of this kind has no lines
+            return {}
+        kinds: dict[str, list[float]] = {}
+        for point in special:
+            kinds.setdefault(point.kind.replace("_", " "), []).append(point.rotor_speed)
+        found.append(kinds)
+    found = found * 2 if fixed else found
+    lines: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for kind in sorted({kind for kinds in found for kind in kinds}):
+        counts = {len(kinds.get(kind, [])) for kinds in found}
+        if len(counts) == 1:  # the same points in every row: lines through them
+            parts = [(np.asarray([kinds[kind][k] for kinds in found]), rows) for k in range(counts.pop())]
+        else:
+            parts = [
+                (np.asarray([n]), np.asarray([row]))
+                for kinds, row in zip(found, rows, strict=True)
+                for n in kinds.get(kind, [])
+            ]
+        lines[kind] = parts if across == _SPEED else [(b, a) for a, b in parts]
+    return lines

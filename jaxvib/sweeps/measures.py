@@ -1,0 +1,131 @@
+"""What is measured in each case: quantities of the optimizer, and what a run from a start comes to."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import closest
+from jaxvib.motion.analysis.regime import REGIMES
+from jaxvib.motion.lanes import WatchedRun
+from optimize.quantities import Quantity
+
+__all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "identity", "measure_of"]
+
+_NEAR = 0.01
+"""Loads whose mean speed differs from their last one by less, in the rotor's speed, have settled."""
+
+
+@dataclass(frozen=True)
+class RunMeasure:
+    """A number that is read off a run from the start to the end, see `WatchedRun`.
+
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `WatchedRun` that gives a scalar, or an array over `axis`, the
+    name of a further dimension ("coordinate", "load"); `meanings`, the words for the values 0, 1, ... of one that is a label.
+    """
+
+    name: str
+    unit: str
+    function: Callable[[WatchedRun], Array]
+    axis: str = ""
+    meanings: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """What is measured, in words."""
+        return self.name.replace("_", " ").removeprefix("run.")
+
+
+Measure: TypeAlias = Quantity | RunMeasure
+"""What a study measures."""
+
+
+def _regime(run: WatchedRun) -> Array:
+    (which,) = jax.tree.leaves(run.regime.name)
+    return which
+
+
+def _settling(run: WatchedRun) -> Array:
+    """The end of the last part in which the speed of some load is not yet near its last one."""
+    last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
+    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _NEAR * jnp.abs(rotor), axis=1)
+    late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
+    return jnp.where(run.regime.change < _NEAR, late, run.window.time[-1])
+
+
+def _mode(run: WatchedRun) -> Array:
+    return run.regime.mode
+
+
+def _load_speed(run: WatchedRun) -> Array:
+    return run.measured.omega
+
+
+def _amplitude(run: WatchedRun) -> Array:
+    return run.measured.amplitude
+
+
+def _force(run: WatchedRun) -> Array:
+    return run.measured.foundation_force
+
+
+def _ripple(run: WatchedRun) -> Array:
+    return run.regime.ripple
+
+
+def _rotor_speed(run: WatchedRun) -> Array:
+    return run.regime.rotor_speed
+
+
+def _drift(run: WatchedRun) -> Array:
+    return run.measured.drift
+
+
+RUN_MEASURES = {
+    measure.name: measure
+    for measure in (
+        RunMeasure("run.regime", "", _regime, meanings=REGIMES),
+        RunMeasure("run.mode", "", _mode),
+        RunMeasure("run.load_speed", "rad/s", _load_speed),
+        RunMeasure("run.amplitude", "m or rad", _amplitude, axis="coordinate"),
+        RunMeasure("run.foundation_force", "N", _force),
+        RunMeasure("run.ripple", "rad/s", _ripple),
+        RunMeasure("run.rotor_speed", "rad/s", _rotor_speed),
+        RunMeasure("run.drift", "", _drift),
+        RunMeasure("run.settling_time", "s", _settling),
+    )
+}
+"""What can be read off a run, by name: its regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor,
+amplitudes and foundation force zero to peak, ripple, drift as in `AbstractMeasured`, and the time, to a 64th of the run, after
+which the loads' speeds stay within 1 % of the rotor's of their last ones."""
+
+
+def measure_of(given: Measure | str, field: str) -> Measure:
+    """What is measured, by name where it is a text. **Raises** `InputError` for what is no measure."""
+    if isinstance(given, (Quantity, RunMeasure)):
+        return given
+    if isinstance(given, str) and given in RUN_MEASURES:
+        return RUN_MEASURES[given]
+    advice = closest(str(given), list(RUN_MEASURES))
+    raise InputError(field, f"is {given!r}; give a quantity of optimize, such as jam_frequency(mode=3), or a name; {advice}")
+
+
+def identity(measure: Measure) -> dict[str, str]:
+    """What tells a measure from another one in a store's record; of a function of the user's own also what it says."""
+    found = {"words": measure.words, "unit": measure.unit}
+    function = measure.function
+    if function is not None and not str(function.__module__).startswith(("jaxvib.", "optimize.")):
+        found["function"] = f"{function.__module__}.{function.__qualname__}"
+        try:
+            found["source"] = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:16]
+        except (OSError, TypeError):
+            found["source"] = ""
+    return found

@@ -1,0 +1,142 @@
+"""The one program that computes a chunk of cases, and what is done where a case brings it down."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.lanes import PARTS, Plan, watched_run
+from jaxvib.motion.start import Start, initial_state
+from jaxvib.runtime.programs import cached
+from jaxvib.sweeps.axes import Spot, put, put_start
+from jaxvib.sweeps.definition import LANES, Study
+from jaxvib.sweeps.measures import Measure, RunMeasure
+from jaxvib.sweeps.status import CASE_STATUSES
+from optimize.wishes.answers import Answers
+
+__all__ = ["Chunk", "compute", "planned", "shapes"]
+
+_SAMPLES = 1024
+"""States in the window over which a run is measured."""
+
+_PER_TURN = 8
+"""Fewest of them in a turn of the rotor: loads that jam turn slower."""
+
+_SLOW_PERIODS = 20
+"""Periods of the lowest natural frequency that the window is long, as that of `simulate`."""
+
+_CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
+
+
+class Chunk(NamedTuple):
+    """The cases of a chunk: by the measure's name what was found, (cases, ...); `status` (cases,) numbers of `CaseStatus`;
+    `errors` the sentence of each case that failed, by its place."""
+
+    found: dict[str, np.ndarray]
+    status: np.ndarray
+    errors: dict[int, str]
+
+
+def _each(
+    scene: Scene,
+    values: Array,
+    spots: tuple[Spot, ...],
+    measures: tuple[Measure, ...],
+    plan: Plan | None,
+    start: Start,
+    mode: int | None,
+) -> tuple[tuple[Array, ...], Array]:
+    """What is measured in each of the cases (cases, axes), and whether its motion stayed finite."""
+
+    def one(value: Array) -> tuple[tuple[Array, ...], Array]:
+        this = put(scene, spots, value)
+        answers, run = Answers(this), None
+        if plan is not None:
+            state = put_start(initial_state(this, start, mode=mode, throw=False), spots, value)
+            run = watched_run(this, state, plan)
+        found = [m.function(run) if isinstance(m, RunMeasure) else m.read(answers) for m in measures]  # pyright: ignore
+        return tuple(map(jnp.asarray, found)), jnp.asarray(True) if run is None else run.finite
+
+    return jax.lax.map(one, values, batch_size=LANES)
+
+
+_cases = cached(_each)
+
+
+@cached
+def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array, Array, Array]:
+    def one(value: Array) -> tuple[Array, Array, Array]:
+        this = put(scene, spots, value)
+        return (*fastest_and_slowest(this), this.drive.speed)
+
+    return jax.vmap(one)(values)
+
+
+def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> Plan:
+    """The same steps and the same window for all cases: by the fastest and the slowest of the `corners` (n, axes) of the study.
+
+    Frequencies grow with each stiffness and fall with each mass, so that no case between the corners is faster or slower.
+    """
+    fastest, slowest, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
+    most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
+    window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
+    step = 1.0 / float(np.max(fastest)) if steps is None else until / steps
+    each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
+    # a number that is whole but for rounding stays what it is
+    return Plan(until, window, _SAMPLES, *(int(np.ceil(x - 1e-9)) or 1 for x in (each, between)))
+
+
+def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:
+    """Shape and type of each measure of one case, without computing any. Raises what tracing the program raises."""
+    values = jnp.zeros((1, len(study.spots)))
+    found, _ = jax.eval_shape(lambda v: _each(study.scene, v, *study.program), values)
+    return [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in found]
+
+
+def compute(study: Study, chunk: int) -> Chunk:
+    """A chunk's cases. A case that raises an error is found by halving, and recorded with its sentence; no other case is lost.
+
+    The program always has the same shape: a chunk with fewer cases is filled up with copies of its first one.
+    """
+    values = study.grid.values(chunk)
+    errors: dict[int, str] = {}
+    parts = _computed(study, values, np.arange(len(values)), errors)
+    leaves, finite = parts
+    whole = np.all([np.all(np.isfinite(leaf.reshape(len(values), -1)), axis=1) for leaf in leaves], axis=0)
+    status = np.where(finite, np.where(whole, _CODE["done"], _CODE["absent"]), _CODE["not_finite"]).astype(np.uint8)
+    status[list(errors)] = _CODE["failed"]
+    return Chunk(dict(zip(study.names, leaves, strict=True)), status, errors)
+
+
+def _computed(
+    study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """What is found in the cases `which` of a chunk, NaN (labels: -1) in the others and in those that raise an error."""
+    filled = np.repeat(values[which[:1]], study.size, axis=0)
+    filled[which] = values[which]
+    try:
+        found, finite = _cases(study.scene, jnp.asarray(filled), *study.program)
+        return [np.asarray(leaf)[: len(values)] for leaf in found], np.asarray(finite)[: len(values)]
+    except RuntimeError as error:  # what a running program raises; a program that cannot be made is no case's fault
+        if "RESOURCE_EXHAUSTED" in str(error):
+            raise
+        if len(which) == 1:
+            errors[int(which[0])] = _sentence(error)
+            return study.nothing(len(values)), np.ones(len(values), bool)
+        halves = [_computed(study, values, half, errors) for half in np.array_split(which, 2)]
+    late = np.isin(np.arange(len(values)), np.array_split(which, 2)[1])
+    chosen = [np.where(late.reshape(-1, *[1] * (a.ndim - 1)), b, a) for a, b in zip(*(h[0] for h in halves), strict=True)]
+    return chosen, np.where(late, halves[1][1], halves[0][1])
+
+
+def _sentence(error: Exception) -> str:
+    """The line of an error that says what happened."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    said = [line for line in lines if line.split(":")[0].endswith(("Error", "Exception")) and ": " in line]
+    return (said or lines or [type(error).__name__])[-1]

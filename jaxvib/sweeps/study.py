@@ -1,0 +1,244 @@
+"""A study: a scene, what changes in it, what is measured, and how; from Python or from a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias, cast
+
+from jaxvib.errors import InputError
+from jaxvib.machine.checked import checked
+from jaxvib.machine.files import closest, load_scene, read_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.start import Start, initial_state
+from jaxvib.results.fields import Plain
+from jaxvib.sweeps.axes import AxisSpec, Grid, axis_of, corners, require_apart, tile_of
+from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
+from jaxvib.sweeps.program import planned, shapes
+from jaxvib.sweeps.samples import SAMPLINGS
+from jaxvib.units import Number, count, number
+from optimize.files import quantity_from_table
+from optimize.quantities import Quantity
+from optimize.wishes.quantity import TIERS, Tier
+
+__all__ = ["TEMPLATE", "Measures", "load_study", "study"]
+
+Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
+"""What is measured, or by the names that it shall have."""
+
+_CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
+"""Cases of a chunk: about a second's work, less than that is taken up by keeping books."""
+
+_RESERVED = ("status", "error")
+
+
+def study(
+    scene: Scene,
+    axes: Mapping[str, AxisSpec],
+    measure: Measures,
+    *,
+    tier: Tier | None = None,
+    until: Number | None = None,
+    start: Start = "rest",
+    mode: int | None = None,
+    steps: int | None = None,
+    samples: int = 0,
+    sampling: str = "low_discrepancy",
+    seed: int = 0,
+    chunk: int | None = None,
+) -> Study:
+    """A study, checked; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
+    scene = checked(scene)
+    if not isinstance(axes, Mapping) or not axes:
+        raise InputError("axes", "is empty; name at least one number that changes, such as drive.speed")
+    found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())
+    require_apart(scene, found)
+    drawn = [axis.name for axis in found if axis.values is None]
+    count(samples, "samples", low=0)
+    if sampling not in SAMPLINGS:
+        raise InputError("sampling", f"is {sampling!r}; it must be one of {', '.join(SAMPLINGS)}")
+    count(seed, "seed", low=0)
+    if drawn and not samples:
+        raise InputError(f"axes.{drawn[0]}", "is a range without count, so that it is sampled; give samples, or a count")
+    if samples and not drawn:
+        raise InputError("samples", f"is {samples}, and no axis is sampled; leave the count of an axis out, or samples")
+    names, measures = _named(measure)
+    taken = [*_RESERVED, *(axis.name for axis in found), "sample"]
+    for name in names:
+        if name in taken or "/" in name or not name:
+            raise InputError(f"measure.{name}", "is a name that something else has or that is none; give it another one")
+    runs = [m for m in measures if isinstance(m, RunMeasure)]
+    chosen = tier or ("time" if runs else "leading")
+    if chosen not in TIERS:
+        raise InputError("tier", f"is {chosen!r}; it must be one of {', '.join(TIERS)}")
+    measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
+    spots = tuple(axis.spot for axis in found)
+    plan = None
+    if runs:
+        if until is None:
+            raise InputError("until", f"is missing; {runs[0].name} is read off a run, say how long that is")
+        end = float(number(until, "s", "until", low=0.0, open_low=True))
+        initial_state(scene, start, mode=mode, throw=False)
+        plan = planned(scene, corners(found), spots, end, None if steps is None else count(steps, "steps"))
+    elif until is not None or any(spot.place is None for spot in spots):
+        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.place is None)
+        raise InputError(what, "is about runs, and nothing is read off a run; measure for example run.regime")
+    grid = Grid(found, samples, seed, sampling, ())
+    most = count(_CHUNK["time" if runs else chosen] if chunk is None else chunk, "chunk")
+    grid = grid._replace(tile=tile_of(grid.shape, most))
+    specs = {name: _plain(spec) for name, spec in axes.items()}
+    made = Study(scene, grid, names, measures, plan, start, mode, chosen, specs)
+    forms = shapes(made)
+    for name, m, form in zip(names, measures, forms, strict=True):
+        wanted = 1 if isinstance(m, RunMeasure) and m.axis else 0
+        if len(form.shape) != wanted:
+            raise InputError(f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * wanted))
+    return dataclasses.replace(made, forms=tuple(forms))
+
+
+def _plain(spec: AxisSpec) -> Plain:
+    if isinstance(spec, Mapping):
+        return {key: v if isinstance(v, (str, int)) else float(cast(float, v)) for key, v in spec.items()}
+    return [v if isinstance(v, str) else float(cast(float, v)) for v in spec]
+
+
+def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
+    """Names of what is measured, each its own: with the mode behind it where quantities of several modes have one name."""
+    if isinstance(measure, Mapping):
+        found = {str(name): measure_of(m, f"measure.{name}") for name, m in measure.items()}
+        if found:
+            return tuple(found), tuple(found.values())
+        measure = ()
+    if isinstance(measure, (str, Quantity, RunMeasure)) or not isinstance(measure, Sequence) or not measure:
+        raise InputError("measure", f"is {measure!r}; give a list of what is measured, such as ['run.regime']")
+    measures = [measure_of(m, f"measure[{k}]") for k, m in enumerate(measure)]
+    names = [m.name.removeprefix("run.").replace(" ", "_").replace("/", "_per_") for m in measures]
+    several = {name for name in names if names.count(name) > 1}
+    names = [
+        f"{name}_{m.mode}" if name in several and isinstance(m, Quantity) and m.mode is not None else name
+        for name, m in zip(names, measures, strict=True)
+    ]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError("measure", f"has several {name}; give their names, {{'{name}_a': ..., '{name}_b': ...}}")
+    return tuple(names), tuple(measures)
+
+
+_FIELDS = ["scene", "tier", "samples", "sampling", "seed", "chunk", "axes", "run", "measure"]
+
+
+def load_study(path: str | Path) -> Study:
+    """Reads a study file: TOML with the path of a `scene` from there, `[axes]`, `[[measure]]` and, for runs, `[run]`.
+
+    **Returns** `Study`. **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field
+    named.
+
+    >>> import pathlib, tempfile
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> from jaxvib.sweeps.study import TEMPLATE, load_study
+    >>> folder = pathlib.Path(tempfile.mkdtemp())
+    >>> for name, text in (("machine.toml", TEMPLATES["two_mass"]), ("study.toml", TEMPLATE)):
+    ...     _ = (folder / name).write_text(text)
+    >>> load_study(folder / "study.toml").grid.shape
+    (40, 40)
+    """
+    tables = read_toml(path)
+    for name in tables:
+        if name not in _FIELDS:
+            raise InputError(name, f"is no part of a study file; {closest(name, _FIELDS)}")
+    for name in ("scene", "axes", "measure"):
+        if name not in tables:
+            raise InputError(name, "is missing; a study file needs scene, [axes] and [[measure]]")
+    if not isinstance(tables["scene"], str):
+        raise InputError("scene", f"is {tables['scene']!r}; give the path of a scene file, in quotes")
+    for name in ("axes", "run"):
+        if not isinstance(tables.get(name, {}), Mapping):
+            raise InputError(name, f"is not a table; write [{name}]")
+    if not isinstance(tables["measure"], list) or not tables["measure"]:
+        raise InputError("measure", "is not a list of tables; write [[measure]] for each of what is measured")
+    run = dict(tables.get("run", {}))
+    for name in run:
+        if name not in ("until", "start", "mode", "steps"):
+            raise InputError(f"run.{name}", f"is no field here; {closest(name, ['until', 'start', 'mode', 'steps'])}")
+    given = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
+    measure: Measures = [m for _, m in given]
+    if any(name for name, _ in given):
+        names = [name or (m if isinstance(m, str) else m.name).removeprefix("run.") for name, m in given]
+        doubled = [name for name in names if names.count(name) > 1]
+        if doubled:
+            raise InputError("measure", f"has several {doubled[0]}; give each a name of its own")
+        measure = dict(zip(names, measure, strict=True))
+    options = {name: tables[name] for name in ("tier", "samples", "sampling", "seed", "chunk") if name in tables}
+    scene = load_scene(Path(path).parent / tables["scene"])
+    return study(scene, tables["axes"], measure, **options, **run)
+
+
+def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]:
+    if not isinstance(table, Mapping):
+        raise InputError(field, f"is {table!r}; it must be a table with a quantity")
+    name, rest = str(table.get("name", "")), {key: value for key, value in table.items() if key != "name"}
+    if "function" in rest:
+        return name, _function(rest, name, field)
+    if str(rest.get("quantity", "")).startswith("run."):
+        read = measure_of(rest["quantity"], f"{field}.quantity")
+        if len(rest) > 1:
+            raise InputError(f"{field}.{next(k for k in rest if k != 'quantity')}", "is no field of what is read off a run")
+        return name, read
+    quantity, _ = quantity_from_table(rest, field, ())
+    return name, quantity
+
+
+def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
+    """A quantity of the user's own: a function of a scene, in a module that Python finds."""
+    module, _, function = str(table["function"]).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        problem = f"is {table['function']!r}, which cannot be imported ({error}); write 'module:function'"
+        raise InputError(f"{field}.function", problem) from error
+    return Quantity(name or function, str(table.get("unit", "")), found)
+
+
+TEMPLATE = """# A study: which numbers change from case to case, and what is measured in each. Run it: jaxvib sweep study.toml
+scene = "machine.toml"            # path of the scene file, from here
+# tier = "exact"                  # of quantities of a jam: leading (of light loads), exact, time [leading]
+# chunk = 1024                    # cases that are computed, and written, together
+
+[axes]                            # every combination of these; SI or with units; names as in a design file
+"drive.speed" = { from = "600 rpm", to = "1800 rpm", count = 40 }
+"start.rate" = { from = "0 rpm", to = "1800 rpm", count = 40 }    # speed that the loads start with; start.angle, start.velocity
+# "loads.drag" = { from = 0.5, to = 5.0, count = 10, scale = "log" }
+# "machine.stiffness[0]" = ["40 N/mm", "50 N/mm", "60 N/mm"]
+
+# Numbers with a range and no count are sampled together, for each combination of the others:
+# samples = 256                   # (these three stand above [axes])
+# sampling = "low_discrepancy"    # or "random"
+# seed = 0
+# "machine.damping" = { from = 30.0, to = 50.0 }
+
+[run]                             # the full equations, from the start above; only for quantities that begin with run.
+until = "10 s"
+# start = "jam"                   # what axes leave open: rest, or near a jam mode [rest]
+# mode = 3
+# steps = 20000                   # equal ones, the same in all cases [one for each radian of what moves fastest]
+
+[[measure]]
+quantity = "run.regime"           # jammed, unbalanced (turning with the rotor), balanced, parted, swinging, unsettled
+[[measure]]
+quantity = "run.mode"             # the jam mode, 0 where the loads are not jammed
+[[measure]]
+quantity = "run.load_speed"       # and run.amplitude, run.foundation_force, run.settling_time, run.ripple, run.drift
+
+# [[measure]]                     # any quantity of a design file
+# quantity = "foundation_force"
+# mode = 3
+# name = "force"                  # what it is called in the store
+
+# [[measure]]                     # a function of a scene of your own, in a module that Python finds
+# function = "mine:stiffness_ratio"
+# unit = ""
+"""
+"""A commented study file."""

@@ -1,0 +1,222 @@
+"""Studies of many cases: run, resumed, read."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import scene_from_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.start import Start
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import member, sentence
+from jaxvib.sweeps.axes import AxisSpec
+from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.execute import Report, in_this_process, timed
+from jaxvib.sweeps.status import CASE_STATUSES, CaseStatus, SweepStatus
+from jaxvib.sweeps.store import Store
+from jaxvib.sweeps.study import Measures, study
+from jaxvib.units import Number
+from optimize.wishes.quantity import Tier
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
+
+
+class CaseCount(NamedTuple):
+    """How many `cases` ended with a `status`, a name of `CaseStatus`."""
+
+    status: str
+    cases: int
+
+
+class Sweep(Result):
+    """A study's store, and how far it is; the numbers themselves stay on disk.
+
+    **Attributes**: `status` a `SweepStatus`; `store` its path; `cases` how many there are; `counts` how many ended with each
+    status; `computed` cases in this call, in `seconds`, compiling included.
+    """
+
+    status: SweepStatus
+    store: str
+    cases: int = eqx.field(metadata=in_unit(""))
+    counts: tuple[CaseCount, ...] = eqx.field(metadata=in_unit("", "kind"))
+    computed: int = eqx.field(metadata=in_unit(""))
+    seconds: float = eqx.field(metadata=in_unit("s"))
+
+    @property
+    def data(self) -> xarray.Dataset:
+        """The labelled numbers, read from disk as far as they are asked for; `xarray.open_zarr(found.store)` gives them too.
+
+        **Raises** `InputError` where xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise InputError("data", "needs xarray; install it with: pip install 'jaxvib[sweep]'") from error
+        return xarray.open_zarr(self.store, chunks=None)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that the cases are made of."""
+        return scene_from_toml(Store(Path(self.store)).record["scene"])
+
+    def summary(self) -> str:
+        """How far the study is, how its cases ended, and how long it took, for a person to read."""
+        lines = [f"{self.message}: {self.cases} cases in {self.store}"]
+        for name, cases in self.counts:
+            lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")
+        if self.computed:
+            each = 1e3 * self.seconds / self.computed
+            lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
+        return "\n".join(lines)
+
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, that of `ax` where it is given."""
+        from jaxvib.sweeps.figures import plot_sweep
+
+        return plot_sweep(self.store, ax=ax)
+
+
+def sweep(
+    scene: Scene,
+    axes: Mapping[str, AxisSpec],
+    measure: Measures,
+    store: str | Path,
+    *,
+    tier: Tier | None = None,
+    until: Number | None = None,
+    start: Start = "rest",
+    mode: int | None = None,
+    steps: int | None = None,
+    samples: int = 0,
+    sampling: str = "low_discrepancy",
+    seed: int = 0,
+    chunk: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    timeout: Number = "30 s",
+    report: Report | None = None,
+) -> Sweep:
+    """Computes every case of a study and keeps it in a store on disk; where the store is there already, goes on with it.
+
+    Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk
+    is written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on
+    the cases beside it, on the order, on how many workers there are, or on restarts.
+
+    **Arguments**
+
+    - `scene`: what all cases have in common
+    - `axes`: what changes: a number of the scene by the name that designs have for it ("machine.stiffness[0]", "loads.drag",
+      "drive.speed"), or of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]"
+      m/s; without an entry of all alike), each with a list of values, or a table of `from`, `to`, `count` and `scale` ("even"
+      or "log"). Cases are all combinations. Numbers whose table has no `count` are sampled together, `samples` times for each
+      combination of the others
+    - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of what is read
+      off a run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
+      "run.foundation_force", "run.settling_time", ... ; or a mapping of names that they shall have
+    - `store`: a folder, by custom with the ending ".zarr"
+    - `tier`: how quantities of a jam are computed: "leading", "exact" or "time"; their own unless said otherwise
+    - `until`, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in it,
+      to `until`, s, by so many equal steps, the same in all cases; by default one for each radian of what moves fastest
+    - `samples`, `seed`, `sampling`: how many, and how they are drawn: "low_discrepancy" or "random"
+    - `chunk`: cases that are computed and written together; it is part of the store's record
+    - `workers`: so many processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
+      which has `timeout`, s, to answer. They need the extra `jaxvib[cluster]`
+    - `report`: is called with a `Progress` after each chunk
+
+    **Returns** `Sweep`. A case that fails raises nothing: its status and its sentence are in the store.
+
+    **Raises** `InputError` for values that are not allowed, a store of another study, and one that cannot be written.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> from optimize import jam_frequency
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
+    >>> store = pathlib.Path(tempfile.mkdtemp()) / "study.zarr"
+    >>> found = jv.sweep(scene, {"drive.speed": [20.0, 60.0], "loads.drag": {"from": 0.05, "to": 0.25, "count": 3}},
+    ...                  [jam_frequency(mode=1)], store)
+    >>> found.status_name, found.cases
+    ('done', 6)
+    >>> found.data.jam_frequency.sel({"drive.speed": 60.0}).round(1).values.tolist()
+    [25.9, 27.0, 27.4]
+    """
+    asked = study(
+        scene,
+        axes,
+        measure,
+        tier=tier,
+        until=until,
+        start=start,
+        mode=mode,
+        steps=steps,
+        samples=samples,
+        sampling=sampling,
+        seed=seed,
+        chunk=chunk,
+    )
+    return run_study(asked, store, workers=workers, scheduler=scheduler, timeout=timeout, report=report)
+
+
+def run_study(
+    asked: Study,
+    store: str | Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    timeout: Number = "30 s",
+    report: Report | None = None,
+) -> Sweep:
+    """Computes what is missing in the store of a study; for the arguments see `sweep`."""
+    begun = time.perf_counter()
+    path = Path(store)
+    if path.exists():
+        kept = Store(path, writable=True)
+        kept.require_same(asked)
+    else:
+        kept = Store.made(path, asked)
+    finished = kept.finished()
+    sizes = np.asarray([_cases(asked, chunk) for chunk in range(finished.size)])
+    add = timed(asked.grid.cases, int(np.sum(sizes[finished])), report)
+    todo = np.flatnonzero(~finished).tolist()
+    if todo:
+        if workers is None and scheduler is None:
+            source = in_this_process(asked, todo)
+        else:
+            from jaxvib.sweeps.cluster import on_a_cluster  # asks for Dask
+
+            source = on_a_cluster(asked, todo, workers=workers, scheduler=scheduler, timeout=timeout)
+        with contextlib.closing(source):
+            for chunk, cases in source:
+                kept.write(asked, chunk, cases)
+                add(int(sizes[chunk]))
+    return _found(kept, int(np.sum(sizes[~finished])), time.perf_counter() - begun)
+
+
+def _cases(asked: Study, chunk: int) -> int:
+    return int(np.prod([s.stop - s.start for s in asked.grid.region(chunk)], dtype=np.int64))
+
+
+def open_sweep(store: str | Path) -> Sweep:
+    """The store of a study that was run, or is being run. **Raises** `InputError` for what is no store, or a damaged one."""
+    return _found(Store(Path(store)), 0, 0.0)
+
+
+def _found(store: Store, computed: int, seconds: float) -> Sweep:
+    counts = store.counts()
+    rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
+    status = SweepStatus.partly if counts[0] else SweepStatus.done
+    return Sweep(status, str(store.path), int(np.prod(store.shape, dtype=np.int64)), rows, computed, seconds)

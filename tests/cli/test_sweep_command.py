@@ -1,0 +1,113 @@
+"""`jaxvib sweep`, `jaxvib show`, `jaxvib new sweep` as a user types them."""
+
+import json
+import sys
+
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.cli.app import run
+from jaxvib.cli.study import sweep as command
+
+STUDY = """
+scene = "machine.toml"
+chunk = 4
+[axes]
+"drive.speed" = { from = "200 rpm", to = "900 rpm", count = 5 }
+"loads.drag" = [0.5, 1.0]
+[[measure]]
+function = "own_quantity:heaviness"
+unit = "kg rad/s"
+name = "heaviness"
+"""
+
+OWN = "def heaviness(scene):\n    return scene.machine.mass[0] * scene.drive.speed\n"
+
+
+@pytest.fixture
+def typed(capsys, tmp_path, monkeypatch):
+    """Runs a command line in a folder that holds machine.toml and study.toml; gives exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "own_quantity", raising=False)
+    jv.save_scene(scene("one_mass", speed=60.0), tmp_path / "machine.toml")
+    (tmp_path / "own_quantity.py").write_text(OWN)
+    (tmp_path / "study.toml").write_text(STUDY)
+
+    def type_(*words):
+        code = run(list(words))
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return type_
+
+
+def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
+    code, out, err = typed("sweep", "study.toml", "--out", "pictures")
+    assert code == 0 and "every case was computed: 10 cases in study.zarr" in out and "100 %" in out and err == ""
+    assert (tmp_path / "pictures" / "sweep.png").stat().st_size > 5_000
+    data = jv.open_sweep("study.zarr").data
+    assert data.heaviness.shape == (5, 2) and abs(float(data.heaviness[0, 0]) - 50.0 * 20.943951) < 1e-3
+    code, out, _ = typed("sweep", "study.toml", "--json")
+    document = json.loads(out)
+    assert code == 0 and document["computed"] == 0 and document["counts"] == [{"status": "done", "cases": 10}]
+    code, out, _ = typed("show", "study.zarr", "--out", "figures", "--no-theory")
+    assert code == 0 and all((tmp_path / "figures" / f"{n}.png").exists() for n in ("map", "distribution", "tornado"))
+    code, out, _ = typed("show", "study.zarr", "--json")
+    assert json.loads(out)["cases"] == 10
+
+
+def test_a_commented_study_file_is_one(typed, tmp_path):
+    code, out, _ = typed("new", "sweep")
+    assert code == 0 and "[axes]" in out
+    assert typed("new", "sweep", "--out", "fresh")[0] == 0
+    assert (tmp_path / "fresh" / "study.toml").read_text() == out.rstrip() + "\n"
+
+
+def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
+    def stop(self, now):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(command._Lines, "__call__", stop)
+        code, _, err = typed("sweep", "study.toml")
+    assert code == 1 and "what is finished is kept in study.zarr; the same command goes on from there" in err
+    code, out, _ = typed("show", "study.zarr")
+    assert code == 0 and "not every case was computed yet" in out and "6 missing" in out
+    assert "6 of them in this call" in typed("sweep", "study.toml")[1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words", "says"),
+    [
+        ("[axes]", "[axis]", (), "axis is no part of a study file; did you mean 'axes'"),
+        ("own_quantity:heaviness", "own_quantity:weight", (), "which cannot be imported"),
+        ('function = "own_quantity:heaviness"', 'quantity = "run.regimes"', (), "did you mean 'run.regime'"),
+        ('function = "own_quantity:heaviness"', 'quantity = "amplitudes"', (), "did you mean 'amplitude'"),
+        ('"loads.drag" = [0.5, 1.0]', '"loads.drag" = [0.5, 0.5]', (), "has a value twice"),
+        ("chunk = 4", "chunk = 4\n[run]\nuntill = 3.0", (), "run.untill is no field here; did you mean 'until'"),
+        ("chunk = 4", "chunk = 4\nsamples = -3", (), "samples is -3"),
+        (
+            "",
+            "",
+            ("--scheduler", "tcp://127.0.0.1:9", "--timeout", "0.5 s"),
+            "no scheduler with workers answers there within 0.5 s",
+        ),
+        ("", "", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:9"), "given together with workers"),
+        ("", "", ("--store", "machine.toml"), "no store of a sweep"),
+    ],
+)
+def test_what_is_wrong_is_said(typed, tmp_path, old, new, words, says):
+    text = (tmp_path / "study.toml").read_text()
+    (tmp_path / "study.toml").write_text(text.replace(old, new) if old else text)
+    code, out, err = typed("sweep", "study.toml", *words)
+    assert code == 2 and says in err and out == ""
+
+
+def test_a_store_that_is_there_is_not_begun_anew(typed):
+    assert typed("sweep", "study.toml")[0] == 0
+    code, _, err = typed("sweep", "study.toml", "--no-resume")
+    assert code == 2 and "is there already; name another one with --store" in err
+    code, _, err = typed("show", "machine.toml")
+    assert code == 2 and "no store of a sweep" in err

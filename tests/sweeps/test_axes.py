@@ -1,0 +1,131 @@
+"""Axes, samples and the grid of cases."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.sweeps.axes import Grid, axis_of, put, put_start, tile_of
+from jaxvib.sweeps.samples import samples
+from jaxvib.sweeps.study import study
+from optimize import jam_frequency
+
+SCENE = scene("one_mass", "balls", speed=60.0)
+MEASURE = [jam_frequency(mode=1)]
+SPEED = {"drive.speed": [50.0, 60.0]}
+
+
+def asked(axes=SPEED, measure=MEASURE, **more):
+    return study(SCENE, axes, measure, **more)
+
+
+@pytest.mark.parametrize("sampling", ["random", "low_discrepancy"])
+def test_a_sample_is_the_same_from_wherever_it_is_asked_for(sampling):
+    whole = samples(0, 500, 5, 3, sampling)
+    assert whole.shape == (500, 5) and np.all((whole >= 0.0) & (whole < 1.0))
+    np.testing.assert_array_equal(whole[123:300], samples(123, 300, 5, 3, sampling))
+    assert not np.any(whole == samples(0, 500, 5, 4, sampling))
+
+
+def test_low_discrepancy_is_low_and_keeps_its_digits():
+    def worst_gap(sampling):
+        """Between the share of samples below x and x itself."""
+        drawn = np.sort(samples(0, 2000, 1, 0, sampling)[:, 0])
+        return np.max(np.abs(np.arange(1, 2001) / 2000 - drawn))
+
+    assert worst_gap("low_discrepancy") < 2e-3 < 0.3 * worst_gap("random")
+    # by whole numbers of any length, the golden ratio among them to 2^-64
+    far, golden = 10**12, int(((5**0.5 + 1) / 2) ** -1.0 * 2.0**64)
+    begin = int(np.random.Philox(key=0).random_raw(1)[0])
+    assert samples(far, far + 1, 1, 0, "low_discrepancy")[0, 0] == ((begin + far * golden) % 2**64 >> 11) * 2.0**-53
+
+
+def test_every_case_stands_in_one_chunk_and_has_the_numbers_of_its_place():
+    axes = {"drive.speed": [1.0, 2.0, 3.0, 4.0, 5.0], "loads.drag": {"from": 0.1, "to": 10.0, "count": 3, "scale": "log"}}
+    sampled = {"machine.mass": {"from": 40.0, "to": 60.0}}
+    found = tuple(axis_of(SCENE, name, spec) for name, spec in (axes | sampled).items())
+    grid = Grid(found, 7, 1, "random", ())
+    grid = grid._replace(tile=tile_of(grid.shape, 12))
+    seen = np.full((*grid.shape, 3), np.nan)
+    for chunk in range(grid.chunks):
+        region = grid.region(chunk)
+        assert np.all(np.isnan(seen[region]))
+        seen[region] = grid.values(chunk).reshape(*(s.stop - s.start for s in region), 3)
+    masses = 40.0 + 20.0 * samples(0, 7, 1, 1, "random")[:, 0]
+    expected = list(itertools.product([1.0, 2.0, 3.0, 4.0, 5.0], [0.1, 1.0, 10.0], masses))
+    np.testing.assert_allclose(seen.reshape(-1, 3), expected, rtol=1e-15)
+    assert grid.dims == ("drive.speed", "loads.drag", "sample") and np.prod(grid.tile) <= 12
+
+
+def test_tiles_are_nearly_alike_and_no_larger_than_asked():
+    assert tile_of((200, 200), 1024) == (5, 200)
+    assert tile_of((10**6,), 16384) == (16130,)
+    assert tile_of((7, 5, 3), 1) == (1, 1, 1)
+    assert tile_of((2, 2), 1000) == (2, 2)
+
+
+def test_numbers_go_where_their_names_say():
+    given = scene("two_mass", "balls")
+    names = ["machine.stiffness[1]", "loads.drag", "start.rate[2]", "start.angle", "start.velocity"]
+    spots = [axis_of(given, name, [1.0, 2.0]).spot for name in names]
+    values = np.array([7e4, 2.5, 30.0, 0.4, -0.1])
+    put_in, state = put(given, spots, values), put_start(jv.initial_state(given), spots, values)
+    assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
+    assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and state.angle[0].tolist() == [0.4] * 3
+    assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
+
+
+RUN = ["run.mode"]
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (dict(axes={}), "axes is empty; name at least one number"),
+        (dict(axes={"drive.sped": [1.0]}), "is no number of this scene; did you mean 'drive.speed'"),
+        (dict(axes={"start.rat": [1.0]}), "is no number of a start; did you mean 'start.rate'"),
+        (dict(axes={"start.rate[3]": [1.0]}), "start.rate has 3 entries"),
+        (
+            dict(axes={"machine.mass": [40.0], "machine.mass[0]": [50.0]}),
+            r"changes a number that axes.machine.mass changes too",
+        ),
+        (
+            dict(axes={"start.rate": [1.0], "start.rate[1]": [2.0]}, measure=RUN, until=1.0),
+            r"axes.start.rate\[1\] changes a number",
+        ),
+        (dict(axes={"drive.speed": [60.0, 60.0]}), "has a value twice"),
+        (dict(axes={"drive.speed": ["3 kg"]}), "which is not in rad/s"),
+        (dict(axes={"drive.speed": [-3.0]}), "must be greater than 0"),
+        (dict(axes={"drive.speed": 60.0}), "give a list of values, or a table"),
+        (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "steps": 3}}), "steps is no field of an axis"),
+        (dict(axes={"drive": {"speed": [1.0]}}), "is no number of this scene"),
+        (dict(axes={"drive.speed": {"from": 1.0}}), "to is missing"),
+        (dict(axes={"drive.speed": {"from": 2.0, "to": 1.0, "count": 3}}), "goes from 2 to 1"),
+        (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "count": -3}}), "count is -3; it must be a whole number"),
+        (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0, "scale": "ln"}}), "scale is 'ln'; it must be 'even' or 'log'"),
+        (dict(axes={"loads.drag": {"from": 0.0, "to": 2.0, "scale": "log"}}), "must be greater than 0 there"),
+        (dict(axes={"drive.speed": {"from": 1.0, "to": 2.0}}), "give samples, or a count"),
+        (dict(samples=9), "samples is 9, and no axis is sampled"),
+        (dict(samples=-9), "samples is -9; it must be a whole number, at least 0"),
+        (dict(sampling="sobol"), "sampling is 'sobol'; it must be one of low_discrepancy, random"),
+        (dict(seed=-1), "seed is -1"),
+        (dict(chunk=0), "chunk is 0"),
+        (dict(tier="best"), "tier is 'best'; it must be one of leading, exact, time"),
+        (dict(measure=[]), r"measure is \[\]; give a list"),
+        (dict(measure=["run.foundationforce"]), "did you mean 'run.foundation_force'"),
+        (dict(measure={"status": jam_frequency(mode=1)}), "is a name that something else has"),
+        (dict(measure=[jam_frequency(mode=1)] * 2), "has several jam_frequency"),
+        (dict(measure=RUN), "until is missing; run.mode is read off a run"),
+        (dict(until=1.0), "until is about runs, and nothing is read off a run"),
+        (dict(axes={"start.rate": [1.0]}), "axes.start.rate is about runs"),
+        (dict(measure=RUN, until=-1.0), "until is -1 s"),
+        (dict(measure=RUN, until=1.0, steps=0), "steps is 0"),
+        (dict(measure=RUN, until=1.0, start="jam"), "mode is missing"),
+        (dict(measure=[jam_frequency(mode=9)]), "mode is 9; this machine's jam modes are numbered 1 to 3"),
+    ],
+)
+def test_what_is_not_allowed_is_said(more, says):
+    with pytest.raises(jv.InputError, match=says):
+        asked(**more)

@@ -1,0 +1,135 @@
+"""Figures of stores: intervals, shares, sensitivities, and which figure fits."""
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.draw.sweeps import label_map
+from jaxvib.sweeps.figures import plot_distribution, plot_map, plot_shares, plot_tornado, wilson
+from jaxvib.sweeps.study import study
+from jaxvib.sweeps.sweep import run_study
+from optimize import Quantity
+
+SCENE = scene("one_mass", "balls", speed=60.0)
+
+
+def weighted(scene):
+    return 3.0 * scene.loads.drag + 0.01 * scene.drive.speed
+
+
+def number(scene):
+    return (scene.drive.speed // 40.0).astype(int)
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    axes = {
+        "drive.speed": {"from": 20.0, "to": 100.0, "count": 11},
+        "loads.drag": {"from": 0.1, "to": 10.0, "count": 6, "scale": "log"},
+    }
+    given = {"weighted": Quantity("weighted", "N", weighted), "mode": Quantity("mode", "", number)}
+    return run_study(study(SCENE, axes, given, chunk=16), tmp_path_factory.mktemp("grid") / "grid.zarr")
+
+
+@pytest.fixture(scope="module")
+def sampled(tmp_path_factory):
+    axes = {"loads.drag": {"from": 1.0, "to": 2.0}, "drive.speed": {"from": 40.0, "to": 80.0}}
+    asked = study(SCENE, axes, [Quantity("weighted", "N", weighted)], samples=3000, chunk=1024)
+    return run_study(asked, tmp_path_factory.mktemp("sampled") / "sampled.zarr")
+
+
+@pytest.mark.parametrize(("hits", "cases"), [(0, 7), (3, 10), (10, 10), (250, 1000)])
+def test_the_ends_of_an_interval_are_shares_just_not_excluded(hits, cases):
+    for end in wilson(np.asarray(hits), np.asarray(cases)):
+        np.testing.assert_allclose((hits / cases - end) ** 2, 1.959964**2 * end * (1.0 - end) / cases, atol=1e-15)
+
+
+def test_intervals_hold_the_share_as_often_as_they_say():
+    hits = np.random.default_rng(0).binomial(40, 0.1, 20000)
+    low, high = wilson(hits, np.full(hits.shape, 40))
+    assert 0.93 < np.mean((low <= 0.1) & (high >= 0.1)) < 0.98
+    assert wilson(np.asarray(0), np.asarray(0)) == (0.0, 1.0)
+
+
+def test_a_map_has_the_values_at_their_place(grid):
+    figure = plot_map(grid.store, "weighted", x="drive.speed", y="loads.drag")
+    mesh = figure.axes[0].collections[0]
+    np.testing.assert_array_equal(np.asarray(mesh.get_array()), grid.data["weighted"].values.T)
+    assert figure.axes[0].get_yscale() == "log" and figure.axes[0].get_xlabel() == "rotor speed, rad/s"
+    turned = plot_map(grid.store, "weighted", x="loads.drag")
+    np.testing.assert_array_equal(np.asarray(turned.axes[0].collections[0].get_array()), grid.data["weighted"].values)
+
+
+def test_labels_have_a_colour_each_and_none_has_its_own():
+    codes = np.array([[0, 2], [2, -1]])
+    figure = label_map(
+        np.arange(2.0),
+        np.arange(2.0),
+        codes,
+        ["a", "b", "c"],
+        across="x",
+        up="y",
+        lines={"fold": [(np.ones(2), np.arange(2.0))]},
+    )
+    axis = figure.axes[0]
+    mesh = axis.collections[0]
+    colours = [to_hex(c) for c in mesh.to_rgba(np.asarray(mesh.get_array())).reshape(-1, 4)]
+    assert colours[1] == colours[2] and len(set(colours)) == 3
+    assert [t.get_text() for t in axis.get_legend().get_texts()] == ["a", "c", "no answer", "fold of exact jams"]
+
+
+def test_shares_are_those_of_the_cases(grid):
+    axis = plot_shares(grid.store, "drive.speed").axes[0]
+    lines = {line.get_label(): np.asarray(line.get_ydata()) for line in axis.lines}
+    expected = np.linspace(20.0, 100.0, 11) // 40.0
+    np.testing.assert_array_equal(lines["not jammed"], expected == 0.0)
+    np.testing.assert_array_equal(lines["jammed, mode 2"], expected == 2.0)
+
+
+def test_a_tornado_shows_what_each_number_does(sampled):
+    axis = plot_tornado(sampled.store).axes[0]
+    ends = {text.get_text(): [] for text in axis.get_yticklabels()}
+    assert list(ends) == ["drive.speed", "loads.drag"]
+    for bar in axis.patches:
+        ends[list(ends)[round(bar.get_y() + bar.get_height() / 2.0)]].append(bar.get_x() + bar.get_width())
+    # the means of a sum that is linear: at the middles of the lowest and the highest fifth, all else at its own;
+    # 600 samples in a fifth are off by about a 600th of the range of the sum
+    np.testing.assert_allclose(ends["loads.drag"], [3.0 * 1.1 + 0.6, 3.0 * 1.9 + 0.6], atol=1e-2)
+    np.testing.assert_allclose(ends["drive.speed"], [4.5 + 0.44, 4.5 + 0.76], atol=1e-2)
+
+
+def test_a_distribution_counts_every_case(sampled):
+    axis = plot_distribution(sampled.store).axes[0]
+    assert sum(bar.get_height() for bar in axis.patches) == 3000
+
+
+def test_the_figure_that_fits(sampled, tmp_path):
+    assert sampled.plot().axes[0].get_ylabel() == "cases"
+    line = jv.sweep(SCENE, {"drive.speed": [40.0, 50.0]}, [Quantity("weighted", "N", weighted)], tmp_path / "s.zarr")
+    assert isinstance(line.plot(), Figure) and line.plot().axes[0].get_ylabel() == "weighted, N"
+
+
+@pytest.mark.parametrize(
+    ("draw", "says"),
+    [
+        (lambda grid, sampled: plot_map(grid.store, "wieghted"), "measure is 'wieghted'; did you mean 'weighted'"),
+        (lambda grid, sampled: plot_map(grid.store, x="drive.sped"), "x is 'drive.sped'; did you mean 'drive.speed'"),
+        (lambda grid, sampled: plot_map(grid.store, x="loads.drag", y="loads.drag"), "must be two axes"),
+        (lambda grid, sampled: plot_map(sampled.store), "must be two axes; this study has: none"),
+        (lambda grid, sampled: plot_shares(grid.store, "machine.mass"), "over is 'machine.mass'"),
+        (lambda grid, sampled: plot_shares(sampled.store), "over is None"),
+    ],
+)
+def test_what_no_figure_can_show(grid, sampled, draw, says):
+    with pytest.raises(jv.InputError, match=says):
+        draw(grid, sampled)
+
+
+@pytest.mark.slow
+def test_lines_of_the_theory_lie_where_the_diagram_has_its_points(grid):
+    axis = plot_map(grid.store).axes[0]
+    special = jv.branches(SCENE, exact=True).special
+    assert any("fold" in text.get_text() for text in axis.get_legend().get_texts()) == any(p.kind == "fold" for p in special)
