@@ -31,7 +31,9 @@ def figures(notebook):
 
 
 @pytest.mark.filterwarnings("default")
-@pytest.mark.parametrize("path", [FIRST, *(pytest.param(path, marks=pytest.mark.slow) for path in OTHERS)], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [FIRST, *(pytest.param(path, marks=pytest.mark.slow) for path in OTHERS)], ids=lambda p: p.stem
+)
 def test_notebook_runs_and_shows_what_it_showed(path):
     kept = nbformat.read(path, as_version=4)
     fresh = nbformat.read(path, as_version=4)
