@@ -63,6 +63,11 @@ class Carrier(eqx.Module):
         """
         return self.coordinate_units or ("m",) * len(self.coordinates)
 
+    @property
+    def bed_directions(self) -> tuple[str, ...]:
+        """A name for each direction of the force on the bed: "up", or "across" and "up"."""
+        return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
+
     def port_at(self, distance: Array | float) -> Array:
         """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""
         return self.port if self.tilt is None else self.port + distance * self.tilt

@@ -27,6 +27,8 @@ from jaxvib.runtime.programs import cached
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
+
 __all__ = ["Run", "RunStatus"]
 
 
@@ -122,23 +124,24 @@ class Run(AbstractMeasured, Result):
             return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
         return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
 
-    def plot(self) -> Figure:
-        """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """Time histories: platforms, load speeds against the rotor's, foundation force. To the left the whole run as bands
+        between its peaks (the window if nothing else was kept), to the right its last three periods, where phases are seen.
 
-        **Returns** a matplotlib figure.
+        **Arguments**: `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto, as many as there are panels, by rows.
+
+        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for another unit or
+        number of axes.
         """
-        from jaxvib.draw.charts import time_histories  # slow to import: only who draws pays
+        from jaxvib.draw.motion.histories import time_histories  # slow to import: only who draws pays
 
-        kept = self.window if self.trajectory is None else self.trajectory
-        return time_histories(
-            np.asarray(kept.time),
-            np.asarray(kept.state.displacement),
-            np.asarray(kept.state.azimuth_rate),
-            np.asarray(kept.foundation_force),
-            np.asarray(kept.rotor_speed),
-            names=self.scene.machine.structure().coordinates,
-            units=self.scene.machine.structure().units,
+        structure = self.scene.machine.structure()
+        whole, end = (
+            [np.asarray(x) for x in (t.time, t.state.displacement, t.state.azimuth_rate, t.rotor_speed, t.foundation_force)]
+            for t in (self.window if self.trajectory is None else self.trajectory, self.window)
         )
+        named = dict(names=structure.coordinates, units=structure.units, directions=structure.bed_directions)
+        return time_histories(whole, end, **named, unit=unit, ax=ax)
 
 
 _FIRST_STATUSES = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")
