@@ -73,6 +73,8 @@ _HOMES = {
     "run-ups": "motion.run_ups",
     "settle": "motion.settle",
     "stability-map": "motion.stability",
+    "animate": "animate",
+    "sketch": "animate",
     "audit": "study.audit",
     "capture": "study.capture",
     "cost": "study.cost",

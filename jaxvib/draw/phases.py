@@ -63,5 +63,5 @@ def drag_diagram(
     axis.set_ylim(0.0, 1.05 * scale * rotor_speed)
     axis.set_xlabel(label)
     axis.set_ylabel("speed of loads, " + unit)
-    legend_above(axis)
+    legend_above(axis, 3)
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +17,7 @@ __all__ = [
     "multiplier_chart",
     "phase_circles",
     "points_chart",
+    "shapes_chart",
     "signals_chart",
     "speeds_chart",
 ]
@@ -64,6 +66,40 @@ def modes_chart(
     return figure
 
 
+def shapes_chart(
+    frequency: np.ndarray,
+    shape: np.ndarray,
+    *,
+    names: Sequence[str],
+    unit: SpeedUnit = "rad/s",
+    ax: Axes | None = None,
+) -> Figure:
+    """Mode shapes (k, nd) as bars, a group for each mode with its frequency (k,) rad/s, drawn in `unit`; `names` (nd,).
+
+    >>> import numpy as np
+    >>> shapes_chart(np.array([10.0]), np.ones((1, 2)), names=("y1", "y2")).axes[0].get_xticklabels()[0].get_text()
+    '10 rad/s'
+    """
+    figure, (axis,) = panels(1, size=(max(5.0, 1.4 * len(frequency)), 3.4), ax=ax)
+    many, width = len(names), 0.8 / len(names)
+    for k, name in enumerate(names):
+        places = np.arange(len(frequency)) + (k - 0.5 * (many - 1)) * width
+        look: Any = {
+            "color": COLORS[k % len(COLORS)],
+            "hatch": ("", "///", "...", "xxx")[k % 4],
+            "edgecolor": "white",
+            "lw": 0.0,
+        }
+        axis.bar(places, shape[:, k], width=0.94 * width, label=name, **look)
+    axis.axhline(0.0, color="black", lw=0.9)
+    axis.set_xticks(range(len(frequency)), [f"{speed_scale(unit) * w:.4g} {unit}" for w in frequency])
+    axis.set_ylim(-1.1, 1.1)
+    axis.set_ylabel("mode shape, relative")
+    axis.grid(False, axis="x")
+    legend_above(axis, 6)
+    return figure
+
+
 def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Figure:
     """Angles of loads (count,) rad as points on a circle, and their mean as an arrow: 1 where all are together, 0 where they
     cancel; one circle for each (title, angles), or one pair of `ax` each.
@@ -105,7 +141,7 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
             arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": "black", "shrinkA": 0.0, "shrinkB": 0.0}
             axis.annotate("", (np.real(mean), np.imag(mean)), (0.0, 0.0), arrowprops=arrow)
         axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
-        axis.set_title(f"{title}\nresultant {abs(mean):.3g}", fontsize="medium")
+        axis.set_title(f"{title}\nresultant {round(float(abs(mean)), 3):g}", fontsize="medium")
     return figure
 
 
@@ -122,7 +158,7 @@ def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
             axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[j % len(MARKERS)], **look)
         e = np.mean(np.exp(1j * angles[group]))
         names = ", ".join(str(j + 1) for j in sorted(group)) if len(group) < 5 else f"{len(group)} loads"
-        place = 0.74 * e / abs(e)
+        place = 1.2 * e / abs(e)
         box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8}
         axis.text(
             float(np.real(place)), float(np.imag(place)), names, ha="center", va="center", fontsize="small", zorder=4, bbox=box

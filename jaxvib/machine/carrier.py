@@ -94,6 +94,11 @@ class Machine(eqx.Module):
     def carrier(self) -> Carrier:
         """The machine as a linear structure, see `Carrier`."""
 
+    def supports(self) -> list[tuple[float, float, float]] | None:
+        """Where along a rotor's axis supports stand, for a drawing: distance from the mass centre m, stiffness N/m, damping
+        N s/m; None where the matrices say all there is to draw."""
+        return None
+
     def structure(self) -> Carrier:
         """The carrier's names, directions and shapes, without computing its numbers."""
         leaves, rest = jax.tree.flatten(self)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxvib.draw.style import COLORS, STROKES, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
 
-__all__ = ["amplitude_histories", "band", "period_of", "time_histories"]
+__all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
 
 _BINS = 300
 """So many pieces of a run at most are drawn as a band between the least and the greatest value in each."""
@@ -53,6 +53,11 @@ def period_of(time: np.ndarray, values: np.ndarray) -> float:
     return float((time[up[-1]] - time[up[0]]) / (up.size - 1)) if up.size > 1 else float(time[-1] - time[0])
 
 
+def last_periods(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Which samples (nt,) lie in the last periods of signals (nt, k)."""
+    return time >= time[-1] - _SHOWN * period_of(time, values)
+
+
 def time_histories(
     whole: Sequence[np.ndarray],
     end: Sequence[np.ndarray],
@@ -80,11 +85,10 @@ def time_histories(
     kinds = [(kind, label) for kind, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if kind in units]
     figure, axes = panels(len(kinds) + 2, 2, size=(5.4, 2.3), widths=(1.7, 1.0), share_x="col", ax=ax)
     period = period_of(end[0], end[1])
-    last = end[0][-1] - _SHOWN * period
     # A piece holds a whole period, or the band would follow the vibration.
     periods = (whole[0][-1] - whole[0][0]) / period
     bins = min(_BINS, int(periods / 1.25)) if periods > _FEW else whole[0].size
-    part = [values[end[0] >= last] for values in end]
+    part = [values[last_periods(end[0], end[1])] for values in end]
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # the widest lowest, so that none hides another
     for row, (kind, label) in enumerate(kinds):
         own = [k for k in range(len(names)) if units[k] == kind]
