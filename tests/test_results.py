@@ -1,6 +1,5 @@
 """Every result: status, sentence, text, figure, plain and labelled data, files and back."""
 
-import inspect
 import json
 import math
 import pathlib
@@ -131,6 +130,8 @@ RESULTS = {
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),
     "Jam": lambda: RESULTS["JamModes"]().select(1),
     "Branches": lambda: jv.branches(SCENE, points=50),
+    "ModeShapes": lambda: jv.mode_shapes(SCENE),
+    "Spectrum": lambda: RESULTS["Run"]().spectrum(),
     "ExactBranches": lambda: jv.branches(SCENE, exact=True, points=20),
     "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
     "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
@@ -183,7 +184,7 @@ RESULTS = {
 # fmt: off
 SEVERAL_PANELS = [
     "TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-    "BalancedStates", "Swing", "Identified", "RunUps", "Capture", "Cost", "Audit",
+    "BalancedStates", "Swing", "Identified", "RunUps", "Cost", "Audit",
 ]
 # fmt: on
 
@@ -210,16 +211,39 @@ def alike(one, other):
 def test_speaks(result):
     assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
     assert result.summary().strip() and "Array(" not in result.summary()
-    assert isinstance(result.plot(), Figure)
+    figure = result.plot()
+    legends = [axes.get_legend() for axes in figure.axes]
+    assert isinstance(figure, Figure) and not any(each is not None and each.get_frame_on() for each in legends)
 
 
 def test_a_figure_of_one_panel_goes_onto_given_axes(result):
     if type(result).__name__ in SEVERAL_PANELS:
-        assert "ax" not in inspect.signature(result.plot).parameters
+        many = len([axes for axes in result.plot().axes if axes.axison or axes.has_data()])
+        given = np.atleast_1d(Figure().subplots(1, many))
+        assert result.plot(ax=given) is given[0].figure and all(axes.has_data() for axes in given)
+        assert len(given[0].figure.axes) == many
+        if many > 1:
+            with pytest.raises(jv.InputError, match=f"ax has 1 axes; this figure has {many} panels, give as many"):
+                result.plot(ax=given[:1])
+        with pytest.raises(jv.InputError, match=r"ax is .*; give matplotlib's Axes"):
+            result.plot(ax=[1.0] * many)
         return
     axes = Figure().subplots(1, 2)
     assert result.plot(ax=axes[1]) is axes[1].figure
     assert axes[1].has_data() and not axes[0].has_data() and len(axes[0].figure.axes) == 2
+
+
+def test_speeds_are_drawn_in_the_unit_that_is_asked_for(result):
+    if "unit" not in type(result).plot.__kwdefaults__:
+        return
+
+    def told(unit):
+        words = [f"{axes.get_xlabel()} {axes.get_ylabel()} {axes.get_xticklabels()}" for axes in result.plot(unit=unit).axes]
+        return " ".join(words)
+
+    assert all(unit in told(unit) for unit in ("rad/s", "Hz")) and "rad/s" not in told("rpm")
+    with pytest.raises(jv.InputError, match="unit is 'turns'; it must be one of 'rad/s', 'rpm', 'Hz'"):
+        result.plot(unit="turns")
 
 
 def test_the_figure_of_jam_modes_names_the_coordinates():

@@ -114,8 +114,8 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     for k, axis in enumerate(axes):
         axis.set_aspect("equal")
-        axis.set_xlim(-1.5, 1.5)
-        axis.set_ylim(-1.5, 1.5)
+        axis.set_xlim(-1.8, 1.8)
+        axis.set_ylim(-1.7, 1.7)
         axis.set_axis_off()
         if k >= len(sets):
             continue
@@ -127,8 +127,8 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
             axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
             if degrees % 90 == 0:
                 axis.text(
-                    1.36 * float(e[0]),
-                    1.36 * float(e[1]),
+                    1.55 * float(e[0]),
+                    1.5 * float(e[1]),
                     f"{degrees}°",
                     ha="center",
                     va="center",

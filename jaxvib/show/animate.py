@@ -171,8 +171,11 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     artists = [put(stage, part) for part in parts(0)]
     clock = stage.text(0.0, 1.0, "", transform=stage.transAxes, va="bottom", family="monospace", fontsize="medium")
     slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
-    note = f"slowed down {slower:.3g} x; displacements drawn {chosen:.3g} x the loads' circle"
+    note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x larger"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
+    # Texts that are longer than the picture is wide shall not make it smaller.
+    for text in stage.texts:
+        text.set_in_layout(False)
     cursors = _strips((lower, below), scene, strips)
 
     def update(k: int) -> None:

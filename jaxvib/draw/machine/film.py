@@ -23,6 +23,9 @@ __all__ = ["Film"]
 _COLORS = 64
 """Colours of a film."""
 
+_NEAR = 20
+"""Levels, of 255, by which two of them differ at least."""
+
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
@@ -110,9 +113,14 @@ class Film(FuncAnimation):
         for k, each in enumerate(some):
             strip.paste(each, (0, k * each.height))
         # The colours that most points have, such as white, are kept as they are.
-        often = sorted(strip.getcolors(strip.width * strip.height) or [], reverse=True)[:_COLORS]  # pyright: ignore
+        colours, often = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
+        chosen: list[np.ndarray] = []
+        for colour in colours[np.argsort(-often, kind="stable")].astype(int):
+            # Those next to a colour that is there would only take another's place.
+            if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _NEAR for other in chosen):
+                chosen.append(colour)
         palette = Image.new("P", (1, 1))
-        palette.putpalette([level for _, color in often for level in color])  # pyright: ignore[reportGeneralTypeIssues]
+        palette.putpalette([int(level) for colour in chosen for level in colour])
         return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in every]
 
     def _page(self, title: str) -> str:

@@ -27,7 +27,7 @@ __all__ = ["Spectrum", "spectrum_of"]
 _FINER = 4
 """So many times as many frequencies as a piece tells apart are computed, so that peaks are read to 2 %."""
 
-_OVER = 2.5
+_OVER = 1.5
 """Frequencies up to so many times the rotor's greatest speed are kept."""
 
 
