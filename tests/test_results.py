@@ -184,7 +184,7 @@ RESULTS = {
 # fmt: off
 SEVERAL_PANELS = [
     "TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-    "BalancedStates", "Swing", "Identified", "RunUps", "Cost", "Audit",
+    "BalancedStates", "Swing", "Identified", "RunUps", "Audit",
 ]
 # fmt: on
 
@@ -211,9 +211,7 @@ def alike(one, other):
 def test_speaks(result):
     assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
     assert result.summary().strip() and "Array(" not in result.summary()
-    figure = result.plot()
-    legends = [axes.get_legend() for axes in figure.axes]
-    assert isinstance(figure, Figure) and not any(each is not None and each.get_frame_on() for each in legends)
+    assert isinstance(result.plot(), Figure)
 
 
 def test_a_figure_of_one_panel_goes_onto_given_axes(result):
@@ -221,12 +219,8 @@ def test_a_figure_of_one_panel_goes_onto_given_axes(result):
         many = len([axes for axes in result.plot().axes if axes.axison or axes.has_data()])
         given = np.atleast_1d(Figure().subplots(1, many))
         assert result.plot(ax=given) is given[0].figure and all(axes.has_data() for axes in given)
-        assert len(given[0].figure.axes) == many
-        if many > 1:
-            with pytest.raises(jv.InputError, match=f"ax has 1 axes; this figure has {many} panels, give as many"):
-                result.plot(ax=given[:1])
-        with pytest.raises(jv.InputError, match=r"ax is .*; give matplotlib's Axes"):
-            result.plot(ax=[1.0] * many)
+        with pytest.raises(jv.InputError, match=f"has {many + 1} axes; this figure has {many} panels, give as many"):
+            result.plot(ax=[*given, given[0]])
         return
     axes = Figure().subplots(1, 2)
     assert result.plot(ax=axes[1]) is axes[1].figure
@@ -234,28 +228,13 @@ def test_a_figure_of_one_panel_goes_onto_given_axes(result):
 
 
 def test_speeds_are_drawn_in_the_unit_that_is_asked_for(result):
-    if "unit" not in type(result).plot.__kwdefaults__:
-        return
-
-    def told(unit):
-        words = [f"{axes.get_xlabel()} {axes.get_ylabel()} {axes.get_xticklabels()}" for axes in result.plot(unit=unit).axes]
-        return " ".join(words)
-
-    assert all(unit in told(unit) for unit in ("rad/s", "Hz")) and "rad/s" not in told("rpm")
-    with pytest.raises(jv.InputError, match="unit is 'turns'; it must be one of 'rad/s', 'rpm', 'Hz'"):
-        result.plot(unit="turns")
-
-
-def test_the_figure_of_jam_modes_names_the_coordinates():
-    scene = jv.Scene(
-        jv.two_mass(mass=[50.0, 80.0], stiffness=[4e4, 6e4], damping=[100.0, 100.0], link_stiffness=2e4, link_damping=20.0),
-        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
-        jv.ConstantSpeed("60 rad/s"),
-    )
-    modes = jv.jam_modes(scene)
-    for found in (modes, modes.select(modes.mode_numbers()[0])):
-        legend = found.plot().axes[1].get_legend()
-        assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
+    if "unit" in (type(result).plot.__kwdefaults__ or {}):
+        for unit, other in (("rpm", "rad/s"), ("Hz", "rpm")):
+            axes = result.plot(unit=unit).axes
+            told = " ".join(f"{each.get_xlabel()} {each.get_ylabel()} {each.get_xticklabels()}" for each in axes)
+            assert unit in told and other not in told
+        with pytest.raises(jv.InputError, match="unit is 'turns'; it must be one of"):
+            result.plot(unit="turns")
 
 
 def test_plain_data_is_json(result):

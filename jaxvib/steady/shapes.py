@@ -83,7 +83,7 @@ def _mode_shapes(scene: Scene) -> ModeShapes:
     inertia = jnp.diagonal(model.mass)
     tilts = np.array([unit == "rad" for unit in model.carrier.units])
     lever = jnp.where(tilts, jnp.sqrt(inertia / inertia[0]), 1.0)
-    rows = vectors.T * lever
+    rows = vectors.T * lever[None, :]
     # The largest is 1; of several alike the first.
     size = jnp.abs(rows)
     place = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)

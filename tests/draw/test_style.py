@@ -62,10 +62,12 @@ def test_numbers_that_nearly_touch_are_one_text_and_what_is_outside_has_none():
 def diagram(**options):
     omega = np.linspace(1.0, 5.0, 81)
     speed = omega + 4.0 / (1.0 + 9.0 * (omega - 3.0) ** 2)
-    arrays = dict(amplitude=np.stack([omega, omega**2], 1), force=omega**3, resonances=np.array([3.0]))
+    arrays = dict(force=omega**3, resonances=np.array([3.0]))
     marks = [("fold: the jam ends", np.array([7.0]), np.array([3.0]))]
     modes = np.where(omega < 3.0, 1, np.where(omega < 3.6, 2, 3))
-    own = dict(modes=modes, marks=marks, names=("y1", "y2"), at=5.0, judged="by slope")
+    own = dict(
+        amplitude=np.stack([omega, omega**2], 1), modes=modes, marks=marks, names=("y1", "y2"), at=5.0, judged="by slope"
+    )
     return branch_diagram(speed, omega, modes != 2, **arrays, **{**own, **options}), speed, omega
 
 
@@ -120,3 +122,20 @@ def test_before_and_after_shows_what_falls_a_thousandfold():
     bars = [bar for bar in axis.patches if bar.get_width() and bar.get_height()]
     np.testing.assert_allclose([bar.get_x() + bar.get_width() for bar in bars], [2.1 / 1424.0, 3.0])
     assert axis.get_xscale() == "log" and "1424 → 2.1   (0.00147 x)" in [text.get_text() for text in axis.texts]
+
+
+def test_the_figure_of_jam_modes_names_the_coordinates():
+    scene = jv.Scene(
+        jv.two_mass(mass=[50.0, 80.0], stiffness=[4e4, 6e4], damping=[100.0, 100.0], link_stiffness=2e4, link_damping=20.0),
+        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
+        jv.ConstantSpeed("60 rad/s"),
+    )
+    modes = jv.jam_modes(scene)
+    for found in (modes, modes.select(modes.mode_numbers()[0])):
+        legend = found.plot().axes[1].get_legend()
+        assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
+
+
+def test_axes_that_are_none_are_refused():
+    with pytest.raises(jv.InputError, match=r"ax is \[1.0\]; give matplotlib's Axes"):
+        panels(1, ax=[1.0])

@@ -2,6 +2,7 @@
 
 import re
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -30,6 +31,11 @@ def run():
 @pytest.fixture(scope="module")
 def orbit():
     return jv.jam_orbit(SCENE, mode=1)
+
+
+def thinned(run, every):
+    """The run as it had kept fewer states."""
+    return eqx.tree_at(lambda r: r.trajectory, run, jax.tree.map(lambda x: x[::every], run.trajectory))
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)
@@ -92,7 +98,7 @@ def test_a_run_between_its_samples(run):
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], rtol=1e-9)
     np.testing.assert_allclose(np.exp(1j * found.angle[0]), np.exp(1j * np.asarray(kept.state.angle[0][some])), rtol=1e-9)
     # Every other sample, from its neighbours, is what it was.
-    coarse = jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=2048, estimate=False)
+    coarse = thinned(run, 2)
     found = of_run(coarse, t[some])
     np.testing.assert_allclose(found.displacement, kept.state.displacement[some], atol=1e-5 * float(run.amplitude[0]))
     np.testing.assert_allclose(np.exp(1j * found.turn), np.exp(60j * t[some]), atol=1e-6)
@@ -142,7 +148,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),
         (lambda run, orbit: jv.animate(run, magnify=-1.0), "magnify is -1; it must be greater than 0"),
         (
-            lambda run, orbit: jv.animate(jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=32), begin=0.1, end=0.3),
+            lambda run, orbit: jv.animate(thinned(run, 128), begin=0.1, end=0.3),
             "run has 32 samples, between which loads turn by up to .* simulate with samples=",
         ),
         (lambda run, orbit: run.plot_path(), "machine.kind is 'one_mass', which moves up and down only"),
@@ -162,7 +168,7 @@ def test_a_spectrum_has_the_height_of_the_vibration(run):
     found = run.spectrum()
     peak = int(np.argmax(found.amplitude[0, :, 0]))
     np.testing.assert_allclose(found.amplitude[0, peak, 0], run.amplitude[0], rtol=0.03)
-    np.testing.assert_allclose(found.frequency[peak], run.omega, rtol=0.02)
+    assert abs(found.frequency[peak] - run.omega) <= found.frequency[1]  # as finely as frequencies are computed
     figure = found.plot(unit="Hz")
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xydata()[:, 1], 1e3 * found.amplitude[0, :, 0])
     assert "resonances" in [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
@@ -174,7 +180,7 @@ def test_a_spectrum_has_the_height_of_the_vibration(run):
 
 def test_mode_shapes_against_the_eigenproblem():
     scene = jv.scene_from_toml(TEMPLATES["network"])
-    found, carrier = jv.mode_shapes(scene), scene.machine.carrier()
+    found, carrier = jv.mode_shapes(scene), jax.tree.map(np.asarray, scene.machine.carrier())
     mass = np.asarray(carrier.mass) + 2.4 * np.outer(carrier.port[0], carrier.port[0])
     for w, x in zip(np.asarray(found.frequency), np.asarray(found.shape), strict=True):
         np.testing.assert_allclose(carrier.stiffness @ x, w**2 * mass @ x, atol=1e-9 * np.max(np.abs(carrier.stiffness)))
@@ -183,19 +189,11 @@ def test_mode_shapes_against_the_eigenproblem():
     np.testing.assert_allclose(np.sort(bars), np.sort(np.ravel(found.shape)))
 
 
-def test_the_path_of_a_rotors_axis():
-    rotor = jv.Scene(
-        jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0),
-        jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04),
-        jv.ConstantSpeed(460.0),
-        (jv.StaticImbalance("8 g m"),),
-    )
-    run = jv.simulate(rotor, 0.5, samples=512, estimate=False)
-    axis = run.plot_path().axes[0]
+def test_the_path_of_a_rotors_axis(run):
+    rotor = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), SCENE.loads, SCENE.drive)
+    moved = 1e-3 * np.stack([np.cos(30.0 * np.asarray(run.window.time)), np.sin(30.0 * np.asarray(run.window.time))], axis=1)
+    turned = eqx.tree_at(lambda r: (r.scene, r.window.state.displacement), run, (rotor, moved))
+    axis = turned.plot_path().axes[0]
     across, up = axis.lines[0].get_data()
-    np.testing.assert_allclose(across, 1e3 * np.asarray(run.window.state.displacement)[-across.size :, 0])
-    assert (
-        axis.get_aspect() == 1.0
-        and (axis.get_xlabel(), axis.get_ylabel()) == ("across, mm", "up, mm")
-        and up.size == across.size
-    )
+    np.testing.assert_allclose(np.stack([across, up], axis=1), 1e3 * moved[-across.size :])
+    assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("across, mm", "up, mm")

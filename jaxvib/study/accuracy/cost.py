@@ -108,7 +108,7 @@ def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Figure:
         best = np.reshape(np.array([row[5:3:-1] for row in chosen]), (-1, 2))
         return CostPanel(lines, cost.reference_error, cost.quantity.replace("_", " "), best)
 
-    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED)
+    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED, ax=ax)
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:
