@@ -169,7 +169,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
         return [*view.parts(poses[k], reach), *view.arrows(poses[k], shown.force[k], per_newton)]
 
     artists = [put(stage, part) for part in parts(0)]
-    clock = stage.text(0.0, 1.0, "", transform=stage.transAxes, va="bottom", family="monospace", fontsize="medium")
+    clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
     slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
     note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x larger"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")

@@ -126,9 +126,9 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
     page = (tmp_path / "a<b>.html").read_text()
     assert not re.search(r"https?:|src=[\"']?//|<link|@import", page) and page.count("iVBOR") == 8
     assert "<title>a&lt;b&gt;</title>" in page
-    clock = next(text.get_text() for text in film.figure.axes[0].texts if text.get_text().startswith("t ="))
+    clock = film.figure.axes[0].get_title(loc="left")
     assert re.match(r"t =\s+1\.[56]\d\d s\s+force on the bed\s+-?\d+ N", clock)
-    assert "slowed down 4 x" in film.figure.axes[0].texts[1].get_text()
+    assert "slowed down 4 x" in film.figure.axes[0].texts[0].get_text()
     assert jv.animate(orbit, scene=SCENE, width=3.0).count > 50
 
 

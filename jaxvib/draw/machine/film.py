@@ -23,7 +23,7 @@ __all__ = ["Film"]
 _COLORS = 64
 """Colours of a film."""
 
-_NEAR = 20
+_NEAR = 10
 """Levels, of 255, by which two of them differ at least."""
 
 _PAGE = """<!doctype html>
