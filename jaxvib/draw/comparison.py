@@ -213,7 +213,7 @@ def steps_chart(
     for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
         axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
         axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
-    axes.axhline(tolerance, color="black", ls=":", lw=1.2)
+    axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: the best step")
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
     legend_above(axes)

@@ -74,8 +74,8 @@ def animate(
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
     ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
     >>> film = jv.animate(jv.jam_orbit(scene, mode=1), scene=scene)
-    >>> film.count, film.figure.axes[1].get_xlabel()
-    (82, 'time, s')
+    >>> film.count, film.figure.axes[2].get_xlabel()
+    (98, 'time, s')
     """
     owner = checked_scene(_scene_of(motion, scene))
     if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):

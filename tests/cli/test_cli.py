@@ -67,7 +67,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
-    assert "loads can stay jammed at 164.63 rad/s (together)" in typed("modes", "rotor.toml")[1]
+    assert "loads can stay jammed at 164.63 rad/s (all together)" in typed("modes", "rotor.toml")[1]
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
     for words in (("modes", "--exact"), ("criterion",)):
         code, out, err = typed(words[0], "stations.toml", *words[1:])
@@ -315,7 +315,7 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
         (["sketch", "machine.toml"], "--out is missing; name the folder"),
         (["animate", "machine.toml", "--out", "a"], "--until is missing; say how long to simulate, or by --mode"),
         (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until goes, as --start and --mode, with a scene file"),
-        (["animate", "missing.npz", "--out", "a"], "cannot be read"),
+        (["animate", "missing.npz", "--out", "a"], "there is no such file"),
     ],
 )
 def test_films_that_cannot_be_made(typed, words, says):
