@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxvib.draw.machine.parts import Part, arrow, box, circle, damper, ground, spring
 from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.layout import Tie, lanes
 from jaxvib.show.wheel import Pose, Text, Wheel, places_of, shown
@@ -281,9 +282,10 @@ class ShaftView(View):
     def texts(self) -> list[Text]:
         """Mass and inertias, supports and stations with their places from the mass centre."""
         small: dict[str, Any] = {"fontsize": "small"}
-        whole, tilt = (np.asarray(x) for x in (self.carrier.mass, self.carrier.gyroscopic))
+        whole, turning = np.asarray(self.carrier.mass), self.carrier.gyroscopic
         inertia = f"M = {shown(float(whole[0, 0]), 'kg')}\nA = {shown(float(whole[2, 2]), 'kg m²')}"
-        inertia += f"\nC = {shown(float(np.max(np.abs(tilt))), 'kg m²')}"
+        if turning is not None:
+            inertia += f"\nC = {shown(float(np.max(np.abs(np.asarray(turning)))), 'kg m²')}"
         found = [Text(self._x(self.cg), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.stands:
             text = f"{_said(k, c)}\nat {1e3 * (s - self.cg):+.4g} mm"
@@ -316,4 +318,7 @@ def view_of(scene: Scene) -> View:
     carrier = scene.machine.structure()
     if carrier.axes == (1,):
         return PlatformView(scene)
+    if carrier.axes != (0, 1):
+        problem = f"is {scene.machine.kind!r}; machines are drawn that move up and down, or across and up"
+        raise InputError("machine.kind", problem)
     return FrontView(scene) if carrier.tilt is None else ShaftView(scene)
