@@ -1,9 +1,11 @@
 """What mkdocs runs: a page of the reference for each group of public names, and formulas as MathML, without a script."""
 
 import ast
+import contextlib
 import html
 import pathlib
 import re
+import tempfile
 
 import latex2mathml.converter
 from mkdocs.structure.files import File
@@ -55,6 +57,8 @@ def on_files(files, config):
     for page, source in INCLUDED.items():
         text = (ROOT / source).read_text(encoding="utf-8").replace("](jaxvib/ode/README.md)", "](engine.md)")
         files.append(File.generated(config, page, content=text))
+    for name, content in _pictures().items():
+        files.append(File.generated(config, f"made/{name}", content=content))
     for title, names in public_groups().items():
         package = "optimize" if title == OPTIMIZE else "jaxvib"
         parts = [f"# {title}\n"]
@@ -62,6 +66,15 @@ def on_files(files, config):
             parts.append(f"::: {home}\n    options:\n      heading: {package}.{name}\n      toc_label: {name}\n")
         files.append(File.generated(config, address(title), content="\n".join(parts)))
     return files
+
+
+def _pictures():
+    """{name: bytes} of what the examples on the page of figures draw."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "figures.md").read_text(encoding="utf-8"), flags=re.S)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for block in blocks:
+            exec(compile(block, "figures.md", "exec"), {})
+        return {path.name: path.read_bytes() for path in sorted(pathlib.Path(folder).iterdir())}
 
 
 _MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>([.,;:)]*)', flags=re.S)

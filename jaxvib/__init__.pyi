@@ -42,6 +42,7 @@ from jaxvib.steady.jams.jam import Jam, JamModes, JamStatus, jam_modes
 from jaxvib.steady.jams.patterns import PhasePattern
 from jaxvib.steady.jams.phase_search import PhaseJams, phase_jams
 from jaxvib.steady.jams.phases import PhaseJam, PhaseStatus
+from jaxvib.steady.shapes import ModeShapes, mode_shapes
 
 # Exact jams
 from jaxvib.steady.orbits.diagram import ExactBranches
@@ -57,6 +58,7 @@ from jaxvib.study.maps.criterion_map import criterion_map
 
 # Motion in time
 from jaxvib.motion.analysis.regime import Regime, RegimeName, regime
+from jaxvib.motion.analysis.spectrum import Spectrum
 from jaxvib.motion.ensemble import Ensemble, ensemble
 from jaxvib.motion.envelope.envelope import envelope
 from jaxvib.motion.envelope.result import Envelope, EnvelopeStatus
@@ -96,10 +98,12 @@ from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Many cases
-
-# Many cases
 from jaxvib.sweeps.status import CaseStatus, SweepStatus
 from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
+
+# Pictures and films
+from jaxvib.show.animate import animate
+from jaxvib.show.sketch import sketch
 
 # Results
 from jaxvib.report.page import html_report
@@ -165,6 +169,8 @@ __all__ = [
     "initial_state",
     "with_spin",
     "natural_frequencies",
+    "mode_shapes",
+    "ModeShapes",
     "energy",
     "power",
     "foundation_force",
@@ -214,6 +220,7 @@ __all__ = [
     "Ensemble",
     "Regime",
     "RegimeName",
+    "Spectrum",
     "growth",
     "Growth",
     "GrowthStatus",
@@ -261,6 +268,9 @@ __all__ = [
     "Sweep",
     "SweepStatus",
     "CaseStatus",
+    # Pictures and films
+    "sketch",
+    "animate",
     # Results
     "Result",
     "load",

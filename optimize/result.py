@@ -212,7 +212,8 @@ class Synthesis(Result):
         from jaxvib.draw.charts import convergence
 
         best = int(np.argmin(self.values)) if np.any(np.isfinite(self.values)) else 0
-        return convergence(self.history, best=best, label=f"{self.objective}, {self.unit}".rstrip(", "), ax=ax)
+        label = f"{self.objective.replace('_', ' ')}, {self.unit}".rstrip(", ")
+        return convergence(self.history, best=best, label=label, ax=ax)
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:

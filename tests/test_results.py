@@ -1,6 +1,5 @@
 """Every result: status, sentence, text, figure, plain and labelled data, files and back."""
 
-import inspect
 import json
 import math
 import pathlib
@@ -124,6 +123,8 @@ RESULTS = {
     "JamModes": cached(lambda: jv.jam_modes(SCENE)),
     "Jam": lambda: RESULTS["JamModes"]().select(1),
     "Branches": lambda: jv.branches(SCENE, points=50),
+    "ModeShapes": lambda: jv.mode_shapes(SCENE),
+    "Spectrum": lambda: RESULTS["Run"]().spectrum(),
     "ExactBranches": lambda: jv.branches(SCENE, exact=True, points=20),
     "Orbit": lambda: jv.jam_orbit(SCENE, mode=1),
     "PhaseJams": cached(lambda: jv.phase_jams(ROTOR, starts=4)),
@@ -175,10 +176,8 @@ RESULTS = {
 }
 
 # fmt: off
-SEVERAL_PANELS = [
-    "TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
-    "BalancedStates", "Swing", "Identified", "RunUps", "Capture", "Cost", "Audit",
-]
+SEVERAL_PANELS = ["TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
+                  "BalancedStates", "Swing", "Identified", "RunUps", "Audit"]
 # fmt: on
 
 
@@ -203,29 +202,29 @@ def alike(one, other):
 
 def test_speaks(result):
     assert isinstance(result.message, str) and " " in result.message and "<" not in result.message
-    assert result.summary().strip() and "Array(" not in result.summary()
-    assert isinstance(result.plot(), Figure)
+    assert result.summary().strip() and "Array(" not in result.summary() and isinstance(result.plot(), Figure)
 
 
 def test_a_figure_of_one_panel_goes_onto_given_axes(result):
     if type(result).__name__ in SEVERAL_PANELS:
-        assert "ax" not in inspect.signature(result.plot).parameters
+        many = len([axes for axes in result.plot().axes if axes.axison or axes.has_data()])
+        given = np.atleast_1d(Figure().subplots(1, many))
+        assert result.plot(ax=given) is given[0].figure and all(axes.has_data() for axes in given)
+        with pytest.raises(jv.InputError, match=f"{many + 1} axes; this figure has {many} panels"):
+            result.plot(ax=[*given, given[0]])
         return
     axes = Figure().subplots(1, 2)
     assert result.plot(ax=axes[1]) is axes[1].figure
     assert axes[1].has_data() and not axes[0].has_data() and len(axes[0].figure.axes) == 2
 
 
-def test_the_figure_of_jam_modes_names_the_coordinates():
-    scene = jv.Scene(
-        jv.two_mass(mass=[50.0, 80.0], stiffness=[4e4, 6e4], damping=[100.0, 100.0], link_stiffness=2e4, link_damping=20.0),
-        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
-        jv.ConstantSpeed("60 rad/s"),
-    )
-    modes = jv.jam_modes(scene)
-    for found in (modes, modes.select(modes.mode_numbers()[0])):
-        legend = found.plot().axes[1].get_legend()
-        assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
+def test_speeds_are_drawn_in_the_unit_that_is_asked_for(result):
+    if "unit" in (type(result).plot.__kwdefaults__ or {}):
+        for unit, other in (("rpm", "rad/s"), ("Hz", "rpm")):
+            told = [f"{x.get_xlabel()} {x.get_ylabel()} {x.get_xticklabels()}" for x in result.plot(unit=unit).axes]
+            assert unit in " ".join(told) and other not in " ".join(told)
+        with pytest.raises(jv.InputError, match="unit is 'turns'; it must be one of"):
+            result.plot(unit="turns")
 
 
 def test_plain_data_is_json(result):

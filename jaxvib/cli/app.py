@@ -19,7 +19,7 @@ from jaxvib.errors import ComputationError, InputError
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
-__all__ = ["WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
+__all__ = ["UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
 
 
 def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
@@ -38,6 +38,12 @@ def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
 """The option of commands whose theories do not know every effect."""
+
+
+UNIT = click.option(
+    "--unit", type=click.Choice(["rad/s", "rpm", "Hz"]), default="rpm", show_default=True, help="Of speeds in figures."
+)
+"""The option of commands that draw speeds."""
 
 
 def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
@@ -67,6 +73,8 @@ _HOMES = {
     "run-ups": "motion.run_ups",
     "settle": "motion.settle",
     "stability-map": "motion.stability",
+    "animate": "animate",
+    "sketch": "animate",
     "audit": "study.audit",
     "capture": "study.capture",
     "cost": "study.cost",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import UNIT, Output, app, shared
 from jaxvib.cli.motion.document import chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
@@ -18,6 +18,7 @@ from jaxvib.ode.progress import ProgressBar
 from jaxvib.units import number
 
 if TYPE_CHECKING:
+    from jaxvib.draw.style import SpeedUnit
     from jaxvib.motion.start import Start
 
 
@@ -58,6 +59,7 @@ def new(kind: str, output: Output) -> None:
 @click.option("--max-steps", type=int, help="Fail after so many steps.")
 @click.option("--window", is_flag=True, help="Keep no trajectory, only what is measured over the last turns.")
 @CSV
+@UNIT
 @shared
 def simulate(
     scene: Path,
@@ -71,6 +73,7 @@ def simulate(
     max_steps: int | None,
     window: bool,
     csv: Path | None,
+    unit: SpeedUnit,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
@@ -89,7 +92,7 @@ def simulate(
         save="window" if window else "all",
         progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
-    output.picture("history.png", run.plot)
+    output.picture("history.png", lambda: run.plot(unit=unit))
     data = output.file("run.npz")
     if data is not None:
         run.save(data)

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
 from jaxvib.steady.balance.states import balanced_intervals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
 
 _RPM = 30.0 / np.pi
 
@@ -25,9 +27,10 @@ _RPM = 30.0 / np.pi
 @app.command("criterion")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--check", is_flag=True, help="Add the exact boundaries, from Floquet multipliers of the full equations.")
+@UNIT
 @WITHOUT
 @shared
-def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output) -> None:
+def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...], output: Output) -> None:
     """Where collected loads of SCENE stay together and where they spread and balance the rotor, by the empirical criterion."""
     loaded = loaded_scene(scene, without)
     judged = jv.criterion(loaded)
@@ -48,7 +51,7 @@ def criterion(scene: Path, check: bool, without: tuple[str, ...], output: Output
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
         figure, (axis,) = panels(1, size=(9.0, 4.0))
-        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact)
+        pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact, unit)
         return figure
 
     output.picture("criterion.png", figure)

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING
 
 import click
 import jax
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
+from jaxvib.results.status import sentence
 from jaxvib.steady.jams.jam import JUDGED
-from jaxvib.steady.jams.phases import growth_apart
+from jaxvib.steady.jams.phases import degrees, growth_apart
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import SpeedUnit
 
 _RPM = 30.0 / np.pi
-
-SpeedUnit: TypeAlias = Literal["rad/s", "rpm"]
 
 
 @app.command("modes")
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
-@click.option("--unit", type=click.Choice(["rad/s", "rpm"]), default="rpm", show_default=True, help="Of speeds in the figure.")
+@UNIT
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
 @WITHOUT
@@ -157,8 +159,8 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
                 f"{float(jam.omega):.5g}",
                 f"{_RPM * float(jam.omega):.5g}",
                 "stable" if jam.stable else "unstable",
-                jam.pattern_label,
-                " ".join(f"{np.rad2deg(float(a)):.4g}" for a in jam.phase),
+                sentence(jam.pattern),
+                " ".join(f"{degrees(float(a)):.4g}" for a in jam.phase),
                 f"{float(jam.foundation_force):.4g}",
             ]
             for jam in jams
@@ -168,7 +170,7 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
         title = f"jams of light loads at any phases; rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm)"
         if not rows:
             return f"no jam at {speed:.5g} rad/s"
-        kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({jam.pattern_label})" for jam in jams if jam.stable)
+        kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({sentence(jam.pattern)})" for jam in jams if jam.stable)
         said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
         return "\n".join([table(title, head, rows), said, *_left_out(scene)])
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import UNIT, Output, app, shared, table
 from jaxvib.cli.output import CSV
 from jaxvib.units import number
+
+if TYPE_CHECKING:
+    from jaxvib.draw.style import SpeedUnit
 
 _RPM = 30.0 / np.pi
 
@@ -22,9 +25,12 @@ _RPM = 30.0 / np.pi
 @click.option(
     "--loads", type=click.Choice(["fixed", "none"]), default="fixed", show_default=True, help="Whether the loads' masses count."
 )
+@UNIT
 @CSV
 @shared
-def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: Path | None, output: Output) -> None:
+def whirl(
+    scene: Path, speed: str | None, loads: Literal["fixed", "none"], unit: SpeedUnit, csv: Path | None, output: Output
+) -> None:
     """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
     loaded = jv.load_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
@@ -40,7 +46,7 @@ def whirl(scene: Path, speed: str | None, loads: Literal["fixed", "none"], csv: 
     ]
     top = 1.3 * max([rotor_speed, *(each["speed"] for each in critical)])
     speeds = np.linspace(0.0, top, 161)
-    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot())
+    output.picture("campbell.png", lambda: jv.whirl(loaded, speeds, loads=loads).plot(at=rotor_speed, unit=unit))
     if csv is not None:
         output.csv(csv, jv.whirl(loaded, speeds, loads=loads), "rotor_speed")
     document = {"rotor_speed": rotor_speed, "loads": loads, "whirl": whirls, "critical": critical}

@@ -9,29 +9,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Onto, legend_above, panels
 
 __all__ = ["curve_chart", "tables_chart", "threshold_chart", "torus_paths"]
 
 
-def threshold_chart(speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float) -> Figure:
+def threshold_chart(
+    speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float, *, ax: Axes | None = None
+) -> Figure:
     """The share of captured starts over the initial speed, with its standard error, and the threshold.
 
     >>> import numpy as np
     >>> len(threshold_chart(np.array([-0.5, -0.1]), np.array([0.0, 1.0]), np.array([0.1, 0.1]), -0.3).axes)
     1
     """
-    figure, (axis,) = panels(1, size=(7.0, 3.4))
+    figure, (axis,) = panels(1, size=(7.0, 3.4), ax=ax)
     axis.fill_between(
         speed, np.clip(fraction - error, 0.0, 1.0), np.clip(fraction + error, 0.0, 1.0), color=COLORS[0], alpha=0.2, lw=0.0
     )
-    axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0])
+    axis.plot(speed, fraction, marker="o", ms=3.0, color=COLORS[0], label="share, with its standard error")
     if np.isfinite(threshold):
         axis.axvline(threshold, color=COLORS[1], ls="--", label=f"threshold {threshold:.3f}")
-        axis.legend()
     axis.set_xlabel("initial speed relative to the rotor, in the rotor's speed")
     axis.set_ylabel("share of starts captured")
     axis.set_ylim(-0.05, 1.05)
+    legend_above(axis)
     return figure
 
 
@@ -58,11 +60,11 @@ def curve_chart(
     axis.set_xlabel("value")
     axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
     axis.set_ylim(-1.03, 0.0)
-    axis.legend()
+    legend_above(axis)
     return figure
 
 
-def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray) -> Figure:
+def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray, *, ax: Onto = None) -> Figure:
     """Paths of balls on the unrolled torus, and their speeds.
 
     **Arguments** (T times, N balls): `around` (T, N) rad, the angle relative to the rotor; `across` (T, N) rad, in the tube's
@@ -72,7 +74,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     >>> len(torus_paths(*np.zeros((3, 4, 2)), np.arange(4.0)).axes)
     2
     """
-    figure, (paths, speeds) = panels(2, size=(7.0, 3.4))
+    figure, (paths, speeds) = panels(2, size=(7.0, 3.4), ax=ax)
     late = max(1, round(0.9 * time.size))
     for j in range(around.shape[1]):
         colour = COLORS[j % len(COLORS)]
@@ -84,17 +86,18 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
         paths.plot(broken[late:], np.degrees(y[late:]), color=colour, lw=1.2, label=f"ball {j + 1}, the last tenth")
         paths.plot(np.degrees(x[:1]), np.degrees(y[:1]), "o", mfc="white", color=colour, label=None if j else "start")
         paths.plot(np.degrees(x[-1:]), np.degrees(y[-1:]), "o", color=colour, label=None if j else "end")
-        speeds.plot(time, rate[:, j], color=colour, lw=0.8)
-    paths.axhline(90.0, color=COLORS[5], ls="--", lw=0.8, label="outer equator")
+        speeds.plot(time, rate[:, j], color=colour, ls=STROKES[j % len(STROKES)], lw=1.0, label=f"ball {j + 1}")
+    paths.axhline(90.0, color=GUIDE, ls="--", lw=0.8, label="outer equator")
     paths.set_xlim(-180.0, 180.0)
     paths.set_xticks(np.arange(-180, 181, 90))
     paths.yaxis.set_major_locator(MultipleLocator(45.0))
     paths.set_xlabel("around the axis, relative to the rotor, degrees")
     paths.set_ylabel("in the tube, degrees")
-    paths.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
-    speeds.axhline(0.0, color=COLORS[5], ls="--", lw=0.8)
+    legend_above(paths, 3)
+    speeds.axhline(0.0, color=GUIDE, ls="--", lw=0.8)
     speeds.set_xlabel("time, s")
     speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
+    legend_above(speeds)
     return figure
 
 
@@ -103,7 +106,7 @@ def _within(angle: np.ndarray, least: float) -> np.ndarray:
     return np.mod(angle - least, 2.0 * np.pi) + least
 
 
-def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]]) -> Figure:
+def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], *, ax: Onto = None) -> Figure:
     """Least initial speeds over the gap.
 
     **Arguments**: `rows`, a panel for each: its title, the gaps, by name the speeds; "paper" as points alone.
@@ -112,8 +115,8 @@ def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]
     >>> len(tables_chart([("p = 0.01", np.arange(2.0), {"paper": np.zeros(2), "derived": np.ones(2)})]).axes)
     1
     """
-    columns = 2 if len(rows) > 1 else 1
-    figure, axes = panels(-(-len(rows) // columns), columns, size=(5.0, 3.0))
+    columns = len(rows) if ax is not None else 2 if len(rows) > 1 else 1
+    figure, axes = panels(-(-len(rows) // columns), columns, size=(5.0, 3.0), ax=ax)
     for axis in axes[len(rows) :]:
         axis.set_visible(False)
     for axis, (title, gap, speeds) in zip(axes, rows, strict=False):
@@ -121,10 +124,11 @@ def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]
             if name == "paper":
                 axis.plot(gap, speed, "o", color="black", label=name)
             else:
-                axis.plot(gap, speed, marker=".", color=COLORS[(k - 1) % len(COLORS)], label=name)
-        axis.set_title(title)
+                look = {"marker": MARKERS[k % len(MARKERS)], "ls": STROKES[k % len(STROKES)], "ms": 4.0}
+                axis.plot(gap, speed, color=COLORS[(k - 1) % len(COLORS)], label=name, **look)
+        axis.set_title(title, loc="right", fontsize="medium")
         axis.set_xlabel("gap, in eccentricities")
         axis.set_ylabel("least initial speed")
         axis.set_ylim(-1.03, 0.0)
-    axes[0].legend()
+    legend_above(axes[0], 2)
     return figure

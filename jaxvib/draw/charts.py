@@ -1,61 +1,36 @@
-"""Charts of plain arrays: time histories, branch diagrams, before and after."""
+"""Charts of plain arrays: branch diagrams, before and after, convergence."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, UNSTABLE, panels, speed_scale
+from jaxvib.draw.style import (
+    COLORS,
+    GUIDE,
+    MARKERS,
+    OPERATING,
+    UNSTABLE,
+    Onto,
+    SpeedUnit,
+    legend_above,
+    legend_outside,
+    numbered,
+    panels,
+    speed_scale,
+)
+from jaxvib.errors import InputError
 
-__all__ = ["before_after", "branch_diagram", "convergence", "solid_and_dashed", "time_histories"]
+__all__ = ["PARTS", "before_after", "branch_diagram", "convergence", "solid_and_dashed"]
 
 
-def time_histories(
-    time: np.ndarray,
-    displacement: np.ndarray,
-    rate: np.ndarray,
-    force: np.ndarray,
-    rotor_speed: np.ndarray,
-    *,
-    names: Sequence[str],
-    units: Sequence[str] | None = None,
-) -> Figure:
-    """Panels over time (s): displacements (nt, nd) mm, tilts mrad where there are any, speeds of the loads (nt, count) and of
-    the rotor (nt,) rad/s, force on the bed (nt, nb) N.
-
-    `displacement` is in m, and in rad where `units` (nd,) say "rad"; if None, all is in m.
-
-    >>> import numpy as np
-    >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
-    >>> figure = time_histories(t, q, one, one, t, names=("y", "theta"), units=("m", "rad"))
-    >>> [axes.get_ylabel() for axes in figure.axes][:2]
-    ['displacement, mm', 'tilt, mrad']
-    """
-    units = ["m"] * len(names) if units is None else units
-    kinds = [(unit, label) for unit, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if unit in units]
-    figure, (*upper, middle, bottom) = panels(len(kinds) + 2, size=(8.0, 2.4), share_x=True)
-    widest_first = np.argsort(-np.ptp(displacement, axis=0))  # so that none hides another
-    for axis, (unit, label) in zip(upper, kinds, strict=True):
-        own = [k for k in widest_first if units[k] == unit]
-        for depth, k in enumerate(own):
-            line = {"color": COLORS[k % len(COLORS)], "lw": 0.7, "zorder": 2 + 0.1 * depth}
-            axis.plot(time, 1e3 * displacement[:, k], label=names[k], **line)
-        axis.set_ylabel(label)
-        axis.legend(ncols=min(len(own), 6), loc="upper right")
-    for k in range(rate.shape[1]):
-        middle.plot(time, rate[:, k], color=COLORS[k % len(COLORS)], lw=0.9)
-    middle.plot(time, rotor_speed, color="black", ls="--", lw=1.0, label="rotor")
-    middle.set_ylabel("speed of loads, rad/s")
-    middle.legend(loc="lower right")
-    for k in range(force.shape[1]):
-        bottom.plot(time, force[:, k], color=COLORS[k % len(COLORS)], lw=0.7)
-    bottom.set_ylabel("force on the bed, N")
-    bottom.set_xlabel("time, s")
-    return figure
+PARTS = ("speed", "amplitude", "force")
+"""What a branch diagram can show over the rotor's speed."""
 
 
 def branch_diagram(
@@ -66,51 +41,117 @@ def branch_diagram(
     amplitude: np.ndarray,
     force: np.ndarray,
     resonances: np.ndarray,
+    modes: np.ndarray | None = None,
     marks: Sequence[tuple[str, np.ndarray, np.ndarray]] = (),
     names: Sequence[str],
     units: Sequence[str] | None = None,
     at: float | None = None,
-    unit: str = "rad/s",
-    title: str = "",
+    unit: SpeedUnit = "rad/s",
+    judged: str = "",
+    show: Sequence[str] = PARTS,
+    ax: Onto = None,
 ) -> Figure:
-    """Three panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N.
+    """Panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N, zero to peak.
 
-    `amplitude` is in m, and in rad where `units` (nd,) say "rad", which is drawn in mrad; if None, all is in m.
-    Stable parts are solid, unstable ones dashed. `resonances` are drawn as level lines, `marks` as points (label, rotor
-    speed, load speed), `at` as an upright line; speeds are given in rad/s and drawn in `unit` ("rad/s" or "rpm").
+    `amplitude` is in m, and in rad where `units` (nd,) say "rad", which is drawn in mrad; if None, all is in m. Of more than
+    two coordinates each has a panel of its own. Stable parts are solid, as `judged`, unstable ones dashed. `resonances` are
+    drawn as level lines, `marks` as points (label, rotor speed, load speed), `at` as an upright line at which the numbers of
+    the `modes` (np,) stand; speeds are given in rad/s and drawn in `unit`. `show` chooses panels of `PARTS`.
     """
     scale = speed_scale(unit)
-    figure, axes = panels(1, 3, size=(5.2, 4.2), share_x=True)
+    if not show or any(part not in PARTS for part in show):
+        raise InputError("show", f"is {tuple(show)!r}; it names some of: {', '.join(PARTS)}")
+    apart = len(names) > 2
+    rows: list[tuple[str, list[tuple[str, np.ndarray]]]] = []
+    for part in show:
+        if part == "speed":
+            rows.append((f"speed of loads, {unit}", [("loads", scale * omega)]))
+        elif part == "force":
+            rows.append(("foundation force, N, zero to peak", [("force", force)]))
+        else:
+            tilts = [units is not None and units[k] == "rad" for k in range(len(names))]
+            each = [(f"{name}, mrad" if tilts[k] else name, 1e3 * amplitude[:, k]) for k, name in enumerate(names)]
+            groups = [[one] for one in each] if apart else [each]
+            rows += [
+                (f"amplitude of {group[0][0]}{'' if tilts[k] else ', mm'}" if apart else "amplitude, mm, zero to peak", group)
+                for k, group in enumerate(groups)
+            ]
+    columns = min(3, len(rows))
+    lines = -(-len(rows) // columns)
+    spare = 0 if ax is not None else lines * columns - len(rows)
+    if ax is not None:
+        lines, columns = 1, len(rows)
+    figure, axes = panels(lines, columns, size=(4.9, 4.3), ax=ax)
+    for empty in axes[len(axes) - spare :] if spare else ():
+        empty.set_axis_off()
     n = scale * rotor_speed
-    view = scale * rotor_speed[np.isfinite(rotor_speed)]
-    series: list[tuple[Axes, np.ndarray, str, str]] = [(axes[0], scale * omega, COLORS[0], "loads")]
-    tilts = [units is not None and units[k] == "rad" for k in range(len(names))]
-    labels = [f"{name}, mrad" if tilts[k] else name for k, name in enumerate(names)]
-    series += [(axes[1], 1e3 * amplitude[:, k], COLORS[k % len(COLORS)], name) for k, name in enumerate(labels)]
-    series += [(axes[2], force, COLORS[0], "force")]
-    for axis, values, color, label in series:
-        solid_and_dashed(axis, n, values, stable, color, label)
-    for k, w in enumerate(resonances):
-        axes[0].axhline(scale * w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
-    low, high = 0.0, float(np.max(view))
-    axes[0].plot([low, high], [low, high], color="#bbbbbb", lw=0.8, label="rotor")
-    for (label, x, y), shape in zip(marks, itertools.cycle("os^Dv"), strict=False):
-        axes[0].plot(scale * x, scale * y, shape, ms=4.5, mfc="white", mec="black", label=label)
-    for axis, label in zip(axes, ("speed of loads, " + unit, "amplitude, mm", "foundation force, N"), strict=True):
+    high = float(np.max(n[np.isfinite(n)]))
+    crossings = _crossings(rotor_speed, stable, modes, at)
+    for axis, (label, group) in zip(axes, rows, strict=False):
+        for j, (name, values) in enumerate(group):
+            solid_and_dashed(
+                axis,
+                n,
+                values,
+                stable,
+                COLORS[j],
+                name if len(group) > 1 else None,
+                marker=MARKERS[j] if len(group) > 1 else "",
+            )
+        axis.plot([], [], color="black", label="stable")
+        axis.plot([], [], color="black", ls=UNSTABLE, label="unstable")
+        axis.set_xlim(0.0, high)
         axis.set_xlabel("rotor speed, " + unit)
         axis.set_ylabel(label)
-        axis.set_xlim(low, high)
+        if label.startswith("speed"):
+            _speed_lines(axis, scale, resonances, marks, high)
+        else:
+            shown = np.concatenate([values[np.isfinite(rotor_speed)] for _, values in group])
+            top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
+            axis.set_yscale("log")
+            axis.set_ylim(1e-5 * top, 2.5 * top)
         if at is not None:
-            axis.axvline(scale * at, color="#c8501e", lw=0.9, ls="-.")
-    figure.suptitle(title, fontsize="medium")
-    axes[0].set_ylim(0.0, None)
-    axes[0].legend(loc="upper left")
-    axes[1].legend(loc="best")
-    for axis, values in zip(axes[1:], (1e3 * amplitude, force[:, None]), strict=True):
-        shown = values[np.isfinite(rotor_speed)]
-        axis.set_yscale("log")
-        axis.set_ylim(1e-5 * np.max(shown), 2.0 * np.max(shown))
+            axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
+            heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossings]
+            told = [(number, filled) for _ in group for _, _, number, filled in crossings]
+            numbered(axis, scale * at, heights, [number for number, _ in told], [filled for _, filled in told])
+    if ax is None:
+        legend_outside(figure, axes, 4 if columns > 1 else 2)
+    else:
+        legend_above(axes[0], 2)
+    if judged and ax is None:
+        figure.supxlabel(f"stable {judged}", fontsize="small", color="#555555")
     return figure
+
+
+def _speed_lines(
+    axis: Axes, scale: float, resonances: np.ndarray, marks: Sequence[tuple[str, np.ndarray, np.ndarray]], high: float
+) -> None:
+    """Resonances, the rotor's own speed, and marks, in the panel of the loads' speeds."""
+    for k, w in enumerate(resonances):
+        axis.axhline(scale * w, color=GUIDE, lw=0.8, ls=":", label=None if k else "resonance")
+    axis.plot([0.0, high], [0.0, high], color=GUIDE, lw=0.8, label="speed of the rotor", zorder=1.0)
+    for (label, x, y), shape in zip(marks, itertools.cycle("osD^vPX"), strict=False):
+        axis.plot(scale * x, scale * y, shape, ms=5.0, mfc="white", mec=COLORS[1], mew=1.2, label=label, ls="", zorder=3)
+    axis.set_ylim(0.0, 1.06 * high)
+
+
+def _crossings(
+    rotor_speed: np.ndarray, stable: np.ndarray, modes: np.ndarray | None, at: float | None
+) -> list[tuple[int, float, str, bool]]:
+    """Where a branch meets the rotor speed `at`: the point before, the share of the way to the next, the mode's number, and
+    whether it is stable."""
+    if at is None:
+        return []
+    gap = rotor_speed - at
+    with np.errstate(invalid="ignore"):
+        places = np.flatnonzero((gap[:-1] * gap[1:] < 0.0) | (gap[:-1] == 0.0))
+    found = []
+    for i in places:
+        if np.isfinite(gap[i]) and np.isfinite(gap[i + 1]):
+            number = "" if modes is None else str(int(modes[i]))
+            found.append((int(i), float(gap[i] / (gap[i] - gap[i + 1])) if gap[i] else 0.0, number, bool(stable[i])))
+    return found
 
 
 def solid_and_dashed(
@@ -121,18 +162,21 @@ def solid_and_dashed(
     color: str,
     label: str | None = None,
     *,
-    widths: tuple[float, float] = (1.4, 1.4),
+    widths: tuple[float, float] = (1.5, 1.2),
+    marker: str = "",
 ) -> None:
     """One line for each unbroken stretch, solid where `stable`; neighbouring stretches share a point so that no gap shows.
-    `widths` of the solid ones and of the dashed ones."""
+    `widths` of the solid ones and of the dashed ones; with a `marker` the line has one here and there, to be known without
+    colour."""
     cuts = np.flatnonzero(stable[1:] != stable[:-1]) + 1
+    sparse = {"marker": marker, "markevery": 0.11, "ms": 4.0, "mfc": "white"} if marker else {}
     labelled = False
     for start, stop in zip([0, *cuts], [*(cuts + 1), len(x)], strict=True):
         solid = bool(stable[start])
         name = label if solid and not labelled else None
         labelled = labelled or solid
         style, width = ("-", widths[0]) if solid else (UNSTABLE, widths[1])
-        axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name)
+        axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name, **sparse)
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Figure:
@@ -142,31 +186,38 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
-    widest = max([1.5, *np.exp(np.abs(np.log(ratios[drawn])))])
+    low, high = min([0.7, *ratios[drawn]]), max([1.4, *ratios[drawn]])
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
+        look: Any = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
         if there:
-            axis.barh(place, ratio - 1.0, left=1.0, color=COLORS[0] if ratio <= 1.0 else COLORS[1], height=0.6)
+            axis.barh(place, ratio - 1.0, left=1.0, height=0.6, lw=0.0, **look)
         share = f"   ({ratio:.3g} x)" if there else ""
-        axis.text(
-            1.02, place, f"{before:.4g} → {after:.4g}{share}", va="center", fontsize=9, transform=axis.get_yaxis_transform()
-        )
+        text = f"{before:.4g} → {after:.4g}{share}"
+        axis.text(1.02, place, text, va="center", fontsize=9, transform=axis.get_yaxis_transform())
+    axis.bar([1.0], [0.0], color=COLORS[0], label="less than before")
+    axis.bar([1.0], [0.0], color=COLORS[3], hatch="///", edgecolor="white", label="more than before")
     axis.axvline(1.0, color="black", lw=0.9)
     axis.set_xscale("log")
-    axis.set_xlim(widest**-1.1, widest**1.1)
+    axis.set_xlim(low**1.1, high**1.1)
+    axis.set_ylim(-0.6, len(rows) - 0.4)
     axis.set_yticks(places, [name for name, _, _ in rows])
     axis.set_xlabel("after / before")
-    axis.set_title(title)
+    axis.text(1.02, 1.0, "before → after", va="bottom", fontsize=9, fontweight="bold", transform=axis.transAxes)
+    if title:
+        axis.set_title(title, loc="left", pad=24.0, fontsize="medium")
     axis.grid(False, axis="y")
+    legend_above(axis)
     return figure
 
 
 def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Figure:
     """The objective of every start (iterations, starts) over the iterations, the one numbered `best` bold."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
-    axis.plot(history, color=COLORS[0], lw=0.5, alpha=0.25)
+    axis.plot(history, color=GUIDE, lw=0.5, alpha=0.5)
+    axis.plot([], [], color=GUIDE, lw=0.8, label="other starts")
     axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
     axis.set_yscale("log" if np.nanmin(history) > 0.0 else "linear")
     axis.set_xlabel("iteration")
     axis.set_ylabel(label)
-    axis.legend()
+    legend_above(axis)
     return figure

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = [
     "CostPanel",
@@ -33,13 +33,16 @@ def tiers_chart(
 ) -> Figure:
     """Relative differences (n,) by name over the mass of a load (n,) kg; marks are hollow where `stable` (n,) is False."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
-    for color, (name, values) in zip(COLORS, differences.items(), strict=False):
-        axes.loglog(mass, values, color=color, label=name)
-        axes.loglog(mass[stable], values[stable], "o", color=color, ms=5)
-        axes.loglog(mass[~stable], values[~stable], "o", color=color, mfc="white", ms=5)
+    for color, mark, stroke, (name, values) in zip(
+        COLORS, MARKERS, itertools.cycle(STROKES), differences.items(), strict=False
+    ):
+        axes.loglog(mass, values, color=color, ls=stroke, marker=mark, ms=0.1, label=name)
+        axes.loglog(mass[stable], values[stable], mark, color=color, ms=5)
+        axes.loglog(mass[~stable], values[~stable], mark, color=color, mfc="white", ms=5)
+    axes.plot([], [], "o", color="black", mfc="white", label="hollow: unstable")
     axes.set_xlabel("mass of a load, kg")
     axes.set_ylabel("leading order against exact, relative")
-    axes.legend()
+    legend_above(axes)
     return figure
 
 
@@ -53,7 +56,7 @@ class CostPanel(NamedTuple):
     best: np.ndarray
 
 
-def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]) -> Figure:
+def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float], *, ax: Onto = None) -> Figure:
     """Relative error over seconds, a panel for each title, two in a row; a name has one look in all of them, told in one
     legend. Dotted lines at the errors that are `wanted`.
 
@@ -65,8 +68,8 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
     # Colours repeat after 8 and marks after 7, so that no two lines look alike.
     looks = {name: dict(color=COLORS[k % len(COLORS)], marker="os^Dv*P"[k % 7]) for k, name in enumerate(names)}
-    columns = min(2, len(panels_by_title))
-    figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4))
+    columns = len(panels_by_title) if ax is not None else min(2, len(panels_by_title))
+    figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4), ax=ax)
     for spare in cells[len(panels_by_title) :]:
         spare.set_axis_off()
     for axes, (title, panel) in zip(cells, panels_by_title.items(), strict=False):
@@ -75,7 +78,10 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     handles: list[Any] = [Line2D([], [], ms=5, **look) for look in looks.values()]  # pyright: ignore[reportArgumentType]
     handles += [Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"), Patch(color=_FLOOR)]
     told = ["cheapest within " + ", ".join(f"{error:.0e}" for error in wanted), "reference's own error"]
-    figure.legend(handles, [*names, *told], loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
+    if ax is None:
+        figure.legend(handles, [*names, *told], loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
+    else:
+        legend_above(cells[0], 2, handles=handles, labels=[*names, *told])
     return figure
 
 
@@ -115,7 +121,7 @@ def convergence_chart(
     axes.plot([], [], ls=(0, (3, 2)), lw=1.0, color="black", label="estimate")
     axes.set_xlabel("highest harmonic")
     axes.set_ylabel("relative error of the rotor speed")
-    axes.legend(title="loads at")
+    legend_above(axes, title="loads at")
     return figure
 
 
@@ -126,20 +132,23 @@ def stability_chart(
     marks: Mapping[str, np.ndarray],
     *,
     label: str,
+    unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Figure:
-    """Where `stable` (n, P) over load speed `omega` (n, P) rad/s and another number (n,), with marks (k, 2) by kind."""
+    """Where `stable` (n, P) over load speed `omega` (n, P) rad/s, drawn in `unit`, and another number (n,), with marks (k,
+    2) by kind.
+    """
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
     height = np.broadcast_to(value[:, None], omega.shape)
     if value.size > 1:
-        axes.contourf(omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])
+        axes.contourf(speed_scale(unit) * omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])
         axes.set_yscale("log" if value[0] > 0.0 and value[-1] > 3.0 * value[0] else "linear")
     for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
-        axes.plot(points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
+        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
-    axes.set_xlabel("speed of loads, rad/s")
+    axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    legend_above(axes)
     return figure
 
 
@@ -149,6 +158,8 @@ def audit_chart(
     uncertainty: np.ndarray,
     accuracy: float,
     added: np.ndarray,
+    *,
+    ax: Onto = None,
 ) -> Figure:
     """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`, grey
     what cannot be told, below the `uncertainty` (n,); and the operations that they add (n,), relative to those of the scene.
@@ -158,7 +169,7 @@ def audit_chart(
     'changes by, %'
     """
     n = len(labels)
-    figure, (left, right) = panels(1, 2, size=(6.0, 1.6 + 0.34 * max(n, 3)))
+    figure, (left, right) = panels(1, 2, size=(6.0, 1.6 + 0.34 * max(n, 3)), ax=ax)
     place = np.arange(n)
     shown = np.concatenate([100.0 * values for values in changes.values()] or [np.zeros(0)])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
@@ -176,7 +187,7 @@ def audit_chart(
     left.set_yticks(place, labels)
     left.set_ylim(n - 0.4, -0.6)
     left.set_xlabel("changes by, %")
-    left.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=3, fontsize=9)
+    legend_above(left, 3)
     right.barh(place, 100.0 * added, color=COLORS[0], height=0.55)
     right.set_yticks(place, [])
     right.set_ylim(n - 0.4, -0.6)
@@ -202,10 +213,10 @@ def steps_chart(
     for color, name, line, x, y in zip(itertools.cycle(COLORS), names, off, best, at_best, strict=False):
         axes.loglog(steps, np.maximum(line, floor), color=color, label=name)
         axes.loglog([x], [max(y, floor)], "o", color=color, mfc="none", ms=8)
-    axes.axhline(tolerance, color="black", ls=":", lw=1.2)
+    axes.axhline(tolerance, color="black", ls=":", lw=1.2, label="tolerance; rings: the best step")
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9)
+    legend_above(axes)
     return figure
 
 
@@ -259,5 +270,5 @@ def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Figu
     handles = [Line2D([], [], ls="", color="black", **look) for look in looks]
     handles += [Patch(color=COLORS[k % len(COLORS)]) for k in range(len(dtypes))]
     names = ["true", "claimed", "bound", "named status", "FAILED", *dtypes]
-    axes.legend(handles, names, loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=4, fontsize=8)
+    legend_above(axes, 4, handles=handles, labels=names)
     return figure

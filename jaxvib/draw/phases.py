@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import solid_and_dashed
-from jaxvib.draw.style import COLORS, UNSTABLE, panels, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["drag_diagram"]
 
@@ -26,7 +26,7 @@ def drag_diagram(
     at: float,
     jams: tuple[np.ndarray, np.ndarray] | None = None,
     within: float | None = None,
-    unit: str = "rad/s",
+    unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Figure:
     """Load speeds over the drag, log scale, of patterns (name, drag, speed, stable), (n,) each; the rotor's a level line.
@@ -44,13 +44,15 @@ def drag_diagram(
     scale = speed_scale(unit)
     figure, (axis,) = panels(1, size=(7.5, 4.6), ax=ax)
     colors = dict(zip(dict.fromkeys(name for name, *_ in branches), itertools.cycle(COLORS), strict=False))
+    marks = dict(zip(colors, MARKERS, strict=False))
     for name, drag, speed, stable in branches:
-        solid_and_dashed(axis, drag, scale * speed, stable, colors[name], widths=_WIDTHS)
+        solid_and_dashed(axis, drag, scale * speed, stable, colors[name], widths=_WIDTHS, marker=marks.get(name, ""))
     for name, color in colors.items():
-        axis.plot([], [], color=color, lw=_WIDTHS[0], label=name)
+        axis.plot([], [], color=color, lw=_WIDTHS[0], marker=marks.get(name, ""), ms=4.0, mfc="white", label=name)
+    axis.plot([], [], color="black", lw=_WIDTHS[0], label="stable")
     axis.plot([], [], color="black", ls=UNSTABLE, lw=_WIDTHS[1], label="unstable")
-    axis.axhline(scale * rotor_speed, color="black", lw=1.0, label="rotor")
-    axis.axvline(at, color="#999999", lw=0.9, ls=":", label="the scene's drag")
+    axis.axhline(scale * rotor_speed, color=GUIDE, lw=1.2, label="speed of the rotor")
+    axis.axvline(at, label="the scene's drag; points: its jams", **OPERATING)
     if jams is not None:
         speed, stable = jams
         for kind, face in ((~stable, "white"), (stable, "black")):
@@ -61,5 +63,5 @@ def drag_diagram(
     axis.set_ylim(0.0, 1.05 * scale * rotor_speed)
     axis.set_xlabel(label)
     axis.set_ylabel("speed of loads, " + unit)
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    legend_above(axis, 3)
     return figure

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, GUIDE, Onto, legend_above, panels
 
 __all__ = ["record_chart"]
 
 
-def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float) -> Figure:
+def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Figure:
     """Two panels over time (n,) s: recorded and fitted angle (n,) rad, in degrees, and fit minus record against 2 `noise`, rad.
 
     >>> import numpy as np
@@ -18,15 +18,16 @@ def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise:
     2
     """
     degrees = 180.0 / np.pi
-    figure, (top, bottom) = panels(2, size=(9.0, 2.6), share_x=True)
+    figure, (top, bottom) = panels(2, size=(9.0, 2.6), share_x=True, ax=ax)
     size = 4.0 if time.size < 800 else 2.0
     top.plot(time, degrees * fitted, color=COLORS[0], lw=0.8, label="fit")
     top.plot(time, degrees * angle, ".", color=COLORS[1], ms=size, label="record")
     top.set_ylabel("angle, deg")
-    top.legend(loc="upper right", ncols=2)
+    legend_above(top)
     bottom.plot(time, degrees * (fitted - angle), ".", color=COLORS[0], ms=2.5)
     for sign in (-2.0, 2.0):
-        bottom.axhline(sign * degrees * noise, color="#999999", lw=0.8, ls=":")
+        bottom.axhline(sign * degrees * noise, color=GUIDE, lw=0.9, ls=":", label="twice the noise" if sign > 0.0 else None)
+    legend_above(bottom)
     bottom.set_ylabel("fit - record, deg")
     bottom.set_xlabel("time, s")
     return figure

@@ -7,32 +7,55 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["regime_chart"]
 
 
-def regime_chart(drag: np.ndarray, shares: Mapping[str, np.ndarray], omega: np.ndarray, rotor_speed: float) -> Figure:
-    """Shares (nd,) of the kinds of motion as stacked areas, and speeds of the loads (nd, ns) rad/s, over drag (nd,) N s/m.
+HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
+"""Of areas that lie side by side, so that they are told apart in grey."""
+
+
+def regime_chart(
+    drag: np.ndarray,
+    shares: Mapping[str, np.ndarray],
+    omega: np.ndarray,
+    rotor_speed: float,
+    *,
+    unit: SpeedUnit = "rad/s",
+    ax: Onto = None,
+) -> Figure:
+    """Shares (nd,) of the kinds of motion as stacked areas, and speeds of the loads (nd, ns) rad/s, drawn in `unit`, over
+    drag (nd,) N s/m.
 
     >>> import numpy as np
     >>> figure = regime_chart(np.array([1.0, 2.0]), {"jammed": np.array([1.0, 0.5])}, np.ones((2, 3)), 2.0)
     >>> len(figure.axes)
     2
     """
-    figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True)
+    figure, (top, bottom) = panels(2, size=(7.5, 2.8), share_x=True, ax=ax)
+    scale = speed_scale(unit)
     width = 0.9 * np.min(np.diff(np.log(drag))) if len(drag) > 1 else 0.1
     low = np.zeros(len(drag))
     for k, (kind, share) in enumerate(shares.items()):
-        top.bar(drag, share, bottom=low, width=drag * width, color=COLORS[k % len(COLORS)], label=kind)
+        look = {"color": COLORS[k % len(COLORS)], "hatch": HATCHES[k % len(HATCHES)], "edgecolor": "white", "lw": 0.0}
+        top.bar(drag, share, bottom=low, width=drag * width, label=kind, **look)
         low = low + share
     top.set_ylabel("share of the starts")
     top.set_ylim(0.0, 1.0)
-    top.legend(ncols=len(shares), loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    bottom.plot(np.repeat(drag, omega.shape[1]), omega.ravel(), ".", color=COLORS[0], ms=4.0, alpha=0.6)
-    bottom.axhline(rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
-    bottom.set_ylabel("speed of loads, rad/s")
+    legend_above(top, len(shares))
+    bottom.plot(
+        np.repeat(drag, omega.shape[1]),
+        scale * omega.ravel(),
+        ".",
+        color=COLORS[0],
+        ms=4.0,
+        alpha=0.6,
+        label="loads, each start",
+    )
+    bottom.axhline(scale * rotor_speed, color="black", lw=1.0, ls="--", label="rotor")
+    bottom.set_ylabel(f"speed of loads, {unit}")
     bottom.set_xlabel("drag, N s/m")
     bottom.set_xscale("log")
-    bottom.legend(loc="best")
+    legend_above(bottom)
     return figure

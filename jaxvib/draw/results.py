@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = [
     "growth_chart",
@@ -16,6 +17,7 @@ __all__ = [
     "multiplier_chart",
     "phase_circles",
     "points_chart",
+    "shapes_chart",
     "signals_chart",
     "speeds_chart",
 ]
@@ -29,99 +31,196 @@ def modes_chart(
     resonances: np.ndarray | None = None,
     *,
     names: Sequence[str],
+    unit: SpeedUnit = "rad/s",
+    ax: Onto = None,
 ) -> Figure:
-    """Load speeds (k,) rad/s and amplitudes (k, nd) m over the numbers of modes (k,); filled where stable, resonances level;
-    `names` (nd,) of the coordinates, a colour each.
+    """Load speeds (k,) rad/s, drawn in `unit`, and amplitudes (k, nd) m, drawn in mm (tilts in mrad), over the numbers of modes
+    (k,); filled where stable, resonances level; `names` (nd,) of the coordinates, a mark and a colour each.
 
     >>> import numpy as np
     >>> figure = modes_chart(np.array([1, 2]), np.array([3.0, 4.0]), np.array([True, False]), np.ones((2, 1)), names=["y"])
     >>> figure.axes[1].get_ylabel()
-    'amplitude, m'
+    'amplitude, mm, zero to peak'
     """
-    figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True)
-    for axis, values in ((top, omega[:, None]), (bottom, amplitude)):
+    scale = speed_scale(unit)
+    figure, (top, bottom) = panels(2, size=(6.0, 2.6), share_x=True, ax=ax)
+    for axis, values in ((top, scale * omega[:, None]), (bottom, 1e3 * amplitude)):
         for k in range(values.shape[1]):
-            for kind, face in ((stable, COLORS[k % len(COLORS)]), (~stable, "white")):
-                axis.plot(mode[kind], values[kind, k], "o", mfc=face, mec=COLORS[k % len(COLORS)])
+            color, mark = COLORS[k % len(COLORS)], MARKERS[k % len(MARKERS)]
+            for kind, face in ((stable, color), (~stable, "white")):
+                axis.plot(mode[kind], values[kind, k], mark, mfc=face, mec=color)
     for k, name in enumerate(names):
-        bottom.plot([], [], "o", color=COLORS[k % len(COLORS)], label=name)
-    bottom.legend(loc="best")
+        bottom.plot([], [], MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)], label=name)
+    legend_above(bottom, 6)
     for k, w in enumerate(() if resonances is None else resonances):
-        top.axhline(w, color="#999999", lw=0.8, ls=":", label=None if k else "resonance")
-    if resonances is not None:
-        top.legend(loc="best")
-    top.set_ylabel("speed of loads, rad/s")
-    bottom.set_ylabel("amplitude, m")
-    bottom.set_xlabel("jam mode (hollow: unstable by slope)")
+        top.axhline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonance")
+    top.plot([], [], "o", color="black", label="stable by slope")
+    top.plot([], [], "o", color="black", mfc="white", label="unstable")
+    legend_above(top)
+    top.set_ylabel(f"speed of loads, {unit}")
+    bottom.set_ylabel("amplitude, mm, zero to peak")
+    bottom.set_xlabel("number of the jam mode")
     if np.any(amplitude > 0.0):
         bottom.set_yscale("log")
     bottom.set_xticks(mode)
     return figure
 
 
-def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Axes | None = None) -> Figure:
-    """Angles of loads (count,) rad as points on a circle, one circle for each (title, angles); `ax` only for a single one.
+def shapes_chart(
+    frequency: np.ndarray,
+    shape: np.ndarray,
+    *,
+    names: Sequence[str],
+    unit: SpeedUnit = "rad/s",
+    ax: Axes | None = None,
+) -> Figure:
+    """Mode shapes (k, nd) as bars, a group for each mode with its frequency (k,) rad/s, drawn in `unit`; `names` (nd,).
+
+    >>> import numpy as np
+    >>> shapes_chart(np.array([10.0]), np.ones((1, 2)), names=("y1", "y2")).axes[0].get_xticklabels()[0].get_text()
+    '10 rad/s'
+    """
+    figure, (axis,) = panels(1, size=(max(5.0, 1.4 * len(frequency)), 3.4), ax=ax)
+    many, width = len(names), 0.8 / len(names)
+    for k, name in enumerate(names):
+        places = np.arange(len(frequency)) + (k - 0.5 * (many - 1)) * width
+        look: Any = {
+            "color": COLORS[k % len(COLORS)],
+            "hatch": ("", "///", "...", "xxx")[k % 4],
+            "edgecolor": "white",
+            "lw": 0.0,
+        }
+        axis.bar(places, shape[:, k], width=0.94 * width, label=name, **look)
+    axis.axhline(0.0, color="black", lw=0.9)
+    axis.set_xticks(range(len(frequency)), [f"{speed_scale(unit) * w:.4g} {unit}" for w in frequency])
+    axis.set_ylim(-1.1, 1.1)
+    axis.set_ylabel("mode shape, relative")
+    axis.grid(False, axis="x")
+    legend_above(axis, 6)
+    return figure
+
+
+def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Figure:
+    """Angles of loads (count,) rad as points on a circle, and their mean as an arrow: 1 where all are together, 0 where they
+    cancel; one circle for each (title, angles), or one pair of `ax` each.
 
     >>> import numpy as np
     >>> len(phase_circles([("a", np.zeros(2)), ("b", np.ones(2))]).axes)
     2
     """
-    figure, axes = panels(1, max(len(sets), 1), size=(3.0, 3.2), ax=ax)
+    columns = max(len(sets), 1) if ax is not None else min(max(len(sets), 1), 4)
+    rows = 1 if ax is not None else -(-max(len(sets), 1) // columns)
+    figure, axes = panels(rows, columns, size=(3.0, 3.4), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
-    for axis in axes:
-        axis.plot(np.cos(turn), np.sin(turn), color="#999999", lw=0.8)
+    for k, axis in enumerate(axes):
         axis.set_aspect("equal")
-        axis.set_xticks([])
-        axis.set_yticks([])
-    for axis, (title, angles) in zip(axes, sets, strict=False):
-        for k, angle in enumerate(angles):
-            axis.plot(np.cos(angle), np.sin(angle), "o", color=COLORS[k % len(COLORS)], label=f"load {k + 1}")
-        axis.set_title(title)
-        axis.legend(loc="center")
+        axis.set_xlim(-1.8, 1.8)
+        axis.set_ylim(-1.7, 1.7)
+        axis.set_axis_off()
+        if k >= len(sets):
+            continue
+        title, angles = sets[k]
+        axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9)
+        for degrees in range(0, 360, 45):
+            e = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+            tick = np.outer(e, [0.96, 1.04])
+            axis.plot(tick[0], tick[1], color=GUIDE, lw=0.9)
+            if degrees % 90 == 0:
+                axis.text(
+                    1.55 * float(e[0]),
+                    1.5 * float(e[1]),
+                    f"{degrees}°",
+                    ha="center",
+                    va="center",
+                    fontsize="small",
+                    color="#555555",
+                )
+        _loads_on_circle(axis, angles)
+        mean = np.mean(np.exp(1j * angles)) if angles.size else 0.0
+        if abs(mean) > 0.02:
+            arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": "black", "shrinkA": 0.0, "shrinkB": 0.0}
+            axis.annotate("", (np.real(mean), np.imag(mean)), (0.0, 0.0), arrowprops=arrow)
+        axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
+        axis.set_title(f"{title}\nresultant {round(float(abs(mean)), 3):g}", fontsize="medium")
     return figure
 
 
+def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
+    """Points with the numbers of the loads, those at one angle named together."""
+    order = np.argsort(np.mod(angles + 1e-6, 2.0 * np.pi))
+    groups: list[list[int]] = []
+    for k in order:
+        near = groups and abs(np.exp(1j * angles[k]) - np.exp(1j * angles[groups[-1][-1]])) < 0.12
+        groups = [*groups[:-1], [*groups[-1], int(k)]] if near else [*groups, [int(k)]]
+    for group in groups:
+        for j in group:
+            look = {"mfc": COLORS[j % len(COLORS)], "mec": "black", "ms": 9.0, "zorder": 3 + 0.01 * j}
+            axis.plot([np.cos(angles[j])], [np.sin(angles[j])], MARKERS[j % len(MARKERS)], **look)
+        e = np.mean(np.exp(1j * angles[group]))
+        names = ", ".join(str(j + 1) for j in sorted(group)) if len(group) < 5 else f"{len(group)} loads"
+        place = 1.2 * e / abs(e)
+        box = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8}
+        axis.text(
+            float(np.real(place)), float(np.imag(place)), names, ha="center", va="center", fontsize="small", zorder=4, bbox=box
+        )
+
+
 def speeds_chart(
-    rows: Sequence[tuple[str, np.ndarray]], spans: Sequence[tuple[str, np.ndarray]] = (), *, ax: Axes | None = None
+    rows: Sequence[tuple[str, np.ndarray]],
+    spans: Sequence[tuple[str, np.ndarray]] = (),
+    *,
+    unit: SpeedUnit = "rad/s",
+    ax: Axes | None = None,
 ) -> Figure:
-    """Speeds (n,) rad/s as points on a level line for each (label, speeds), then intervals (n, 2) as bars; what is no finite
-    number is left out, an interval without an end goes to the edge.
+    """Speeds (n,) rad/s as points with their values on a level line for each (label, speeds), then intervals (n, 2) as bars,
+    drawn in `unit`; what is no finite number is left out, an interval without an end goes to the edge.
 
     >>> import numpy as np
     >>> figure = speeds_chart([("resonances", np.array([1.0, np.nan]))], [("balancing", np.array([[1.0, np.inf]]))])
     >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
     ['balancing', 'resonances']
     """
-    figure, (axis,) = panels(1, size=(7.0, 0.5 * (len(rows) + len(spans)) + 1.0), ax=ax)
-    values = np.concatenate([np.ravel(x) for _, x in (*rows, *spans)])
+    scale = speed_scale(unit)
+    figure, (axis,) = panels(1, size=(7.0, 0.55 * (len(rows) + len(spans)) + 1.0), ax=ax)
+    values = scale * np.concatenate([np.ravel(x) for _, x in (*rows, *spans)])
     top = 1.15 * np.max(values[np.isfinite(values)], initial=1e-300)
     heights = np.arange(len(rows) + len(spans))[::-1]
     for height, (k, (_, speeds)) in zip(heights, enumerate(rows), strict=False):
-        axis.plot(speeds, np.full(np.shape(speeds), height), "o", color=COLORS[k % len(COLORS)])
+        axis.plot(scale * speeds, np.full(np.shape(speeds), height), MARKERS[k % len(MARKERS)], color=COLORS[k % len(COLORS)])
+        last = -np.inf
+        for w in np.sort(scale * np.ravel(speeds)[np.isfinite(np.ravel(speeds))]):
+            if w - last > 0.06 * top:
+                below = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center", "fontsize": "small"}
+                axis.annotate(f"{w:.4g}", (w, height), **below)
+                last = w
     for height, (k, (_, intervals)) in zip(heights[len(rows) :], enumerate(spans), strict=True):
-        for start, end in intervals[~np.isnan(intervals[:, 0])]:
-            axis.barh(height, min(end, top) - start, left=start, height=0.5, color=COLORS[k % len(COLORS)], alpha=0.6)
+        for start, end in scale * intervals[~np.isnan(intervals[:, 0])]:
+            hatch = {"color": COLORS[(k + 2) % len(COLORS)], "hatch": ("", "///")[k % 2], "edgecolor": "white", "lw": 0.0}
+            axis.barh(height, min(end, top) - start, left=start, height=0.5, **hatch)
     labels = [label for label, _ in (*rows, *spans)]
     axis.set_yticks(heights[::-1], labels[::-1])
+    axis.set_ylim(-0.6, len(labels) - 0.3)
     axis.set_xlim(0.0, top)
-    axis.set_xlabel("speed, rad/s")
+    axis.set_xlabel(f"speed, {unit}")
     return figure
 
 
-def signals_chart(x: np.ndarray, signals: Sequence[tuple[str, np.ndarray]], *, across: str) -> Figure:
-    """One panel for each (label with unit, values (n, k)), over x (n,), which `across` labels.
+def signals_chart(
+    x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, across: str, ax: Onto = None
+) -> Figure:
+    """One panel for each (label with unit, values (n, k), k names), over x (n,), which `across` labels.
 
     >>> import numpy as np
-    >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)))], across="time, s").axes)
+    >>> len(signals_chart(np.arange(3.0), [("angle, rad", np.ones((3, 1)), ["load"])], across="time, s").axes)
     1
     """
-    figure, axes = panels(len(signals), size=(7.5, 2.2), share_x=True)
-    for axis, (label, values) in zip(axes, signals, strict=True):
-        for k in range(values.shape[1]):
-            axis.plot(x, values[:, k], color=COLORS[k % len(COLORS)], label=str(k + 1))
+    figure, axes = panels(len(signals), size=(7.5, 2.2), share_x=True, ax=ax)
+    for axis, (label, values, names) in zip(axes, signals, strict=True):
+        for k, name in enumerate(names):
+            axis.plot(x, values[:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], label=name)
         axis.set_ylabel(label)
-        if values.shape[1] > 1:
-            axis.legend(loc="upper right", ncols=min(values.shape[1], 6))
+        if len(names) > 1:
+            legend_above(axis, 6)
     axes[-1].set_xlabel(across)
     return figure
 
@@ -135,7 +234,8 @@ def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = 
     """
     figure, (axis,) = panels(1, size=(7.0, 3.2), ax=ax)
     for k in range(values.shape[1]):
-        axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], ".", color=COLORS[k % len(COLORS)])
+        mark = MARKERS[k % len(MARKERS)]
+        axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=COLORS[k % len(COLORS)])
     axis.set_xlabel(across)
     axis.set_ylabel(up)
     return figure
@@ -150,8 +250,16 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Figu
     """
     figure, (axis,) = panels(1, size=(4.0, 4.0), ax=ax)
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
-    axis.plot(np.cos(turn), np.sin(turn), color="#999999", lw=0.8)
-    axis.plot(np.real(multipliers), np.imag(multipliers), "o", color=COLORS[0], ms=4.0)
+    axis.plot(np.cos(turn), np.sin(turn), color=GUIDE, lw=0.9, label="limit of stability")
+    inside = np.abs(multipliers) <= 1.0
+    for kind, look in ((inside, {"color": COLORS[0]}), (~inside, {"color": COLORS[1], "marker": "X"})):
+        name = f"{int(np.sum(kind))} {'decay' if kind is inside else 'grow'}"
+        axis.plot(
+            np.real(multipliers[kind]),
+            np.imag(multipliers[kind]),
+            **{"marker": "o", "ls": "", "ms": 5.0, "label": name, **look},
+        )
+    legend_above(axis, 3)
     axis.set_aspect("equal")
     axis.set_xlabel("real part")
     axis.set_ylabel("imaginary part")
@@ -164,9 +272,9 @@ def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertain
     axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each stretch")
     half = time[time.size // 2 :]
     axes.fill_between(half[[0, -1]], exponent - uncertainty, exponent + uncertainty, color=COLORS[1], alpha=0.3, lw=0.0)
-    axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], label="exponent")
+    axes.plot(half[[0, -1]], [exponent, exponent], color=COLORS[1], ls="--", label="exponent, with its standard error")
     axes.axhline(0.0, color="black", lw=0.8)
     axes.set_xlabel("time, s")
     axes.set_ylabel("growth of disturbances, 1/s")
-    axes.legend()
+    legend_above(axes)
     return figure

@@ -4,64 +4,169 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxvib.errors import InputError
 
-__all__ = ["COLORS", "UNSTABLE", "panels", "speed_scale"]
+__all__ = [
+    "COLORS",
+    "GUIDE",
+    "MARKERS",
+    "OPERATING",
+    "STROKES",
+    "UNSTABLE",
+    "Onto",
+    "SpeedUnit",
+    "legend_above",
+    "legend_outside",
+    "load_names",
+    "numbered",
+    "panels",
+    "speed_scale",
+]
 
-COLORS = ("#1f5aa6", "#c8501e", "#2d8a4e", "#7a4fa3", "#b8860b", "#555555", "#0f8b8d", "#a8324a")
-"""Colours told apart by every reader; further series start over."""
+SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
+"""In what speeds are drawn."""
+
+Onto: TypeAlias = "Axes | Sequence[Axes] | None"
+"""The axes that a figure goes onto: one, or as many as it has panels; None for a figure of its own."""
+
+COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
+"""Colours that readers with any colour vision tell apart, and of unlike greys where they follow each other; further series
+start over."""
+
+MARKERS = "osD^vPX*"
+STROKES = ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+"""Marks and strokes of series, so that they are told apart without colours too."""
 
 UNSTABLE = (0, (3, 2))
 """The dashes of what is not stable."""
 
+GUIDE = "#8a8a8a"
+"""The colour of lines that are no data: resonances, limits, the speed of the rotor."""
+
+OPERATING: Any = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
+"""The line of the speed at which the machine runs."""
+
 _STYLE: Any = {
     "font.size": 10.0,
     "axes.grid": True,
-    "grid.color": "#dddddd",
+    "grid.color": "#e2e2e2",
     "grid.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
     "lines.linewidth": 1.4,
-    "legend.frameon": False,
     "figure.constrained_layout.use": True,
-    "savefig.dpi": 150,
+    "figure.dpi": 130,
 }
+
+_SCALES = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
 def speed_scale(unit: str) -> float:
-    """By what speeds in rad/s are multiplied to be drawn in `unit`. **Raises** `InputError` but for "rad/s" and "rpm".
+    """By what speeds in rad/s are multiplied to be drawn in `unit`. **Raises** `InputError` but for "rad/s", "rpm" and "Hz".
 
     >>> round(speed_scale("rpm"), 3)
     9.549
     """
-    if unit not in ("rad/s", "rpm"):
-        raise InputError("unit", f"is {unit!r}; it must be 'rad/s' or 'rpm'")
-    return 30.0 / math.pi if unit == "rpm" else 1.0
+    if unit not in _SCALES:
+        raise InputError("unit", f"is {unit!r}; it must be one of 'rad/s', 'rpm', 'Hz'")
+    return _SCALES[unit]
 
 
 def panels(
-    rows: int, columns: int = 1, *, size: Sequence[float] = (7.0, 3.0), share_x: bool = False, ax: Axes | None = None
+    rows: int,
+    columns: int = 1,
+    *,
+    size: Sequence[float] = (7.0, 3.0),
+    widths: Sequence[float] | None = None,
+    share_x: bool | Literal["col"] = False,
+    polar: bool = False,
+    ax: Onto = None,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `rows` x `columns` axes in the house's style, `size` inches each; with `ax` those axes and their figure.
+    """A figure with `rows` x `columns` axes in the house's style, `size` inches each, columns as wide as `widths` say; with
+    `ax` those axes and their figure.
 
-    **Returns** the figure and its axes.
+    **Returns** the figure and its axes. **Raises** `InputError` for `ax` that are no axes, or not as many as there are panels.
 
     >>> figure, axes = panels(2)
     >>> len(axes)
     2
     """
     if ax is not None:
-        return ax.figure.figure, [ax]
+        given = [ax] if isinstance(ax, Axes) else list(np.ravel(np.asarray(ax, dtype=object)))
+        if not all(isinstance(each, Axes) for each in given):
+            raise InputError("ax", f"is {ax!r}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
+        if len(given) != rows * columns:
+            raise InputError("ax", f"has {len(given)} axes; this figure has {rows * columns} panels, give as many")
+        return given[0].figure.figure, given
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(size[0] * columns, size[1] * rows))
         FigureCanvasAgg(figure)
-        grid = figure.subplots(rows, columns, squeeze=False, sharex=share_x)
+        look = {"projection": "polar"} if polar else None
+        grid = figure.subplots(
+            rows, columns, squeeze=False, sharex=share_x, width_ratios=None if widths is None else [*widths], subplot_kw=look
+        )
     return figure, list(grid.ravel())
+
+
+def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
+    """The legend of a panel above it, where it covers no data; none where nothing has a label."""
+    _, names = axis.get_legend_handles_labels()
+    if not names and "handles" not in options:
+        return
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2, "columnspacing": 1.2, "handlelength": 2.2}
+    axis.legend(**{**place, "ncols": columns, "frameon": False, "fontsize": "small", **options})
+
+
+def load_names(count: int) -> list[str | None]:
+    """Names for the legend of as many loads; of more than eight, whose colours start over, the first alone speaks for all."""
+    if count == 1:
+        return ["load"]
+    return [f"load {k + 1}" for k in range(count)] if count <= len(COLORS) else [f"{count} loads", *[None] * (count - 1)]
+
+
+def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str], filled: Sequence[bool]) -> None:
+    """Points at one `x` with their names to the right, those in one text whose points nearly touch; filled or hollow.
+
+    Call it when the limits of the axes are set: what lies outside of them is left out.
+    """
+    low, high = axis.get_ylim()
+    inside = sorted((k for k, y in enumerate(heights) if np.isfinite(y) and low <= y <= high), key=lambda k: heights[k])
+    to_share = axis.transScale + axis.transLimits
+    shares = {k: float(to_share.transform((x, heights[k]))[1]) for k in inside}
+    groups: list[list[int]] = []
+    for k in inside:
+        axis.plot([x], [heights[k]], "o", ms=4.5, mfc="black" if filled[k] else "white", mec="black", zorder=4)
+        # Near the last of a group, whose text shall not be far from its first.
+        share, (first, last) = shares[k], (shares[groups[-1][0]], shares[groups[-1][-1]]) if groups else (-1.0, -1.0)
+        near = share - last < 0.045 and share - first < 0.09
+        groups = [*groups[:-1], [*groups[-1], k]] if near else [*groups, [k]]
+    for group in groups:
+        share = np.mean([shares[k] for k in group])
+        axis.annotate(
+            ", ".join(sorted({names[k] for k in group})),
+            (x, to_share.inverted().transform((0.0, float(share)))[1]),
+            xytext=(6, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize="small",
+            fontweight="bold",
+            zorder=5,
+            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+        )
+
+
+def legend_outside(figure: Figure, axes: Sequence[Axes], columns: int, **options: Any) -> None:
+    """One legend for several panels of a figure, above all of them; each name once."""
+    named = {name: handle for axis in axes for handle, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        [*named.values()], [*named], loc="outside upper left", ncols=columns, frameon=False, fontsize="small", **options
+    )

@@ -63,6 +63,11 @@ class Carrier(eqx.Module):
         """
         return self.coordinate_units or ("m",) * len(self.coordinates)
 
+    @property
+    def bed_directions(self) -> tuple[str, ...]:
+        """A name for each direction of the force on the bed: "up", or "across" and "up"."""
+        return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
+
     def port_at(self, distance: Array | float) -> Array:
         """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""
         return self.port if self.tilt is None else self.port + distance * self.tilt
@@ -88,6 +93,11 @@ class Machine(eqx.Module):
     @abc.abstractmethod
     def carrier(self) -> Carrier:
         """The machine as a linear structure, see `Carrier`."""
+
+    def supports(self) -> list[tuple[float, float, float]] | None:
+        """Where along a rotor's axis supports stand, for a drawing: distance from the mass centre m, stiffness N/m, damping
+        N s/m; None where the matrices say all there is to draw."""
+        return None
 
     def structure(self) -> Carrier:
         """The carrier's names, directions and shapes, without computing its numbers."""

@@ -86,6 +86,10 @@ class Rotor(Machine):
             cg_offset=-self.stations if shared else None,
         )
 
+    def supports(self) -> list[tuple[float, float, float]]:
+        """The two supports."""
+        return list(zip(self.position.tolist(), self.stiffness.tolist(), self.damping.tolist(), strict=True))
+
 
 def rotor(
     *,

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import SpeedUnit
+
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
@@ -99,14 +101,16 @@ class Ensemble(Result):
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """The mean speed of each load, over the runs.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """The mean speed of each load in `unit`, over the runs.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
+        from jaxvib.draw.style import speed_scale
 
-        return points_chart(np.asarray(self.load_speed), across="run", up="speed of loads, rad/s", ax=ax)
+        speeds = speed_scale(unit) * np.asarray(self.load_speed)
+        return points_chart(speeds, across="run", up=f"speed of loads, {unit}", ax=ax)
 
 
 @refuse_former(steps=FORMER["steps"])

@@ -14,18 +14,23 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import normal_force
+from jaxvib.errors import InputError
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
 from jaxvib.motion.analysis.regime import Regime, regime
+from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Onto, SpeedUnit
 
 __all__ = ["Run", "RunStatus"]
 
@@ -122,23 +127,58 @@ class Run(AbstractMeasured, Result):
             return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
         return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
 
-    def plot(self) -> Figure:
-        """Time histories: platforms, load speeds against the rotor's, foundation force; the window if nothing else was kept.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """Time histories: platforms, load speeds against the rotor's, foundation force. To the left the whole run as bands
+        between its peaks (the window if nothing else was kept), to the right its last three periods, where phases are seen.
 
-        **Returns** a matplotlib figure.
+        **Arguments**: `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto, as many as there are panels, by rows.
+
+        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for another unit or
+        number of axes.
         """
-        from jaxvib.draw.charts import time_histories  # slow to import: only who draws pays
+        from jaxvib.draw.motion.histories import time_histories  # slow to import: only who draws pays
 
-        kept = self.window if self.trajectory is None else self.trajectory
-        return time_histories(
-            np.asarray(kept.time),
-            np.asarray(kept.state.displacement),
-            np.asarray(kept.state.azimuth_rate),
-            np.asarray(kept.foundation_force),
-            np.asarray(kept.rotor_speed),
-            names=self.scene.machine.structure().coordinates,
-            units=self.scene.machine.structure().units,
+        structure = self.scene.machine.structure()
+        whole, end = (
+            [np.asarray(x) for x in (t.time, t.state.displacement, t.state.azimuth_rate, t.rotor_speed, t.foundation_force)]
+            for t in (self.window if self.trajectory is None else self.trajectory, self.window)
         )
+        named = dict(names=structure.coordinates, units=structure.units, directions=structure.bed_directions)
+        return time_histories(whole, end, **named, unit=unit, ax=ax)
+
+    def spectrum(self, parts: int = 1) -> Spectrum:
+        """Which frequencies the motion holds: over the window, or from piece to piece over `parts` pieces of the whole run,
+        each of which shares its halves with its neighbours.
+
+        **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked. **Raises** `InputError` for
+        more parts than there are samples for, and for several where the run kept its window only.
+        """
+        return spectrum_of(self.scene, self.window, self.trajectory, parts)
+
+    def plot_path(self, *, ax: Axes | None = None) -> Figure:
+        """The path of a rotor's axis across and up over the last three periods, mm; of one that tilts at every station.
+
+        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for a machine that moves
+        up and down only.
+        """
+        from jaxvib.draw.motion.histories import last_periods  # slow to import: only who draws pays
+        from jaxvib.draw.motion.spectra import path_chart
+
+        carrier = self.scene.machine.carrier()
+        if carrier.axes != (0, 1):
+            kind = self.scene.machine.kind
+            raise InputError(
+                "machine.kind", f"is {kind!r}, which moves up and down only; a path needs a rotor such as rotor(...)"
+            )
+        moved = np.asarray(self.window.state.displacement)
+        moved = moved[last_periods(np.asarray(self.window.time), moved)]
+        places = {0.0} if carrier.stations is None else {float(s) for s in np.asarray(carrier.stations)}
+        named = {
+            "axis of the loads" if len(places) == 1 else f"axis at {1e3 * s:+.4g} mm": carrier.port_at(s)
+            for s in sorted(places)
+        }
+        paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
+        return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
 
 
 _FIRST_STATUSES = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")

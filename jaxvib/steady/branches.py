@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, overload
 
 import equinox as eqx
@@ -26,6 +27,7 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
     from jaxvib.steady.orbits.diagram import ExactBranches
 
 __all__ = ["Branches", "branches"]
@@ -50,18 +52,28 @@ class Branches(AbstractJam):
         )
         return branch_summary(self, [("fold", w, n) for w, n in folds], JUDGED)
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
-        """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
+    def plot(
+        self,
+        *,
+        unit: SpeedUnit = "rad/s",
+        most: float | None = None,
+        show: Sequence[str] = ("speed", "amplitude", "force"),
+        ax: Onto = None,
+    ) -> Figure:
+        """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed;
+        where the scene's rotor speed crosses them, jams stand with the numbers of their modes.
 
-        **Arguments**: `unit` of the speeds on the axes; `most` the greatest rotor speed shown, rad/s (a third above the
-        scene's unless said otherwise).
+        **Arguments**: `unit` of the speeds on the axes, "rad/s", "rpm" or "Hz"; `most` the greatest rotor speed shown, rad/s (a
+        third above the scene's unless said otherwise); `show` which panels, such as `("force",)`; `ax` axes to draw onto, as
+        many as there are panels.
 
-        **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for another unit, panel or
+        number of axes.
         """
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
-        return picture(self, marks, unit, most, JUDGED)
+        return picture(self, marks, unit, most, JUDGED, show, ax, np.asarray(self.mode))
 
 
 @overload

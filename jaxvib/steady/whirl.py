@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import SpeedUnit
+
 __all__ = ["CriticalSpeeds", "Whirl", "critical_speeds", "whirl"]
 
 Weights = Literal["fixed", "none"]
@@ -51,15 +53,15 @@ class CriticalSpeeds(Result):
         lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
         return "\n".join(lines) or "no critical speed"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """Forward and backward critical speeds, on a line each.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """Forward and backward critical speeds, on a line each, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         speed, forward = np.asarray(self.speed), np.asarray(self.forward)
-        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])], ax=ax)
+        return speeds_chart([("forward", speed[forward]), ("backward", speed[~forward])], unit=unit, ax=ax)
 
 
 class Whirl(Result):
@@ -86,14 +88,17 @@ class Whirl(Result):
             lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
         return "\n".join([*lines, self.critical.summary()])
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, and the synchronous line.
+    def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, the synchronous line with the
+        critical speeds on it, and the speed `at` which the rotor runs, rad/s, where it is given. Speeds are drawn in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
 
-        return campbell_diagram(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), ax=ax)
+        critical = (np.asarray(self.critical.speed), np.asarray(self.critical.forward))
+        whirls = map(np.asarray, (self.rotor_speed, self.speed, self.forward))
+        return campbell_diagram(*whirls, critical=critical, at=at, unit=unit, ax=ax)
 
 
 def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:

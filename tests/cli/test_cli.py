@@ -67,7 +67,7 @@ def test_modes_of_a_rotor_are_its_jams_at_any_phases(typed, tmp_path):
     np.testing.assert_allclose([jam["omega"] for jam in document["phase_jams"]], [412.8, 199.4, 164.6], atol=0.05)
     assert [jam["pattern"] for jam in document["phase_jams"] if jam["stable"]] == ["together"]
     assert (tmp_path / "o" / "phases.png").stat().st_size > 10_000
-    assert "loads can stay jammed at 164.63 rad/s (together)" in typed("modes", "rotor.toml")[1]
+    assert "loads can stay jammed at 164.63 rad/s (all together)" in typed("modes", "rotor.toml")[1]
     (tmp_path / "stations.toml").write_text(TEMPLATES["rotor"])
     for words in (("modes", "--exact"), ("criterion",)):
         code, out, err = typed(words[0], "stations.toml", *words[1:])
@@ -297,3 +297,27 @@ def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
         "assert not any(m.startswith(('jaxvib.cli', 'click', 'pint')) for m in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
+    code, out, err = typed("sketch", "machine.toml", "--out", "a")
+    assert code == 0 and (tmp_path / "a" / "sketch.png").stat().st_size > 10_000, err
+    small = ["--seconds", "0.5", "--width", "3", "--end", "0.05s"]
+    code, out, err = typed("animate", "machine.toml", "--mode", "3", *small, "--out", "a", "--json")
+    assert code == 0 and json.loads(out) == {"pictures": 10, "fps": 20.0, "begin": 0.0, "end": pytest.approx(0.045)}, err
+    assert (tmp_path / "a" / "animation.gif").exists() and "<script>" in (tmp_path / "a" / "animation.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["animate", "machine.toml", "--until", "1s"], "--out is missing; name the folder"),
+        (["sketch", "machine.toml"], "--out is missing; name the folder"),
+        (["animate", "machine.toml", "--out", "a"], "--until is missing; say how long to simulate, or by --mode"),
+        (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until goes, as --start and --mode, with a scene file"),
+        (["animate", "missing.npz", "--out", "a"], "there is no such file"),
+    ],
+)
+def test_films_that_cannot_be_made(typed, words, says):
+    code, _, err = typed(*words)
+    assert code == 2 and says in err

@@ -18,6 +18,8 @@ from jaxvib.results.result import Result
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
+
 __all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
 
 
@@ -85,13 +87,18 @@ class Envelope(AbstractMeasured, Result):
             ]
         )
 
-    def plot(self) -> Figure:
-        """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time. **Returns** a figure."""
-        from jaxvib.draw.charts import time_histories
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time; arguments as
+        `Run.plot`.
+        """
+        from jaxvib.draw.motion.histories import amplitude_histories  # slow to import: only who draws pays
 
-        kept = self.window if self.trajectory is None else self.trajectory
-        return time_histories(
+        kept, structure = self.window if self.trajectory is None else self.trajectory, self.scene.machine.structure()
+        return amplitude_histories(
             *map(np.asarray, (kept.time, kept.amplitude, kept.load_speed, kept.foundation_force, kept.rotor_speed)),
-            names=self.scene.machine.structure().coordinates,
-            units=self.scene.machine.structure().units,
+            names=structure.coordinates,
+            units=structure.units,
+            directions=structure.bed_directions,
+            unit=unit,
+            ax=ax,
         )

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import SpeedUnit
+
 __all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
 
 
@@ -66,16 +68,17 @@ class Criterion(Result):
         lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """Characteristic speeds with damping, and the intervals between them.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """Characteristic speeds with damping, and the intervals between them, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         rows = [("resonances", self.speeds.damped_resonances), ("additional", self.speeds.damped_additional)]
         spans = [("balancing", self.balancing), ("gathering", self.gathering)]
-        return speeds_chart(*([(label, np.asarray(values)) for label, values in group] for group in (rows, spans)), ax=ax)
+        drawn = ([(label, np.asarray(values)) for label, values in group] for group in (rows, spans))
+        return speeds_chart(*drawn, unit=unit, ax=ax)
 
 
 def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = None) -> Array:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import SpeedUnit
+
 __all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
 
 _POINTS = 24
@@ -87,16 +89,16 @@ class CharacteristicSpeeds(Result):
             lines.append(line)
         return "\n".join(lines)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """Resonances and additional speeds, without and with damping, on a line each.
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """Resonances and additional speeds, without and with damping, on a line each, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
         rows = [("resonances", self.resonances), ("additional", self.additional)]
         rows += [("damped resonances", self.damped_resonances), ("damped additional", self.damped_additional)]
-        return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows], ax=ax)
+        return speeds_chart([(label, np.asarray(speeds)) for label, speeds in rows], unit=unit, ax=ax)
 
 
 def port_receptance(scene: Scene, omega: Array) -> Array:

@@ -28,6 +28,8 @@ from jaxvib.steady.balance.stability import BalancedStability
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = [
     "BalanceStatus",
     "BalancedStates",
@@ -95,11 +97,11 @@ class BalancedStates(Result):
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
         return "\n".join([self.message, *rows, directions])
 
-    def plot(self) -> Figure:
-        """The arrangements in the frame of the rotor, a circle each. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """The arrangements in the rotor's frame, a circle each, onto axes `ax` if given. **Returns** a matplotlib figure."""
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 
-        return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)])
+        return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
 
 
 def balanced_states(scene: Scene) -> BalancedStates:

@@ -25,6 +25,8 @@ from jaxvib.units import traced
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
+
 __all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
 
 JUDGED = "by slope, for light loads that stay together"
@@ -83,9 +85,11 @@ class Jam(AbstractJam):
             return "loads cannot stay together"
         return f"{'stable' if self.stable else 'unstable'} by slope"
 
-    def plot(self) -> Figure:
-        """The speed of the loads and the amplitudes. **Returns** a matplotlib figure."""
-        return _modes_chart(jax.tree.map(lambda leaf: leaf[None], self), None)
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """The speed of the loads in `unit`, and the amplitudes; onto two axes `ax` if given. **Returns** a matplotlib
+        figure.
+        """
+        return _modes_chart(jax.tree.map(lambda leaf: leaf[None], self), None, unit, ax)
 
 
 class JamModes(AbstractJam):
@@ -135,17 +139,20 @@ class JamModes(AbstractJam):
         lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
         return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
 
-    def plot(self) -> Figure:
-        """Speeds of the loads among the resonances, and amplitudes, by mode. **Returns** a matplotlib figure."""
-        return _modes_chart(self, self.resonances)
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """Speeds of the loads in `unit` among the resonances, and amplitudes, by mode; onto two axes `ax` where they are given.
+
+        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        """
+        return _modes_chart(self, self.resonances, unit, ax)
 
 
-def _modes_chart(jams: AbstractJam, resonances: Array | None) -> Figure:
+def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Figure:
     from jaxvib.draw.results import modes_chart  # slow to import: only who draws pays
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))
     among = None if resonances is None else np.asarray(resonances)
-    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates)
+    return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates, unit=unit, ax=ax)
 
 
 def jam_modes(scene: Scene) -> JamModes:

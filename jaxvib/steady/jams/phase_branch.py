@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,6 +17,8 @@ from jaxvib.steady.jams.phases import PhaseStatus
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
 
 __all__ = ["PhaseBranch", "drag_curve"]
 
@@ -59,7 +61,7 @@ class PhaseBranch(Result):
             f"{np.max(factor[there]):.4g} times the scene's drag"
         )
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
         """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
         solid, unstable dashed.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, overload
+from typing import TYPE_CHECKING, overload
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.linalg import damped_newton
 from jaxvib.results.fields import in_unit
+from jaxvib.results.status import sentence
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phases import (
@@ -37,6 +38,8 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
 
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
@@ -81,7 +84,7 @@ class PhaseJams(AbstractPhaseJam):
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
         """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
         scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
 
@@ -101,7 +104,7 @@ class PhaseJams(AbstractPhaseJam):
                 for _, other, _, _ in curves:
                     # Dashes on other dashes would look like a line that is not broken.
                     factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE * factor), np.nan, factor)
-                curves.append((jam.pattern_label, factor, at, stable))
+                curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
         label = "drag, times the scene's"
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit, ax=ax)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "growth_apart", "phase_jam", "phase_torques"]
+__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_apart", "phase_jam", "phase_torques"]
 
 _NEAR = 0.02
 """Relative distance of load speeds up to which two theories speak of the same jam."""
@@ -41,6 +42,15 @@ class PhaseStatus(eqx.Enumeration):
     with_rotor = "the loads turn with the rotor and leave it at rest: they balance, and are not jammed"
     not_converged = "no jam was found from this start"
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+
+
+def degrees(angle: float) -> float:
+    """An angle in rad in degrees, for a person to read: what rounding leaves of 0 is 0.
+
+    >>> degrees(2.5e-19), degrees(3.141592653589793)
+    (0.0, 180.0)
+    """
+    return round(math.degrees(angle), 9) + 0.0
 
 
 class AbstractPhaseJam(Result):
@@ -80,7 +90,7 @@ class PhaseJam(AbstractPhaseJam):
         """A line a person can read; phases in degrees."""
         if not np.isfinite(self.omega):
             return self.message
-        phases = ", ".join(f"{np.rad2deg(float(a)):.4g}" for a in self.phase)
+        phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phase)
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
         return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from jax import Array
@@ -14,7 +14,9 @@ from jaxvib.machine.scene import Scene
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["branch_summary", "picture"]
+    from jaxvib.draw.style import Onto, SpeedUnit
+
+__all__ = ["MARKS", "branch_summary", "picture"]
 
 
 class _Branch(Protocol):
@@ -22,6 +24,7 @@ class _Branch(Protocol):
 
     omega: Array
     rotor_speed: Array
+    slope: Array
     stable: Array
     amplitude: Array
     foundation_force: Array
@@ -41,15 +44,32 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], j
     return "\n".join([*lines, *(f"  {kind}: Omega {w:.6g} rad/s, rotor {n:.6g} rad/s" for kind, w, n in names)])
 
 
+MARKS = {
+    "fold": "fold: the jam ends, the loads jump",
+    "torus": "torus: the jam begins to pulsate",
+    "symmetry": "symmetry lost: loads part, or half-turns differ",
+    "period_doubling": "period doubles",
+}
+"""What special points mean, for a legend."""
+
+
 def picture(
-    branch: _Branch, marks: Sequence[tuple[str, float, float]], unit: Literal["rad/s", "rpm"], most: float | None, judged: str
+    branch: _Branch,
+    marks: Sequence[tuple[str, float, float]],
+    unit: SpeedUnit,
+    most: float | None,
+    judged: str,
+    show: Sequence[str],
+    ax: Onto,
+    modes: np.ndarray | None = None,
 ) -> Figure:
     """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
 
     **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
-    rotor speed shown, rad/s (a third above the scene's if None); how stability is `judged`.
+    rotor speed shown, rad/s (a third above the scene's if None); how stability is `judged`; `show` which panels, `ax` onto
+    which axes; `modes` the number of the jam mode at each point, counted by the resonances and the slope if None.
 
-    **Returns** a matplotlib figure. **Raises** `InputError` for another unit.
+    **Returns** a matplotlib figure. **Raises** `InputError` for another unit or panel.
     """
     from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
 
@@ -57,18 +77,23 @@ def picture(
     top = 4.0 / 3.0 * at if most is None else most
     kinds = sorted({kind for kind, _, _ in marks})
     shown = {kind: np.array([(w, n) for k, w, n in marks if k == kind and n <= top]).reshape(-1, 2) for kind in kinds}
-    rotor_speed = np.asarray(branch.rotor_speed)
+    rotor_speed, resonances = np.asarray(branch.rotor_speed), np.asarray(natural_frequencies(branch.scene))
+    if modes is None:
+        modes = 2 * np.searchsorted(resonances, np.asarray(branch.omega)) + (np.asarray(branch.slope) > 0.0)
     return branch_diagram(
         np.where(rotor_speed <= top, rotor_speed, np.nan),
         np.asarray(branch.omega),
         np.asarray(branch.stable),
         amplitude=np.asarray(branch.amplitude),
         force=np.asarray(branch.foundation_force),
-        resonances=np.asarray(natural_frequencies(branch.scene)),
-        marks=[(kind.replace("_", " "), points[:, 1], points[:, 0]) for kind, points in shown.items()],
+        resonances=resonances,
+        modes=modes,
+        marks=[(MARKS.get(kind, kind), points[:, 1], points[:, 0]) for kind, points in shown.items() if points.size],
         names=branch.scene.machine.structure().coordinates,
         units=branch.scene.machine.structure().units,
-        at=at,
+        at=at if at <= top else None,
         unit=unit,
-        title=f"solid: stable {judged}",
+        judged=judged,
+        show=show,
+        ax=ax,
     )

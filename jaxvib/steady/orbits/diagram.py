@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +29,8 @@ from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Onto, SpeedUnit
 
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
@@ -79,9 +82,16 @@ class ExactBranches(Result):
         """The ranges of the branch, its resonances and its special points, for a person to read."""
         return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
 
-    def plot(self, *, unit: Literal["rad/s", "rpm"] = "rad/s", most: float | None = None) -> Figure:
+    def plot(
+        self,
+        *,
+        unit: SpeedUnit = "rad/s",
+        most: float | None = None,
+        show: Sequence[str] = ("speed", "amplitude", "force"),
+        ax: Onto = None,
+    ) -> Figure:
         """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
-        return picture(self, list(self.special), unit, most, _JUDGED)
+        return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
 
 
 def exact_branches(

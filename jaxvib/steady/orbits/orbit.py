@@ -30,6 +30,8 @@ from jaxvib.steady.orbits.floquet import Floquet, floquet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
 
 
@@ -128,8 +130,9 @@ class Orbit(Result):
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )
 
-    def plot(self) -> Figure:
-        """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed; onto three
+        axes `ax` where they are given. **Returns** a matplotlib figure."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         theta = np.linspace(0.0, 2.0 * np.pi, 721)
@@ -138,10 +141,16 @@ class Orbit(Result):
             return np.real(np.asarray(harmonics) @ np.exp(1j * np.asarray(orders)[:, None] * theta)).T
 
         motion = signal(self.displacement_harmonics, self.orders)
-        panels = [(f"displacement, {' or '.join(dict.fromkeys(self.units))}", motion)]
-        panels += [("deviation of the loads, rad", signal(self.deviation_harmonics, self.deviation_orders))]
-        panels += [("force on the bed, N", signal(self.force_harmonics, self.orders))]
-        return signals_chart(np.rad2deg(theta), panels, across="load angle Omega t, deg")
+        deviation = np.rad2deg(signal(self.deviation_harmonics, self.deviation_orders))
+        force = signal(self.force_harmonics, self.orders)
+        shown = [f"m{unit}" for unit in dict.fromkeys(self.units)]
+        several = [f"load {k + 1}" for k in range(deviation.shape[1])]
+        panels = [
+            (f"displacement, {' or '.join(shown)}", 1e3 * motion, [f"coordinate {k + 1}" for k in range(motion.shape[1])]),
+            ("loads ahead of Ωt, degrees", deviation, several if len(several) > 1 else ["all loads"]),
+            ("force on the bed, N", force, ["across", "up"][-force.shape[1] :]),
+        ]
+        return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
 
 
 def light_rotor_speed(model: LinearModel, omega: Array) -> Array:

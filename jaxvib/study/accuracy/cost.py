@@ -18,6 +18,8 @@ from jaxvib.results.status import Computed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "timed"]
 
 T = TypeVar("T")
@@ -70,17 +72,20 @@ class Cost(Result):
             lines.append(f"  to {wanted:.0e}: {way}")
         return "\n".join([*lines, *(f"  {reason}" for reason in self.left_out)])
 
-    def plot(self) -> Figure:
-        """Error against seconds, a line for each method; see `cost_figure`. **Returns** a matplotlib figure."""
-        return cost_figure({"": self})
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """Error against seconds, a line for each method; see `cost_figure`; onto axes `ax` if given. **Returns** a
+        matplotlib figure.
+        """
+        return cost_figure({"": self}, ax=ax)
 
 
-def cost_figure(costs: Mapping[str, Cost]) -> Figure:
+def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Figure:
     """Error against seconds, a panel for each of `costs` by its title, a line for each method, the same in all panels.
 
     Rings mark the cheapest way to each of the errors `WANTED`.
 
-    **Arguments**: `costs` a `Cost` for each title, which stands above its panel. **Returns** a matplotlib figure.
+    **Arguments**: `costs` a `Cost` for each title, which stands above its panel; `ax` as many axes to draw onto. **Returns**
+    a matplotlib figure.
 
     >>> import jaxvib as jv
     >>> rows = [CostRow("full", "Tsit5", "float64", f"{error:.0e}", error, seconds, 1.0)
@@ -103,7 +108,7 @@ def cost_figure(costs: Mapping[str, Cost]) -> Figure:
         best = np.reshape(np.array([row[5:3:-1] for row in chosen]), (-1, 2))
         return CostPanel(lines, cost.reference_error, cost.quantity.replace("_", " "), best)
 
-    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED)
+    return cost_chart({title: panel(cost) for title, cost in costs.items()}, WANTED, ax=ax)
 
 
 def timed(call: Callable[[], T], repeats: int) -> tuple[T, float, float]:

@@ -29,6 +29,8 @@ from jaxvib.units import Number, count, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["Audit", "AuditStatus", "audit"]
 
 
@@ -82,8 +84,10 @@ class Audit(Result):
             lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.says}")
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """What each effect changes against the accuracy asked for, and what it costs. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """What each effect changes against the accuracy asked for, and what it costs, onto two axes `ax` if given.
+        **Returns** a matplotlib figure.
+        """
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 
         told = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
@@ -91,7 +95,7 @@ class Audit(Result):
         labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
         uncertainty = np.array([row.uncertainty for row in self.effects])
         added = np.array([row.operations for row in self.effects], float) / self.operations
-        return audit_chart(labels, changes, uncertainty, self.accuracy, added)
+        return audit_chart(labels, changes, uncertainty, self.accuracy, added, ax=ax)
 
 
 def audit(

@@ -25,6 +25,8 @@ from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_sta
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["Identified", "IdentifyStatus", "identify"]
 
 _MOST_ITERATIONS = 64
@@ -115,11 +117,11 @@ class Identified(Result):
         lines.append(f"frequency {shown(self.frequency)} rad/s, noise {self.noise:.2g} rad; {self.message}")
         return "\n".join([*lines, *self.notes])
 
-    def plot(self) -> Figure:
-        """The record with the fit, and what the fit leaves."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """The record with the fit, and what the fit leaves; onto two axes `ax` if given."""
         from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
 
-        return record_chart(self.record.time, self.record.angle, self.fitted, self.noise)
+        return record_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
 
 
 def shown(estimate: Estimate) -> str:

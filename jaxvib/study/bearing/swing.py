@@ -25,6 +25,8 @@ from jaxvib.units import Number, Numbers, count, number, numbers, traced
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
 
 
@@ -111,14 +113,13 @@ class Swing(Result):
         first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
         return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"
 
-    def plot(self) -> Figure:
-        """Angle and rate over time. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """Angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))
-        return signals_chart(
-            np.asarray(self.time), [("angle, deg", np.rad2deg(angle)), ("rate, rad/s", rate)], across="time, s"
-        )
+        signals = [("angle, deg", np.rad2deg(angle), ["angle"]), ("rate, rad/s", rate, ["rate"])]
+        return signals_chart(np.asarray(self.time), signals, across="time, s", ax=ax)
 
 
 @refuse_former(tolerance=FORMER["tolerance"])

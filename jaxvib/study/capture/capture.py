@@ -26,6 +26,7 @@ from jaxvib.results.result import Result
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "steps_per_second", "thrown_state"]
@@ -108,11 +109,14 @@ class Capture(Result):
         lone = f"; below it {100.0 * np.mean(below):.3g} % are captured all the same" if np.any(below > 0.0) else ""
         return f"{head}\n  {where}{lone}"
 
-    def plot(self) -> Figure:
-        """The share of starts captured over the initial speed, and the threshold. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Figure:
+        """The share of starts captured over the initial speed, and the threshold; onto the axes `ax` where they are given.
+
+        **Returns** a matplotlib figure.
+        """
         from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
 
-        return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold))
+        return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold), ax=ax)
 
 
 def steps_per_second(scene: Scene) -> float:

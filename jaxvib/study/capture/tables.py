@@ -37,6 +37,8 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto
+
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
 CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
@@ -158,8 +160,11 @@ class TorusTables(Result):
                     lines.append(f"{point}  {name:8s}{numbers}  {self.fraction[m, i]:5.2f}  {pattern}")
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """The speeds nearest to the paper's over the gap, a panel for each row. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Figure:
+        """The speeds nearest to the paper's over the gap, a panel for each row; onto as many axes `ax` where they are given.
+
+        **Returns** a matplotlib figure.
+        """
         from jaxvib.draw.capture import tables_chart  # slow to import: only who draws pays
 
         panels = [
@@ -173,7 +178,7 @@ class TorusTables(Result):
             )
             for row in self.rows()
         ]
-        return tables_chart(panels)
+        return tables_chart(panels, ax=ax)
 
 
 def published_tables(

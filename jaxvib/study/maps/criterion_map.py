@@ -22,6 +22,8 @@ from jaxvib.steady.balance.states import balanced_growth, stability_changes
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
+
 __all__ = ["CriterionMap", "criterion_map"]
 
 
@@ -62,21 +64,16 @@ class CriterionMap(Result):
             lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """One panel a drag: rotor speed against load mass, where the criterion is right and where not."""
-        import matplotlib.pyplot as plt
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """One panel a drag: rotor speed in `unit` against load mass, where the criterion is right and where not; onto as many
+        axes `ax` where they are given.
 
-        from jaxvib.draw.criterion import agreement_map
+        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        """
+        from jaxvib.draw.criterion import agreement_maps  # slow to import: only who draws pays
 
-        figure, axes = plt.subplots(1, self.drag_factor.size, sharey=True, squeeze=False, layout="constrained")
-        figure.set_size_inches(3.2 * self.drag_factor.size + 0.8, 3.4)
-        entries = []
-        for d, ax in enumerate(axes[0]):
-            entries = agreement_map(ax, self.speeds, self.mass_factor, self.predicted, self.growth[d] < 0.0)
-            ax.set_title(f"drag x {self.drag_factor[d]:.3g}")
-        axes[0, 0].set_ylabel("load mass, times the scene's")
-        figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize="small")
-        return figure
+        maps = [(f"drag x {d:.3g}", growth < 0.0) for d, growth in zip(self.drag_factor, self.growth, strict=True)]
+        return agreement_maps(self.speeds, self.mass_factor, self.predicted, maps, unit=unit, ax=ax)
 
 
 def criterion_map(

@@ -29,6 +29,8 @@ from jaxvib.units import Number, count, number, numbers
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Onto, SpeedUnit
+
 __all__ = ["RunUps", "run_ups"]
 
 _FAILED = "failed"
@@ -79,13 +81,16 @@ class RunUps(Result):
             lines.append(f"drag {drag:.4g} N s/m: {', '.join(said)}")
         return "\n".join(lines)
 
-    def plot(self) -> Figure:
-        """Shares of the kinds of motion, and the speeds of the loads, over drag. **Returns** a matplotlib figure."""
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+        """Shares of the kinds of motion, and speeds of the loads in `unit`, over drag; onto two axes `ax` where they are given.
+
+        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        """
         shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
         rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)
         from jaxvib.draw.regimes import regime_chart  # slow to import: only who draws pays
 
-        return regime_chart(self.drag, shares, self.omega, float(rotor))
+        return regime_chart(self.drag, shares, self.omega, float(rotor), unit=unit, ax=ax)
 
 
 def _span(values: np.ndarray) -> str:

@@ -13,11 +13,14 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.steady.jams.picture import MARKS
 from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
 
 __all__ = ["StabilityMap", "stability_map", "stability_onset"]
 
@@ -41,19 +44,19 @@ class StabilityMap(Result):
             lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
-    def plot(self, *, label: str = "x", ax: Axes | None = None) -> Figure:
-        """Stable jams shaded over the load speed and x, special points as marks by kind; `label` names x on its axis.
+    def plot(self, *, label: str = "x", unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """Stable jams shaded over the load speed in `unit` and x, special points as marks by kind; `label` names x on its axis.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
         """
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):
             for point in points:
-                marks.setdefault(point.kind.replace("_", " "), []).append((point.omega, float(x)))
+                marks.setdefault(MARKS.get(point.kind, point.kind), []).append((point.omega, float(x)))
         from jaxvib.draw.comparison import stability_chart  # slow to import: only who draws pays
 
         return stability_chart(
-            self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label, ax=ax
+            self.value, self.omega, self.stable, {k: np.array(v) for k, v in marks.items()}, label=label, unit=unit, ax=ax
         )
 
 

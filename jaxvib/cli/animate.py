@@ -1,0 +1,82 @@
+"""jaxvib animate, sketch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import Output, app, shared
+from jaxvib.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxvib.motion.start import Start
+
+
+@app.command("animate")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--until", help="Of a scene: simulate it so long first, such as 20s.")
+@click.option("--start", type=click.Choice(["rest", "jam", "spin_up"]), help="Of a scene: how that run starts [rest].")
+@click.option("--mode", type=int, help="Of a scene: the jam mode. Without --until its exact motion is shown.")
+@click.option("--begin", help="From when, such as 4.5s [four vibrations before the end].")
+@click.option("--end", help="Until when [the end].")
+@click.option("--seconds", help="How long the film lasts [as the rotor's speed asks for].")
+@click.option("--fps", type=int, default=20, show_default=True, help="Pictures a second.")
+@click.option("--magnify", type=float, help="How many times larger displacements are drawn than the loads' circle.")
+@click.option("--width", type=float, default=6.4, show_default=True, help="Of the picture, in hundreds of dots.")
+@click.option("--format", "kind", type=click.Choice(["gif", "html", "both"]), default="both", show_default=True)
+@shared
+def animate(
+    source: Path,
+    until: str | None,
+    start: Start | None,
+    mode: int | None,
+    begin: str | None,
+    end: str | None,
+    seconds: str | None,
+    fps: int,
+    magnify: float | None,
+    width: float,
+    kind: str,
+    output: Output,
+) -> None:
+    """A film of the machine as it moves, in slow motion, into --out: animation.gif and animation.html.
+
+    SOURCE is a run.npz that `jaxvib simulate` kept, or a scene file: with --until it is simulated first, with --mode its
+    exact jam is shown."""
+    if output.folder is None:
+        raise InputError("--out", "is missing; name the folder that the film goes into")
+    if source.suffix == ".npz":
+        if until is not None or start is not None or mode is not None:
+            raise InputError("--until", "goes, as --start and --mode, with a scene file; a kept run has its own")
+        motion, scene = jv.Run.load(source), None
+    else:
+        loaded = jv.load_scene(source)
+        if until is not None:
+            motion, scene = jv.simulate(loaded, until, start=start or "rest", mode=mode, estimate=False), None
+        elif mode is None:
+            raise InputError("--until", "is missing; say how long to simulate, or by --mode which jam to show")
+        else:
+            motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
+    film = jv.animate(motion, scene=scene, begin=begin, end=end, seconds=seconds, fps=fps, magnify=magnify, width=width)
+    for suffix in ("gif", "html"):
+        path = output.file(f"animation.{suffix}") if kind in (suffix, "both") else None
+        if path is not None:
+            film.save(path)
+    first, last = film.figure.axes[1].get_xlim()
+    document = {"pictures": film.count, "fps": film.fps, "begin": first, "end": last}
+    output.done(document, lambda: f"{film.count} pictures of {first:.6g} to {last:.6g} s", "animate")
+
+
+@app.command("sketch")
+@click.argument("scene", type=click.Path(path_type=Path))
+@shared
+def sketch(scene: Path, output: Output) -> None:
+    """A drawing of SCENE with its numbers, into --out: sketch.png."""
+    picture = output.file("sketch.png")
+    if picture is None:
+        raise InputError("--out", "is missing; name the folder that the sketch goes into")
+    jv.sketch(jv.load_scene(scene)).savefig(picture)
+    output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

@@ -1,0 +1,1 @@
+"""Parts of a machine as shapes, and films of them; plain numbers, no machine."""

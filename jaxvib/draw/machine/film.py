@@ -1,0 +1,134 @@
+"""Films: pictures one after the other, as GIF or as one HTML page that asks nothing of a network."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from jaxvib.errors import InputError
+
+__all__ = ["Film"]
+
+_COLORS = 64
+"""Colours of a film."""
+
+_NEAR = 10
+"""Levels, of 255, by which two of them differ at least."""
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>body{{font-family:sans-serif;margin:1em auto;max-width:{width}px;padding:0 .5em}}img{{width:100%;height:auto}}
+.bar{{display:flex;gap:.6em;align-items:center}}input{{flex:1}}button{{min-width:5em}}</style></head>
+<body><img id="picture" alt="{title}"><div class="bar"><button id="run">Pause</button>
+<input id="place" type="range" min="0" max="{last}" value="0" aria-label="picture">
+<label>speed <select id="speed"><option value="0.25">1/4</option><option value="0.5">1/2</option>
+<option value="1" selected>1</option><option value="2">2</option></select></label></div>
+<script>
+const pictures = [{pictures}].map(data => "data:image/png;base64," + data);
+const picture = document.getElementById("picture"), place = document.getElementById("place");
+const run = document.getElementById("run"), speed = document.getElementById("speed");
+let running = true, timer = null;
+function show(k) {{ place.value = k; picture.src = pictures[k]; }}
+function step() {{ show((+place.value + 1) % pictures.length); timer = setTimeout(step, {pause} / +speed.value); }}
+run.onclick = () => {{ running = !running; run.textContent = running ? "Pause" : "Play";
+  if (running) step(); else clearTimeout(timer); }};
+place.oninput = () => {{ if (running) run.onclick(); show(+place.value); }};
+show(0); timer = setTimeout(step, {pause});
+</script></body></html>
+"""
+
+
+class Film(FuncAnimation):
+    """matplotlib's animation of a figure of which only some artists move, with a `save` that draws nothing else again.
+
+    **Arguments**: `figure`; `update(k)` puts the artists `moving` where they are in picture k, of `count`; `fps` pictures a
+    second.
+    """
+
+    def __init__(self, figure: Figure, update: Callable[[int], Any], moving: Sequence[Artist], count: int, fps: float):
+        super().__init__(figure, lambda k: [update(k), moving][1], frames=count, interval=1000.0 / fps, blit=False)
+        self._draw_was_started = True  # what was never shown need not be warned of
+        self.figure, self._update, self._moving, self.count, self.fps = figure, update, list(moving), count, fps
+
+    def pictures(self) -> Iterator[Image.Image]:
+        """Every picture: what does not move is drawn once."""
+        canvas = self.figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        for artist in self._moving:
+            artist.set_animated(True)
+        canvas.draw()
+        still = canvas.copy_from_bbox(self.figure.bbox)
+        ordered = sorted(self._moving, key=lambda artist: artist.get_zorder())
+        for k in range(self.count):
+            self._update(k)
+            canvas.restore_region(still)
+            for artist in ordered:
+                self.figure.draw_artist(artist)
+            yield Image.fromarray(np.asarray(canvas.buffer_rgba()).copy()).convert("RGB")
+        for artist in self._moving:
+            artist.set_animated(False)
+
+    def save(self, filename: str | Path, *rest: Any, **options: Any) -> None:
+        """Writes a GIF, or for a name that ends so one HTML page with its pictures inside; every other format by matplotlib's
+        own `save`, which takes the further arguments.
+
+        **Raises** `InputError` where the file cannot be written.
+        """
+        path = Path(filename)
+        if path.suffix.lower() not in (".gif", ".html", ".htm") or rest or options:
+            super().save(str(filename), *rest, **options)
+            return
+        try:
+            if path.suffix.lower() == ".gif":
+                self._gif(path)
+            else:
+                path.write_text(self._page(path.stem), encoding="utf-8")
+        except OSError as error:
+            problem = f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file"
+            raise InputError("path", problem) from error
+
+    def _gif(self, path: Path) -> None:
+        first, *others = self._few_colours()
+        # Hundredths of a second are all that a GIF knows.
+        pause = max(20, round(100.0 / self.fps) * 10)
+        first.save(path, save_all=True, append_images=others, duration=pause, loop=0, optimize=True, disposal=1)
+
+    def _few_colours(self) -> list[Image.Image]:
+        """All pictures in the colours of a few of them, without speckles, so that what stands still stays the same."""
+        every = list(self.pictures())
+        some = every[:: max(1, len(every) // 4)]
+        strip = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+        for k, each in enumerate(some):
+            strip.paste(each, (0, k * each.height))
+        # The colours that most points have, such as white, are kept as they are.
+        colours, often = np.unique(np.asarray(strip).reshape(-1, 3), axis=0, return_counts=True)
+        chosen: list[np.ndarray] = []
+        for colour in colours[np.argsort(-often, kind="stable")].astype(int):
+            # Those next to a colour that is there would only take another's place.
+            if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _NEAR for other in chosen):
+                chosen.append(colour)
+        palette = Image.new("P", (1, 1))
+        palette.putpalette([int(level) for colour in chosen for level in colour])
+        return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in every]
+
+    def _page(self, title: str) -> str:
+        coded = []
+        for each in self._few_colours():
+            with io.BytesIO() as memory:
+                each.save(memory, "PNG", optimize=False)
+                coded.append('"' + base64.b64encode(memory.getvalue()).decode("ascii") + '"')
+        width = int(self.figure.bbox.width)
+        words = {"title": html.escape(title, quote=True), "width": width, "last": self.count - 1}
+        return _PAGE.format(pictures=",".join(coded), pause=round(1000.0 / self.fps), **words)

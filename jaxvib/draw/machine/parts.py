@@ -1,0 +1,93 @@
+"""Springs, dampers, slabs, discs and arrows as outlines: arrays of points (n, 2), NaN where the pen is lifted."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+
+__all__ = ["Part", "arrow", "box", "circle", "damper", "ground", "put", "spring"]
+
+Point = tuple[float, float]
+
+
+class Part(NamedTuple):
+    """An outline to be drawn: its `points` (n, 2), how it looks (matplotlib's options), and whether it is `filled`."""
+
+    points: np.ndarray
+    look: dict[str, Any]
+    filled: bool = False
+
+
+def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Points at the shares `forward` of the way from `start` to `end`, `side` to its left."""
+    a, b = np.asarray(start, float), np.asarray(end, float)
+    way = b - a
+    length = np.hypot(*way)
+    left = np.array([-way[1], way[0]]) / (length if length > 0.0 else 1.0)
+    return a + forward[:, None] * way + side[:, None] * left
+
+
+def spring(start: Point, end: Point, width: float = 0.2, coils: int = 6) -> np.ndarray:
+    """A zigzag line from one point to another.
+
+    >>> spring((0.0, 0.0), (0.0, 1.0)).shape
+    (16, 2)
+    """
+    zigzag = np.linspace(0.15, 0.85, 2 * coils + 1)
+    side = np.where(np.arange(2 * coils + 1) % 2, 0.5, -0.5) * width
+    side[[0, -1]] = 0.0
+    return _along(start, end, np.concatenate([[0.0], zigzag, [0.93, 1.0]]), np.concatenate([[0.0], side, [0.0, 0.0]]))
+
+
+def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np.ndarray:
+    """A dashpot from one point to another: a cup on the first, a share `cup` of the whole, a piston on the second."""
+    pen, low, high = np.nan, 0.5 - 0.5 * cup, 0.5 + 0.5 * cup
+    forward = np.array([0.0, low, pen, high, low, low, high, pen, 1.0, 0.52, pen, 0.52, 0.52])
+    side = np.array([0.0, 0.0, pen, 0.5, 0.5, -0.5, -0.5, pen, 0.0, 0.0, pen, 0.36, -0.36]) * width
+    return _along(start, end, forward, side)
+
+
+def box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
+    """A rectangle."""
+    return np.array([[left, bottom], [right, bottom], [right, top], [left, top], [left, bottom]])
+
+
+def circle(centre: Point, radius: float, points: int = 61) -> np.ndarray:
+    """A circle."""
+    turn = np.linspace(0.0, 2.0 * np.pi, points)
+    return np.stack([centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn)], axis=1)
+
+
+def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:
+    """The outline of an arrow; a short one has a short head, one of no length is a point."""
+    length = float(np.hypot(*way))
+    head = min(0.28, 0.6 * length)
+    shaft = (length - head) / length if length > 0.0 else 0.0
+    slim = width * min(1.0, length / 0.28)
+    forward = np.array([0.0, 0.0, shaft, shaft, 1.0, shaft, shaft, 0.0, 0.0])
+    side = np.array([0.0, 0.5, 0.5, 1.3, 0.0, -1.3, -0.5, -0.5, 0.0]) * slim
+    return _along(start, (start[0] + way[0], start[1] + way[1]), forward, side)
+
+
+def ground(start: Point, end: Point, step: float = 0.22) -> np.ndarray:
+    """A line with short strokes on its right side: what does not move."""
+    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+    many = max(2, int(length / step))
+    forward, side = [0.0, 1.0], [0.0, 0.0]
+    for share in (np.arange(many) + 0.5) / many:
+        forward += [np.nan, share, share - 0.6 * step / length]
+        side += [np.nan, 0.0, -0.6 * step]
+    return _along(start, end, np.array(forward), np.array(side))
+
+
+def put(axis: Axes, part: Part) -> Line2D | Polygon:
+    """Draws a part. **Returns** its artist, whose points `set_data` (a line) or `set_xy` (a filled one) moves."""
+    if part.filled:
+        outline = Polygon(part.points, closed=True, **part.look)
+        axis.add_patch(outline)
+        return outline
+    return axis.plot(part.points[:, 0], part.points[:, 1], **{"solid_joinstyle": "miter", **part.look})[0]

@@ -1,0 +1,1 @@
+"""Motions in time as figures: histories, spectra, paths; plain arrays, no machine."""

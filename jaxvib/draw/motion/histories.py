@@ -1,0 +1,172 @@
+"""Histories over time: whole runs as bands between their peaks, and the last few periods as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxvib.draw.style import COLORS, STROKES, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
+
+__all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
+
+_BINS = 300
+"""So many pieces of a run at most are drawn as a band between the least and the greatest value in each."""
+
+_FEW = 40
+"""Up to so many periods a run is drawn as it is."""
+
+_SHOWN = 3
+"""Periods at the end that are drawn as they are."""
+
+
+def band(time: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Middle times, least and greatest of a signal (nt,) in so many equal pieces of it; the signal itself, twice, where it is
+    short.
+
+    >>> import numpy as np
+    >>> t, low, high = band(np.arange(4.0), np.array([0.0, 2.0, -1.0, 1.0]), 2)
+    >>> low.tolist(), high.tolist()
+    ([0.0, -1.0], [2.0, 1.0])
+    """
+    if time.size < 2 * bins:
+        return time, values, values
+    edges = np.linspace(0, time.size, bins + 1).astype(int)
+    low, high = np.minimum.reduceat(values, edges[:-1]), np.maximum.reduceat(values, edges[:-1])
+    return (time[edges[:-1]] + time[edges[1:] - 1]) / 2.0, low, high
+
+
+def period_of(time: np.ndarray, values: np.ndarray) -> float:
+    """The mean period of the widest of signals (nt, k), by its crossings of its middle upward; all of the time where there are
+    none.
+
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 1.0, 1000)
+    >>> round(period_of(t, np.sin(40.0 * np.pi * t)[:, None]), 3)
+    0.05
+    """
+    signal = values[:, int(np.argmax(np.ptp(values, axis=0)))]
+    signal = signal - (np.max(signal) + np.min(signal)) / 2.0
+    up = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
+    return float((time[up[-1]] - time[up[0]]) / (up.size - 1)) if up.size > 1 else float(time[-1] - time[0])
+
+
+def last_periods(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Which samples (nt,) lie in the last periods of signals (nt, k)."""
+    return time >= time[-1] - _SHOWN * period_of(time, values)
+
+
+def time_histories(
+    whole: Sequence[np.ndarray],
+    end: Sequence[np.ndarray],
+    *,
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    directions: Sequence[str] = ("force",),
+    unit: SpeedUnit = "rad/s",
+    ax: Onto = None,
+) -> Figure:
+    """Two columns over time: the `whole` run as bands between its peaks, and the last periods of its `end` as they are. Rows:
+    displacements mm, tilts mrad where there are any, speeds of the loads and the rotor in `unit`, force on the bed N.
+
+    `whole` and `end` hold time (nt,) s, displacement (nt, nd), speeds of the loads (nt, count) and of the rotor (nt,) rad/s,
+    force (nt, nb) N; `displacement` is in m, and in rad where `units` (nd,) say "rad"; if None, all is in m.
+
+    >>> import numpy as np
+    >>> t, q, one = np.linspace(0.0, 1.0, 5), np.ones((5, 2)), np.ones((5, 1))
+    >>> figure = time_histories(*[(t, q, one, t, one)] * 2, names=("y", "theta"), units=("m", "rad"))
+    >>> [axes.get_ylabel() for axes in figure.axes][::2]
+    ['displacement, mm', 'tilt, mrad', 'speed, rad/s', 'force on the bed, N']
+    """
+    units = ["m"] * len(names) if units is None else units
+    scale = speed_scale(unit)
+    kinds = [(kind, label) for kind, label in (("m", "displacement, mm"), ("rad", "tilt, mrad")) if kind in units]
+    figure, axes = panels(len(kinds) + 2, 2, size=(5.4, 2.3), widths=(1.7, 1.0), share_x="col", ax=ax)
+    period = period_of(end[0], end[1])
+    # A piece holds a whole period, or the band would follow the vibration.
+    periods = (whole[0][-1] - whole[0][0]) / period
+    bins = min(_BINS, int(periods / 1.25)) if periods > _FEW else whole[0].size
+    part = [values[last_periods(end[0], end[1])] for values in end]
+    depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # the widest lowest, so that none hides another
+    for row, (kind, label) in enumerate(kinds):
+        own = [k for k in range(len(names)) if units[k] == kind]
+        left, right = axes[2 * row : 2 * row + 2]
+        for k in own:
+            _band(left, whole[0], 1e3 * whole[1][:, k], k, names[k], bins, depth[k])
+        for k in own:
+            right.plot(part[0], 1e3 * part[1][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.3)
+        left.set_ylabel(label)
+        legend_above(left, 6)
+    left, right = axes[-4:-2]
+    for k, name in enumerate(load_names(whole[2].shape[1])):
+        _band(left, whole[0], scale * whole[2][:, k], k, name, bins)
+        right.plot(part[0], scale * part[2][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
+    left.plot(whole[0], scale * whole[3], color="black", ls="--", lw=1.1, label="rotor")
+    left.set_ylabel(f"speed, {unit}")
+    legend_above(left, 6)
+    left, right = axes[-2:]
+    for k, name in enumerate(directions):
+        _band(left, whole[0], whole[4][:, k], k, name, bins)
+        right.plot(part[0], part[4][:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], lw=1.2)
+    left.set_ylabel("force on the bed, N")
+    if len(directions) > 1:
+        legend_above(left)
+    for axis, text in zip(axes[:2], ("the whole run: bands between peaks", f"its last {_SHOWN} periods"), strict=True):
+        axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
+    for axis in axes[-2:]:
+        axis.set_xlabel("time, s")
+    return figure
+
+
+def _band(
+    axis: Axes, time: np.ndarray, values: np.ndarray, k: int, name: str | None, bins: int, depth: float | np.ndarray = 0.0
+) -> None:
+    middle, low, high = band(time, values, bins)
+    look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.1, "zorder": 2.0 + 0.01 * float(depth)}
+    axis.plot(middle, high, label=name, **look)
+    if low is not high:
+        axis.plot(middle, low, **look)
+        axis.fill_between(middle, low, high, color=look["color"], alpha=0.22, lw=0.0, zorder=look["zorder"])
+
+
+def amplitude_histories(
+    time: np.ndarray,
+    amplitude: np.ndarray,
+    load_speed: np.ndarray,
+    force: np.ndarray,
+    rotor_speed: np.ndarray,
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    directions: Sequence[str] = ("force",),
+    unit: SpeedUnit = "rad/s",
+    ax: Onto = None,
+) -> Figure:
+    """Panels over time (nt,) s of an averaged run: amplitudes (nt, nd) mm and mrad, speeds of the loads (nt, count) and of the
+    rotor (nt,), amplitude of the force on the bed (nt, nb) N; zero to peak."""
+    scale = speed_scale(unit)
+    kinds = [(kind, label) for kind, label in (("m", "amplitude, mm"), ("rad", "amplitude, mrad")) if kind in units]
+    figure, axes = panels(len(kinds) + 2, size=(7.0, 2.2), share_x="col", ax=ax)
+
+    def lines(axis: Axes, values: np.ndarray, places: Sequence[int], labels: Sequence[str | None]) -> None:
+        for k, name in zip(places, labels, strict=True):
+            axis.plot(time, values[:, k], color=COLORS[k % len(COLORS)], ls=STROKES[k % len(STROKES)], label=name)
+
+    for axis, (kind, label) in zip(axes, kinds, strict=False):
+        own = [k for k in range(len(names)) if units[k] == kind]
+        lines(axis, 1e3 * amplitude, own, [names[k] for k in own])
+        axis.set_ylabel(label)
+        legend_above(axis, 6)
+    lines(axes[-2], scale * load_speed, range(load_speed.shape[1]), load_names(load_speed.shape[1]))
+    axes[-2].plot(time, scale * rotor_speed, color="black", ls="--", lw=1.1, label="rotor")
+    axes[-2].set_ylabel(f"speed, {unit}")
+    legend_above(axes[-2], 6)
+    lines(axes[-1], force, range(len(directions)), directions)
+    axes[-1].set_ylabel("force on the bed, N")
+    if len(directions) > 1:
+        legend_above(axes[-1])
+    axes[-1].set_xlabel("time, s")
+    axes[0].text(1.0, 1.02, "zero to peak", transform=axes[0].transAxes, ha="right", va="bottom", fontsize="small")
+    return figure

@@ -1,0 +1,109 @@
+"""Spectra over frequency, as lines and as waterfalls; paths of a point across a rotor's axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, SpeedUnit, legend_above, panels, speed_scale
+
+__all__ = ["path_chart", "spectrum_chart", "waterfall_chart"]
+
+_DECADES = 1e-4
+"""What is so much weaker than the strongest is not told apart."""
+
+
+def spectrum_chart(
+    frequency: np.ndarray,
+    series: Mapping[str, np.ndarray],
+    rotor_speed: np.ndarray,
+    load_speed: np.ndarray,
+    resonances: np.ndarray,
+    *,
+    unit: SpeedUnit = "rad/s",
+    ax: Axes | None = None,
+) -> Figure:
+    """Amplitudes (nf,) by name with unit, log scale, over frequency (nf,) rad/s, drawn in `unit`; speeds (1,) of rotor and
+    loads and resonances as upright lines."""
+    scale = speed_scale(unit)
+    figure, (axis,) = panels(1, size=(7.5, 4.0), ax=ax)
+    top = max(float(np.max(values)) for values in series.values())
+    for k, (name, values) in enumerate(series.items()):
+        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.3}
+        axis.plot(scale * frequency, values, label=name, **look)
+    for k, w in enumerate(resonances):
+        axis.axvline(scale * w, color=GUIDE, lw=0.9, ls=":", label=None if k else "resonances")
+    axis.axvline(scale * float(np.mean(load_speed)), color="black", lw=0.9, ls=(0, (5, 3)), label="speed of the loads")
+    axis.axvline(scale * float(np.mean(rotor_speed)), color="black", lw=0.9, ls="-.", label="speed of the rotor")
+    axis.set_yscale("log")
+    axis.set_ylim(_DECADES * top, 2.0 * top)
+    axis.set_xlim(0.0, scale * float(frequency[-1]))
+    axis.set_xlabel(f"frequency, {unit}")
+    axis.set_ylabel("amplitude, zero to peak")
+    legend_above(axis)
+    return figure
+
+
+def waterfall_chart(
+    time: np.ndarray,
+    frequency: np.ndarray,
+    name: str,
+    values: np.ndarray,
+    rotor_speed: np.ndarray,
+    load_speed: np.ndarray,
+    resonances: np.ndarray,
+    *,
+    unit: SpeedUnit = "rad/s",
+    ax: Axes | None = None,
+) -> Figure:
+    """Amplitudes (P, nf), `name` with unit, as darkness over time (P,) s and frequency (nf,) rad/s; the rotor's and the
+    loads' speed (P,) as lines, resonances level."""
+    scale = speed_scale(unit)
+    figure, (axis,) = panels(1, size=(7.5, 4.4), ax=ax)
+    top = max(float(np.max(values)), 1e-300)
+    shade = axis.pcolormesh(
+        time,
+        scale * frequency,
+        np.maximum(values, _DECADES * top).T,
+        norm=LogNorm(_DECADES * top, top),
+        cmap="Greys",
+        shading="nearest",
+        rasterized=True,
+    )
+    figure.colorbar(shade, ax=axis, label=f"{name}, zero to peak")
+    axis.grid(False)
+    for k, w in enumerate(resonances):
+        axis.axhline(scale * w, color=COLORS[0], lw=1.0, ls=":", label=None if k else "resonances")
+    axis.plot(time, scale * load_speed, color=COLORS[1], lw=1.4, ls=(0, (5, 3)), label="speed of the loads")
+    axis.plot(time, scale * rotor_speed, color=COLORS[2], lw=1.4, ls="-.", label="speed of the rotor")
+    axis.set_ylim(0.0, scale * float(frequency[-1]))
+    axis.set_xlabel("time, s")
+    axis.set_ylabel(f"frequency, {unit}")
+    legend_above(axis)
+    return figure
+
+
+def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Figure:
+    """Paths of points by name: across and up (nt,) m, drawn in mm; a mark where each ends.
+
+    >>> import numpy as np
+    >>> t = np.linspace(0.0, 6.0, 50)
+    >>> path_chart({"centre": (np.cos(t), np.sin(t))}).axes[0].get_xlabel()
+    'across, mm'
+    """
+    figure, (axis,) = panels(1, size=(5.0, 4.8), ax=ax)
+    for k, (name, (across, up)) in enumerate(paths.items()):
+        color = COLORS[k % len(COLORS)]
+        axis.plot(1e3 * across, 1e3 * up, color=color, ls=STROKES[k % len(STROKES)], lw=1.2, label=name)
+        axis.plot(1e3 * across[-1:], 1e3 * up[-1:], "o", color=color, mec="black", zorder=3)
+    axis.plot([], [], "o", color="white", mec="black", label="where it ends")
+    axis.plot([0.0], [0.0], "+", color="black", ms=9.0)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("across, mm")
+    axis.set_ylabel("up, mm")
+    legend_above(axis, 3)
+    return figure

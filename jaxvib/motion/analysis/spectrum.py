@@ -1,0 +1,143 @@
+"""Spectra of a run: which frequencies it holds at its end, or from piece to piece as a waterfall."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import equinox as eqx
+import numpy as np
+
+from jaxvib.equations.linear import natural_frequencies
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.units import count
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
+
+__all__ = ["Spectrum", "spectrum_of"]
+
+_FINER = 4
+"""So many times as many frequencies as a piece tells apart are computed, so that peaks are read to 2 %."""
+
+_OVER = 1.5
+"""Frequencies up to so many times the rotor's greatest speed are kept."""
+
+
+class Spectrum(Result):
+    """Amplitudes over frequency, of P pieces of a run.
+
+    A piece is weighted by Hann's window; a vibration of constant amplitude has a peak of that height, zero to peak, to 2 %.
+
+    **Attributes** (P pieces, nf frequencies): `time` (P,) s, the middles of the pieces; `frequency` (nf,) rad/s; `amplitude`
+    (P, nf, nd) m, of tilts rad; `force` (P, nf, nb) N on the bed; `rotor_speed` and `load_speed` (P,) rad/s, means of the
+    pieces; `resonances` (nd,) rad/s; `coordinates` and `units` (nd,) their names and units.
+    """
+
+    status = Computed.done
+
+    time: np.ndarray = eqx.field(metadata=in_unit("s", "piece"))
+    frequency: np.ndarray = eqx.field(metadata=in_unit("rad/s", "frequency"))
+    amplitude: np.ndarray = eqx.field(metadata=in_unit("m or rad", "piece", "frequency", "coordinate"))
+    force: np.ndarray = eqx.field(metadata=in_unit("N", "piece", "frequency", "direction"))
+    rotor_speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece"))
+    load_speed: np.ndarray = eqx.field(metadata=in_unit("rad/s", "piece"))
+    resonances: np.ndarray = eqx.field(metadata=in_unit("rad/s", "resonance"))
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
+
+    def summary(self) -> str:
+        """The strongest frequency of each coordinate in the last piece, for a person to read."""
+        last = self.amplitude[-1]
+        peaks = np.argmax(last, axis=0)
+        lines = [
+            f"{name}: {last[k, j]:.4g} {unit} at {self.frequency[k]:.5g} rad/s"
+            for j, (name, unit, k) in enumerate(zip(self.coordinates, self.units, peaks, strict=True))
+        ]
+        return "\n".join(
+            [f"{self.time.size} pieces, strongest in the last one, zero to peak:", *(f"  {line}" for line in lines)]
+        )
+
+    def plot(
+        self,
+        *,
+        show: Literal["displacement", "force"] = "displacement",
+        coordinate: str | None = None,
+        unit: SpeedUnit = "rad/s",
+        ax: Axes | None = None,
+    ) -> Figure:
+        """Of one piece amplitudes over frequency; of several a waterfall over time, darker where it is stronger. Resonances,
+        the rotor's speed and the loads' are marked.
+
+        **Arguments**: `show` displacements or the force on the bed; `coordinate` by name, in a waterfall the one that moves
+        most unless said otherwise; `unit` of frequencies, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto.
+
+        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for other words.
+        """
+        from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow to import: only who draws pays
+
+        if show not in ("displacement", "force"):
+            raise InputError("show", f"is {show!r}; it must be 'displacement' or 'force'")
+        if coordinate is not None and (show == "force" or coordinate not in self.coordinates):
+            known = "a force has none" if show == "force" else f"there are {', '.join(self.coordinates)}"
+            raise InputError("coordinate", f"is {coordinate!r}; {known}")
+        series: dict[str, np.ndarray]
+        if show == "force":
+            names = ["force, N"] if self.force.shape[2] == 1 else ["force across, N", "force up, N"]
+            series = {name: self.force[:, :, k] for k, name in enumerate(names)}
+        else:
+            wanted = [k for k, name in enumerate(self.coordinates) if coordinate in (None, name)]
+            series = {f"{self.coordinates[k]}, m{self.units[k]}": 1e3 * self.amplitude[:, :, k] for k in wanted}
+        marks = (self.rotor_speed, self.load_speed, self.resonances)
+        if self.time.size == 1:
+            return spectrum_chart(self.frequency, {k: v[0] for k, v in series.items()}, *marks, unit=unit, ax=ax)
+        strongest = max(series, key=lambda name: np.max(series[name]))
+        return waterfall_chart(self.time, self.frequency, strongest, series[strongest], *marks, unit=unit, ax=ax)
+
+
+def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None, parts: int) -> Spectrum:
+    """The spectrum of a run's window (`parts` 1), or of so many pieces of its trajectory, see `Run.spectrum`."""
+    count(parts, "parts")
+    if parts > 1 and trajectory is None:
+        raise InputError("parts", f"is {parts}; the run kept its end only, simulate with save='all', or give 1")
+    kept = window if parts == 1 or trajectory is None else trajectory
+    time = np.asarray(kept.time, float)
+    # Neighbouring pieces share a half, so that nothing falls between the windows' ends.
+    size = time.size if parts == 1 else 2 * time.size // (parts + 1)
+    if size < 64:
+        raise InputError("parts", f"is {parts}, which leaves {size} samples for a piece; 64 are needed, give fewer parts")
+    starts = np.linspace(0, time.size - size, parts).astype(int)
+    step = float(time[1] - time[0])
+    points = _FINER * 2 ** int(np.ceil(np.log2(size)))
+    frequency = 2.0 * np.pi * np.fft.rfftfreq(points, step)
+    speed = np.asarray(kept.rotor_speed, float)
+    keep = frequency <= _OVER * max(float(np.max(np.abs(speed))), 1e-300)
+    weight = np.hanning(size)
+
+    def amplitudes(values: np.ndarray) -> np.ndarray:
+        pieces = np.stack([values[s : s + size] for s in starts])
+        pieces = (pieces - np.mean(pieces, axis=1, keepdims=True)) * weight[:, None]
+        return 2.0 / np.sum(weight) * np.abs(np.fft.rfft(pieces, points, axis=1))[:, keep]
+
+    def means(values: np.ndarray) -> np.ndarray:
+        return np.array([np.mean(values[s : s + size]) for s in starts])
+
+    structure = scene.machine.structure()
+    return Spectrum(
+        time=np.array([0.5 * (time[s] + time[s + size - 1]) for s in starts]),
+        frequency=frequency[keep],
+        amplitude=amplitudes(np.asarray(kept.state.displacement, float)),
+        force=amplitudes(np.asarray(kept.foundation_force, float)),
+        rotor_speed=means(speed),
+        load_speed=means(np.mean(np.asarray(kept.state.azimuth_rate, float), axis=1)),
+        resonances=np.asarray(natural_frequencies(scene), float),
+        coordinates=structure.coordinates,
+        units=structure.units,
+    )

@@ -1,0 +1,1 @@
+"""Machines as pictures and films: sketches of scenes, animations of their motions."""

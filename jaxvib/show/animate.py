@@ -1,0 +1,225 @@
+"""Films of a machine as it moves: platforms, springs, rotor, loads, and the forces on the bed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+
+from jaxvib.draw.machine.film import Film
+from jaxvib.draw.machine.parts import Part, put
+from jaxvib.draw.motion.histories import period_of
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.run import Run
+from jaxvib.show.motion import Stretch, of_orbit, of_run
+from jaxvib.show.sketch import checked_scene, fit
+from jaxvib.show.views import View, view_of
+from jaxvib.show.wheel import Pose
+from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.units import Number, number
+
+__all__ = ["animate"]
+
+_TURN = 0.42
+"""Turns of the rotor or a load from one picture to the next beyond which the eye is deceived."""
+
+_SMOOTH = 0.09
+"""Turns of the rotor from one picture to the next, where nothing else is said."""
+
+_MOST = 600
+"""Pictures of a film."""
+
+
+def animate(
+    motion: Run | Orbit,
+    path: str | Path | None = None,
+    *,
+    scene: Scene | None = None,
+    begin: Number | None = None,
+    end: Number | None = None,
+    seconds: Number | None = None,
+    fps: int = 20,
+    magnify: float | None = None,
+    width: float = 6.4,
+) -> Film:
+    """A film of a run or of an exact jam in slow motion, with a clock: platforms, springs, rotor and loads move, arrows are the
+    forces of the supports on the bed (black: of all of them), below are the displacements and the force over time.
+
+    **Arguments**
+
+    - `motion`: a `Run`, or an `Orbit` with the `scene` that it belongs to
+    - `path`: where to write it, as GIF (".gif") or as one HTML page with its pictures inside (".html"); None writes nothing
+    - `begin`, `end`: what is shown, s or text; the last four vibrations of a run, or as many of an orbit, unless said otherwise
+    - `seconds` that the film lasts: unless said otherwise so many that the rotor goes on by a tenth of a turn in a picture;
+      `fps` pictures a second
+    - `magnify`: how many times larger displacements are drawn than the loads' circle; so that the largest is well seen unless
+      said otherwise. Said in the picture
+    - `width` of the picture, inches of 100 dots
+
+    **Returns** a matplotlib animation, whose `save` writes further files. The same call gives the same file.
+
+    **Raises** `InputError` for a stretch that the run does not keep, too few samples in it, a film in which loads or rotor
+    would go on by nearly half a turn from one picture to the next, an orbit without its scene, and a file that is no GIF or
+    HTML or cannot be written.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
+    >>> film = jv.animate(jv.jam_orbit(scene, mode=1), scene=scene)
+    >>> film.count, film.figure.axes[2].get_xlabel()
+    (98, 'time, s')
+    """
+    owner = checked_scene(_scene_of(motion, scene))
+    if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):
+        raise InputError("path", f"is {str(path)!r}; films are written as .gif or .html")
+    if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
+        raise InputError("fps", f"is {fps!r}; it must be a whole number of pictures a second, 1 to 50")
+    first, last = _stretch(motion, begin, end)
+    speed = _fastest(motion, owner)
+    turns = speed * (last - first) / (2.0 * np.pi)
+    lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
+    wanted = int(np.ceil(turns / _SMOOTH)) if lasts is None else round(lasts * fps)
+    count = int(np.clip(wanted, 2, _MOST))
+    if turns / count > _TURN:
+        most = first + _TURN * 2.0 * np.pi * count / speed
+        problem = f"makes the rotor go on by {turns / count:.3g} turns from one picture to the next, which deceives the eye"
+        raise InputError("end", f"{problem}; end at {most:.4g} s or before, or let the film last more seconds")
+    # An orbit closes: its last picture is the one before its first.
+    time = first + (last - first) * np.arange(count) / (count if isinstance(motion, Orbit) else count - 1)
+    dense = np.linspace(time[0], time[-1], max(400, count))
+    shown, strips = (
+        of_run(motion, times) if isinstance(motion, Run) else of_orbit(motion, owner, times) for times in (time, dense)
+    )
+    film = _film(owner, shown, strips, float(fps), magnify, width)
+    if path is not None:
+        film.save(path)
+    return film
+
+
+def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
+    if isinstance(motion, Run):
+        if scene is not None:
+            raise InputError("scene", "goes with an Orbit only; a run has its own")
+        return motion.scene
+    if not isinstance(motion, Orbit):
+        raise InputError("motion", f"is a {type(motion).__name__}; give a Run, or an Orbit with its scene")
+    if scene is None:
+        raise InputError("scene", "is missing; an Orbit does not have it: animate(orbit, scene=scene)")
+    return scene
+
+
+def _stretch(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
+    """From when to when is shown, s."""
+    if isinstance(motion, Run):
+        window = motion.window
+        last = float(window.time[-1])
+        period = period_of(np.asarray(window.time), np.asarray(window.state.displacement))
+        ends = (max(last - 4.0 * period, float(window.time[0])), last)
+    else:
+        ends = (0.0, 8.0 * np.pi / float(motion.omega) if np.isfinite(motion.omega) else 1.0)
+    given = [None if x is None else float(number(x, "s", name, low=0.0)) for x, name in ((begin, "begin"), (end, "end"))]
+    first, last = (default if x is None else x for x, default in zip(given, ends, strict=True))
+    if not first < last:
+        raise InputError("end", f"is {last:.6g} s; it must be after the beginning, {first:.6g} s")
+    return first, last
+
+
+def _fastest(motion: Run | Orbit, scene: Scene) -> float:
+    """The greatest speed of rotor or loads, rad/s."""
+    if isinstance(motion, Run):
+        kept = motion.window
+        return float(max(np.max(np.abs(kept.rotor_speed)), np.max(np.abs(kept.state.azimuth_rate)), 1e-300))
+    return float(max(motion.rotor_speed, motion.omega)) if np.isfinite(motion.rotor_speed) else float(scene.drive.speed)
+
+
+def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: float | None, width: float) -> Film:
+    view = view_of(scene)
+    left, right, bottom, top = view.limits
+    tall = width * (top - bottom) / (right - left)
+    figure, (stage, lower, below) = panels(3, size=(width, (0.8 * tall + 2.9) / 3.0))
+    grid = stage.get_gridspec()
+    assert grid is not None
+    grid.set_height_ratios([0.8 * tall + 0.3, 1.3, 1.3])
+    figure.set_dpi(100.0)
+    fit(stage, view)
+    length = [k for k, unit in enumerate(scene.machine.structure().units) if unit == "m"]
+    largest = float(np.max(np.abs(shown.displacement[:, length]), initial=1e-300))
+    per_metre = _circle_scale(view)
+    chosen = 0.3 / largest / per_metre if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
+    if magnify is None:
+        chosen = float(f"{chosen:.1g}")
+    reach = chosen * per_metre
+    poses = [
+        Pose(shown.displacement[k], shown.velocity[k], tuple(u[k] for u in shown.angle), float(shown.turn[k]))
+        for k in range(shown.time.size)
+    ]
+    forces = np.array([view.support_forces(pose) for pose in poses])
+    most = max(float(np.max(np.abs(forces), initial=0.0)), float(np.max(np.abs(shown.force))), 1e-300)
+    per_newton = 0.7 / most
+
+    def parts(k: int) -> list[Part]:
+        return [*view.parts(poses[k], reach), *view.arrows(poses[k], shown.force[k], per_newton)]
+
+    artists = [put(stage, part) for part in parts(0)]
+    clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
+    slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
+    note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x larger"
+    stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
+    # Texts that are longer than the picture is wide shall not make it smaller.
+    for text in stage.texts:
+        text.set_in_layout(False)
+    cursors = _strips((lower, below), scene, strips)
+
+    def update(k: int) -> None:
+        for artist, part in zip(artists, parts(k), strict=True):
+            _move(artist, part.points)
+        total = " ".join(f"{force:8.0f}" for force in shown.force[k])
+        clock.set_text(f"t = {shown.time[k]:8.3f} s    force on the bed {total} N")
+        for cursor in cursors:
+            cursor.set_xdata([shown.time[k]] * 2)
+
+    update(0)
+    moving: list[Artist] = [*artists, clock, *cursors]
+    return Film(figure, update, moving, shown.time.size, fps)
+
+
+def _circle_scale(view: View) -> float:
+    """Drawn units for a metre of the loads' circle."""
+    wheel: Any = getattr(view, "wheel", None)
+    return float(wheel.scale)
+
+
+def _move(artist: Line2D | Polygon, points: np.ndarray) -> None:
+    if isinstance(artist, Line2D):
+        artist.set_data(points[:, 0], points[:, 1])
+    else:
+        artist.set_xy(points)
+
+
+def _strips(axes: tuple[Axes, Axes], scene: Scene, shown: Stretch) -> list[Line2D]:
+    """Displacements and force over the time shown, each with a line that goes along."""
+    upper, lower = axes
+    structure = scene.machine.structure()
+    for k, name in enumerate(structure.coordinates):
+        label = name if structure.units[k] == "m" else f"{name} (mrad)"
+        look = {"color": COLORS[k % len(COLORS)], "ls": STROKES[k % len(STROKES)], "lw": 1.2}
+        upper.plot(shown.time, 1e3 * shown.displacement[:, k], label=label, **look)
+    upper.set_ylabel("mm, mrad" if "rad" in structure.units else "mm")
+    legend_above(upper, 6)
+    for k, name in enumerate(structure.bed_directions):
+        look = {"color": "black" if k else COLORS[1], "ls": STROKES[k], "lw": 1.2}
+        lower.plot(shown.time, shown.force[:, k], label=f"force on the bed, {name}", **look)
+    lower.set_ylabel("N")
+    lower.set_xlabel("time, s")
+    legend_above(lower)
+    for axis in (upper, lower):
+        axis.set_xlim(shown.time[0], shown.time[-1])
+    return [axis.axvline(shown.time[0], color=GUIDE, lw=1.2) for axis in (upper, lower)]

@@ -1,0 +1,60 @@
+"""Where the parts of a machine of platforms stand in a picture, so that no spring crosses what it does not hold."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["Tie", "lanes"]
+
+
+class Tie(NamedTuple):
+    """What holds two platforms together or one on the bed: their levels (`low`, `high`), 0 for the bed; its `stiffness` N/m and
+    `damping` N s/m. The exciter stands on its platform as a tie of that level to itself, without either."""
+
+    low: int
+    high: int
+    stiffness: float = 0.0
+    damping: float = 0.0
+
+    @property
+    def exciter(self) -> bool:
+        """Whether it is the exciter's place."""
+        return self.low == self.high
+
+
+def lanes(ties: list[Tie], levels: int) -> list[int]:
+    """The order from left to right in which ties stand, such that they cross few platforms that they do not hold, and platforms
+    are short.
+
+    Neighbouring and distant ties are swapped until no swap is an improvement.
+
+    >>> lanes([Tie(0, 1), Tie(0, 2), Tie(1, 2)], 2)
+    [0, 2, 1]
+    """
+    order = list(range(len(ties)))
+
+    def cost(order: list[int]) -> float:
+        place = {tie: x for x, tie in enumerate(order)}
+        spans = []
+        for level in range(1, levels + 1):
+            own = [place[k] for k, tie in enumerate(ties) if level in (tie.low, tie.high)]
+            spans.append((min(own), max(own)) if own else (0, 0))
+        crossed = sum(
+            spans[level - 1][0] < place[k] < spans[level - 1][1]
+            for k, tie in enumerate(ties)
+            for level in range(tie.low + 1, tie.high)
+        )
+        return 100.0 * crossed + sum(high - low for low, high in spans)
+
+    best = cost(order)
+    while True:
+        swaps = [(i, j) for i in range(len(order)) for j in range(i)]
+        tried = []
+        for i, j in swaps:
+            other = order.copy()
+            other[i], other[j] = other[j], other[i]
+            tried.append((cost(other), other))
+        least, other = min(tried, default=(best, order))
+        if not least < best - 1e-12:
+            return order
+        best, order = least, other

@@ -1,0 +1,103 @@
+"""The motion that a film shows: a stretch of a run between its samples, or a period of an exact jam."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.motion.run import Run
+from jaxvib.steady.orbits.orbit import Orbit
+
+__all__ = ["Stretch", "of_orbit", "of_run"]
+
+_COARSE = 1.2
+"""Angles, rad, by which a load may go on between two samples of a run for the motion between them to be known."""
+
+
+class Stretch(NamedTuple):
+    """A motion at some times (nt,) s: `displacement`, `velocity` (nt, nd), the loads' coordinates `angle`, (nt, count) each,
+    the rotor's `turn` (nt,) rad, the `force` on the bed (nt, nb) N."""
+
+    time: np.ndarray
+    displacement: np.ndarray
+    velocity: np.ndarray
+    angle: tuple[np.ndarray, ...]
+    turn: np.ndarray
+    force: np.ndarray
+
+
+def of_run(run: Run, time: np.ndarray) -> Stretch:
+    """A run at these times, by cubic interpolation through the states that it kept, with their rates.
+
+    **Raises** `InputError` for times that it did not keep, or keeps too few states of.
+    """
+    kept = _kept(run, time)
+    t = np.asarray(kept.time, float)
+    k = np.clip(np.searchsorted(t, time, side="right") - 1, 0, t.size - 2)
+    h = t[k + 1] - t[k]
+    share = (time - t[k]) / h
+    state = kept.state
+    rate = np.max(np.abs(np.asarray(state.azimuth_rate)[np.unique(np.concatenate([k, k + 1]))]), initial=0.0)
+    if rate * np.max(h) > _COARSE:
+        most = int(np.ceil(t.size * rate * np.max(h) / _COARSE))
+        problem = f"has {t.size} samples, between which loads turn by up to {rate * np.max(h):.3g} rad"
+        raise InputError("run", f"{problem}; simulate with samples={most}, or animate its last turns")
+
+    def cubic(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        s, step = (x.reshape(-1, *[1] * (value.ndim - 1)) for x in (share, h))
+        a, b = value[k], value[k + 1]
+        da, db = step * slope[k], step * slope[k + 1]
+        return a + s * (da + s * (3.0 * (b - a) - 2.0 * da - db + s * (2.0 * (a - b) + da + db)))
+
+    def arrays(parts: object) -> list[np.ndarray]:
+        return [np.asarray(leaf, float) for leaf in jax.tree.leaves(parts)]
+
+    q, v = np.asarray(state.displacement, float), np.asarray(state.velocity, float)
+    angle = [cubic(_whole(u, w, t), w) for u, w in zip(arrays(state.angle), arrays(state.rate), strict=True)]
+    speed = np.asarray(kept.rotor_speed, float)
+    turn = cubic(_whole(np.asarray(kept.rotor_angle, float), speed, t), speed)
+    force = np.asarray(kept.foundation_force, float)
+    between = (1.0 - share)[:, None] * force[k] + share[:, None] * force[k + 1]
+    velocity = (1.0 - share)[:, None] * v[k] + share[:, None] * v[k + 1]
+    return Stretch(time, cubic(q, v), velocity, tuple(angle), turn, between)
+
+
+def _kept(run: Run, time: np.ndarray) -> Trajectory:
+    """The states that a run kept over these times: the dense ones of its window where they reach."""
+    slack = 1e-9 * max(float(run.window.time[-1]), 1e-300)
+    kept = [run.window, *([] if run.trajectory is None else [run.trajectory])]
+    for states in kept:
+        if float(states.time[0]) - slack <= time[0] and time[-1] <= float(states.time[-1]) + slack:
+            return states
+    first, last = float(kept[-1].time[0]), float(kept[-1].time[-1])
+    problem = f"asks for {time[0]:.6g} to {time[-1]:.6g} s; the run keeps {first:.6g} to {last:.6g} s"
+    raise InputError("begin", problem + ("" if run.trajectory is not None else " (simulate with save='all' for the rest)"))
+
+
+def _whole(angle: np.ndarray, rate: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Angles (nt, ...), known but for whole turns, as ones that go on as their rates say."""
+    step = np.diff(time).reshape(-1, *[1] * (angle.ndim - 1))
+    foreseen = 0.5 * step * (rate[1:] + rate[:-1])
+    change = np.diff(angle, axis=0)
+    change = change + 2.0 * np.pi * np.round((foreseen - change) / (2.0 * np.pi))
+    return np.concatenate([angle[:1], angle[:1] + np.cumsum(change, axis=0)])
+
+
+def of_orbit(orbit: Orbit, scene: Scene, time: np.ndarray) -> Stretch:
+    """An exact jam of a `scene` at these times, from the sums that it is. **Raises** `InputError` for one that is not known."""
+    omega = float(orbit.omega)
+    if not np.isfinite(omega) or not np.isfinite(np.asarray(orbit.amplitude)).all():
+        raise InputError("orbit", f"is no motion to be shown: {orbit.message}")
+    if len(orbit.units) != len(scene.machine.structure().coordinates) or orbit.offsets.shape != (scene.loads.count,):
+        raise InputError("scene", "is not the one that the orbit belongs to: it has other coordinates or loads")
+    theta = omega * time
+    q, v, (phi,), _ = jax.vmap(orbit.at)(jnp.asarray(theta))
+    wave = np.exp(1j * np.asarray(orbit.orders)[:, None] * theta)
+    force = np.real(np.asarray(orbit.force_harmonics) @ wave).T
+    return Stretch(time, np.asarray(q), np.asarray(v), (np.asarray(phi),), float(orbit.rotor_speed) * time, force)

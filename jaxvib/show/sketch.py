@@ -1,0 +1,69 @@
+"""A sketch of a scene: platforms, springs, dampers, rotor, loads, with their numbers."""
+
+from __future__ import annotations
+
+import jax
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxvib.draw.machine.parts import put
+from jaxvib.draw.style import panels
+from jaxvib.errors import InputError
+from jaxvib.machine.scene import Scene
+from jaxvib.show.views import View, view_of
+from jaxvib.show.wheel import at_rest, caption
+from jaxvib.units import traced
+
+__all__ = ["checked_scene", "fit", "sketch"]
+
+_INCH = 0.62
+"""Inches of a drawing's unit."""
+
+
+def sketch(scene: Scene, *, ax: Axes | None = None) -> Figure:
+    """Draws a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
+
+    Platforms stand above each other, numbered from the bed upward; a rotor is seen along its axis, one that tilts from the side
+    too. Loads are spread over their circle so that each is seen. Sizes are not to scale but for the loads on their circle.
+
+    **Arguments**: `scene`, of any machine; `ax` axes to draw onto.
+
+    **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for what is no scene, or one
+    whose numbers are not known (within `jit`, `grad`).
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> [text.get_text() for text in jv.sketch(scene).axes[0].texts][:2]
+    ['40 N/mm\\n30 N s/m', 'M1 = 50 kg']
+    """
+    view = view_of(checked_scene(scene))
+    left, right, bottom, top = view.limits
+    figure, (axis,) = panels(1, size=(_INCH * (right - left), _INCH * (top - bottom) + 0.6), ax=ax)
+    fit(axis, view)
+    for part in view.parts(at_rest(scene), 0.0):
+        put(axis, part)
+    for text in view.texts():
+        axis.text(text.x, text.y, text.text, zorder=6, **text.look)
+    axis.set_title(caption(scene), loc="left", fontsize="small")
+    return figure
+
+
+def checked_scene(scene: object) -> Scene:
+    """The scene. **Raises** `InputError` for what is none, and for one whose numbers are not known."""
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+    if any(traced(leaf) for leaf in jax.tree.leaves(scene)):
+        raise InputError(
+            "scene", "has numbers that are not known under a JAX transformation; draw it outside of jit, grad or vmap"
+        )
+    return scene
+
+
+def fit(axis: Axes, view: View) -> None:
+    """Axes without ticks, in the drawing's units."""
+    left, right, bottom, top = view.limits
+    axis.set_xlim(left, right)
+    axis.set_ylim(bottom, top)
+    axis.set_aspect("equal")
+    axis.set_axis_off()

@@ -1,0 +1,138 @@
+"""The rotor with its loads, seen along its axis; and numbers with the units that a drawing has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvib.draw.machine.parts import Part, circle
+from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.machine.loads import Loads
+from jaxvib.machine.scene import Scene
+
+__all__ = ["Pose", "Text", "Wheel", "at_rest", "caption", "places_of", "shown"]
+
+
+class Pose(NamedTuple):
+    """Where everything is at an instant: `displacement` (nd,) m and `velocity` (nd,) m/s, of tilts rad and rad/s, the loads'
+    coordinates `angle`, (count,) each, and the angle `turn` of the rotor, rad."""
+
+    displacement: np.ndarray
+    velocity: np.ndarray
+    angle: tuple[np.ndarray, ...]
+    turn: float
+
+
+class Text(NamedTuple):
+    """A text at a place of the drawing; `look` matplotlib's options."""
+
+    x: float
+    y: float
+    text: str
+    look: dict[str, Any]
+
+
+_UNITS = {
+    "kg": (("kg", 1.0), ("g", 1e3)),
+    "m": (("mm", 1e3),),
+    "N/m": (("N/mm", 1e-3), ("N/m", 1.0)),
+    "N s/m": (("N s/m", 1.0),),
+    "kg m²": (("kg m²", 1.0), ("kg cm²", 1e4)),
+}
+
+
+def shown(value: float, unit: str) -> str:
+    """A number in the unit that a drawing has.
+
+    >>> shown(5e4, "N/m"), shown(0.12, "m"), shown(0.05, "kg")
+    ('50 N/mm', '120 mm', '50 g')
+    """
+    choices = _UNITS[unit]
+    name, factor = next((choice for choice in choices if abs(value) * choice[1] >= 1.0), choices[-1])
+    return f"{value * factor:.4g} {name}"
+
+
+def _span(values: np.ndarray, unit: str) -> str:
+    """One number that all share, or the range of several."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return shown(low, unit) if high - low <= 1e-12 * abs(high) else f"{shown(low, unit)} to {shown(high, unit)}"
+
+
+def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Own positions of loads with these coordinates, m: across, up, and along the axis where they move there."""
+    return [np.asarray(x, float) for x in loads.position(*map(jnp.asarray, angle))]
+
+
+def track_radius(loads: Loads) -> float:
+    """How far from the axis the loads are at rest, m."""
+    across, up, *_ = loads.position(*loads.rest())
+    return float(jnp.max(jnp.hypot(across, up)))
+
+
+def at_rest(scene: Scene) -> Pose:
+    """The pose of a sketch: nothing displaced, loads spread evenly so that each is seen."""
+    first, *others = (np.asarray(u, float) for u in scene.loads.rest())
+    spread = first + 2.0 * np.pi * np.arange(scene.loads.count) / scene.loads.count + np.pi * 5.0 / 6.0
+    zero = np.zeros(len(scene.machine.structure().coordinates))
+    return Pose(zero, zero, (spread, *others), 0.0)
+
+
+def caption(scene: Scene) -> str:
+    """Loads, drive and effects in a few words and numbers, for the head of a sketch."""
+    loads, drive = scene.loads, scene.drive
+    each = " each" if loads.count > 1 else ""
+    named = loads.kind.replace("_", " ") + ("s" if loads.count > 1 else "")
+    words = [f"{loads.count} {named}, m = {_span(np.asarray(loads.mass), 'kg')}{each}"]
+    words += [f"R = {shown(track_radius(loads), 'm')}"]
+    drag = getattr(loads, "drag", None)
+    if drag is not None:
+        words.append(f"drag {_span(np.asarray(drag), 'N s/m')}")
+    speed = float(drive.speed)
+    lines = [", ".join(words), f"{drive.kind.replace('_', ' ')}: {30.0 / np.pi * speed:.5g} rpm ({speed:.5g} rad/s)"]
+    if scene.effects:
+        lines.append("with " + ", ".join(effect.kind.replace("_", " ") for effect in scene.effects))
+    return "\n".join(lines)
+
+
+class Wheel:
+    """The rotor of a scene with its loads, seen along its axis: `radius` of the loads' circle in the drawing."""
+
+    def __init__(self, scene: Scene, radius: float):
+        self.loads, self.radius = scene.loads, radius
+        self.scale = radius / track_radius(scene.loads)
+        own = getattr(scene.loads, "own_radius", None)
+        self.size = 0.12 * radius / 0.7 if own is None else max(float(own) * self.scale, 0.05)
+        self.rim = radius + max(1.15 * self.size, 0.1)
+
+    def places(self, angle: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+        """Where the loads are relative to the axis, in the drawing: across, up, and along where they move there."""
+        return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in places_of(self.loads, angle)]
+
+    def parts(self, centre: tuple[float, float], pose: Pose) -> list[Part]:
+        """The rim, the loads' circle, two spokes that turn with the rotor, and the loads."""
+        x, y = centre
+        found = [
+            Part(circle(centre, self.rim), {"fc": "#f4f4f4", "ec": "black", "lw": 1.4, "zorder": 3}, True),
+            Part(circle(centre, self.radius), {"color": GUIDE, "lw": 0.7, "ls": ":", "zorder": 3.1}),
+        ]
+        for turn in (pose.turn, pose.turn + 0.5 * np.pi):
+            e = np.array([np.cos(turn), np.sin(turn)])
+            look = {"color": "#9a9a9a", "lw": 1.0, "zorder": 3.2}
+            found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look))
+        mark = np.array([np.cos(pose.turn), np.sin(pose.turn)])
+        found.append(
+            Part(circle(tuple(centre + 0.82 * self.rim * mark), 0.05), {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True)
+        )
+        across, up, *_ = self.places(pose.angle)
+        for j in range(self.loads.count):
+            color = COLORS[j % len(COLORS)]
+            place = (x + float(across[j]), y + float(up[j]))
+            if self.loads.has_bearing:
+                found.append(Part(np.array([centre, place]), {"color": color, "lw": 2.0, "zorder": 3.4}))
+            look = {"fc": color, "ec": "black", "lw": 0.8, "zorder": 3.5 + 0.001 * j}
+            found.append(Part(circle(place, self.size, 31), look, True))
+        found.append(Part(circle(centre, 0.04, 13), {"fc": "black", "ec": "none", "zorder": 3.6}, True))
+        return found

@@ -1,0 +1,90 @@
+"""Mode shapes: how the machine vibrates freely at each of its natural frequencies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.linear import linear_model
+from jaxvib.machine.checked import checked
+from jaxvib.machine.scene import Scene
+from jaxvib.results.fields import in_unit
+from jaxvib.results.result import Result
+from jaxvib.results.status import Computed
+from jaxvib.runtime.programs import cached
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import SpeedUnit
+
+__all__ = ["ModeShapes", "mode_shapes"]
+
+
+class ModeShapes(Result):
+    """Undamped free vibrations, ascending: `frequency` (nd,) rad/s; `shape` (nd, nd), a row a mode, the amplitude of each
+    coordinate relative to the largest, tilts in rad times their `lever` (nd,) m, the radius of gyration (1 for lengths);
+    `coordinates` (nd,)."""
+
+    status = Computed.done
+
+    frequency: Array = eqx.field(metadata=in_unit("rad/s", "shape_mode"))
+    shape: Array = eqx.field(metadata=in_unit("", "shape_mode", "coordinate"))
+    lever: Array = eqx.field(metadata=in_unit("m", "coordinate"))
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+
+    def summary(self) -> str:
+        """A line a mode, for a person to read."""
+        rows = zip(np.asarray(self.frequency), np.asarray(self.shape), strict=True)
+        parts = [
+            f"{w:.6g} rad/s: " + ", ".join(f"{name} {x:+.3f}" for name, x in zip(self.coordinates, row, strict=True))
+            for w, row in rows
+        ]
+        return "\n".join(parts)
+
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+        """The shapes as bars, a group for each mode with its frequency in `unit`.
+
+        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        """
+        from jaxvib.draw.results import shapes_chart  # slow to import: only who draws pays
+
+        return shapes_chart(np.asarray(self.frequency), np.asarray(self.shape), names=self.coordinates, unit=unit, ax=ax)
+
+
+def mode_shapes(scene: Scene) -> ModeShapes:
+    """Natural frequencies and mode shapes of the machine with its loads on it, no damping, rotor at rest.
+
+        K X = w^2 (M + sum_j m_j B^T B) X
+
+    **Returns** `ModeShapes`. **Raises** `InputError` for what is no scene.
+
+    >>> import jaxvib as jv
+    >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
+    ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
+    >>> print(jv.mode_shapes(form.scene()).summary())
+    0.333333 rad/s: y1 +1.000, y2 +1.000
+    1 rad/s: y1 +1.000, y2 -1.000
+
+    Source: the antiphase paper, equations (19), (23).
+    """
+    return _mode_shapes(checked(scene))
+
+
+@cached
+def _mode_shapes(scene: Scene) -> ModeShapes:
+    model = linear_model(scene)
+    frequency, vectors = model.modes()
+    inertia = jnp.diagonal(model.mass)
+    tilts = np.array([unit == "rad" for unit in model.carrier.units])
+    lever = jnp.where(tilts, jnp.sqrt(inertia / inertia[0]), 1.0)
+    rows = vectors.T * lever[None, :]
+    # The largest is 1; of several alike the first.
+    size = jnp.abs(rows)
+    place = jnp.argmax(size > (1.0 - 1e-6) * jnp.max(size, axis=1, keepdims=True), axis=1)
+    return ModeShapes(frequency, rows / jnp.take_along_axis(rows, place[:, None], axis=1), lever, model.carrier.coordinates)

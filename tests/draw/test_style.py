@@ -1,0 +1,141 @@
+"""Colours that every reader tells apart, legends that cover no data, axes that are given."""
+
+import itertools
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import jaxvib as jv
+from jaxvib.draw.charts import before_after, branch_diagram
+from jaxvib.draw.motion.histories import band, time_histories
+from jaxvib.draw.style import COLORS, legend_above, numbered, panels
+
+# Machado, Oliveira, Fernandes 2009: what readers without one kind of cones see, of linear RGB.
+VISION = {
+    "normal": np.eye(3),
+    "protanopia": np.array([[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]),
+    "deuteranopia": np.array(
+        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+    ),
+    "tritanopia": np.array([[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]),
+}
+
+
+def lab(color, vision):
+    """CIELAB of a colour as seen with that vision."""
+    levels = np.array([int(color[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    linear = vision @ np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ np.clip(linear, 0, 1)
+    f = xyz / [0.9505, 1.0, 1.089]
+    f = np.where(f > 0.008856, np.cbrt(f), 7.787 * f + 16.0 / 116.0)
+    return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("vision", VISION)
+def test_the_first_six_colours_differ_for_every_reader(vision):
+    seen = [lab(color, VISION[vision]) for color in COLORS[:6]]
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)) > 15.0
+
+
+def test_the_first_four_colours_differ_in_grey():
+    grey = sorted(lab(color, np.eye(3))[0] for color in COLORS[:4])
+    assert min(np.diff(grey)) > 6.0
+
+
+def test_a_legend_stands_above_its_panel():
+    figure, (axis,) = panels(1)
+    axis.plot([0.0, 1.0], [0.0, 1.0], label="line")
+    legend_above(axis)
+    figure.canvas.draw()
+    assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
+
+
+def test_numbers_that_nearly_touch_are_one_text_and_what_is_outside_has_none():
+    axis = Figure().subplots()
+    axis.set_ylim(0.0, 1.0)
+    numbered(axis, 0.5, [0.5, 0.51, 0.9, 7.0, np.nan], ["3", "4", "5", "6", "7"], [True, False, True, True, True])
+    assert [text.get_text() for text in axis.texts] == ["3, 4", "5"]
+    assert [line.get_markerfacecolor() for line in axis.lines] == ["black", "white", "black"]
+
+
+def diagram(**options):
+    omega = np.linspace(1.0, 5.0, 81)
+    speed = omega + 4.0 / (1.0 + 9.0 * (omega - 3.0) ** 2)
+    arrays = dict(force=omega**3, resonances=np.array([3.0]))
+    marks = [("fold: the jam ends", np.array([7.0]), np.array([3.0]))]
+    modes = np.where(omega < 3.0, 1, np.where(omega < 3.6, 2, 3))
+    own = dict(
+        amplitude=np.stack([omega, omega**2], 1), modes=modes, marks=marks, names=("y1", "y2"), at=5.0, judged="by slope"
+    )
+    return branch_diagram(speed, omega, modes != 2, **arrays, **{**own, **options}), speed, omega
+
+
+def test_a_branch_diagram_says_what_its_lines_are_and_numbers_the_modes():
+    figure, speed, omega = diagram(unit="rpm")
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"stable", "unstable", "resonance", "speed of the rotor", "operating speed; numbers: jam modes", "y1", "y2"} < set(
+        told
+    )
+    assert "fold: the jam ends" in told and figure.get_supxlabel() == "stable by slope"
+    assert [axis.get_ylabel() for axis in figure.axes] == [
+        "speed of loads, rpm",
+        "amplitude, mm, zero to peak",
+        "foundation force, N, zero to peak",
+    ]
+    numbers = sorted(",".join(text.get_text() for text in figure.axes[0].texts).replace(" ", "").split(","))
+    assert numbers == ["1", "2", "3"]
+    drawn = figure.axes[0].lines[0].get_xydata()
+    np.testing.assert_allclose(drawn, np.stack([speed, omega], 1)[: len(drawn)] * 30.0 / np.pi)
+
+
+def test_more_than_two_coordinates_have_a_panel_each_and_panels_are_chosen():
+    figure, _, omega = diagram(amplitude=np.ones((81, 4)), names=("y1", "y2", "y3", "y4"))
+    assert [axis.get_ylabel() for axis in figure.axes][1:5] == [f"amplitude of y{k}, mm" for k in (1, 2, 3, 4)]
+    axis = Figure().subplots()
+    figure, _, omega = diagram(show=("force",), ax=axis)
+    assert figure is axis.figure and axis.get_ylabel().startswith("foundation force, N")
+    assert np.isin(axis.lines[0].get_ydata(), omega**3).all()
+    with pytest.raises(jv.InputError, match=r"show is \('power',\); it names some of: speed, amplitude, force"):
+        diagram(show=("power",))
+
+
+def test_a_band_holds_the_signal_and_the_last_periods_are_the_signal():
+    t = np.linspace(0.0, 10.0, 10_001)
+    y = np.sin(2.0 * np.pi * 10.0 * t) * t
+    middle, low, high = band(t, y, 50)
+    assert middle.size == 50 and np.all(high >= np.interp(middle, t, y)) and np.all(low <= np.interp(middle, t, y))
+    np.testing.assert_allclose(high[-1], 10.0, rtol=0.01)
+    arrays = (t, np.stack([y, -y], 1), np.ones((t.size, 2)), 2.0 * np.ones_like(t), y[:, None])
+    figure = time_histories(arrays, arrays, names=("y1", "y2"), directions=("up",))
+    left, right = figure.axes[:2]
+    assert len(left.collections) == 2 and [text.get_text() for text in left.get_legend().get_texts()] == ["y1", "y2"]
+    x, shown = right.lines[0].get_data()
+    np.testing.assert_allclose(shown, 1e3 * y[-x.size :])
+    np.testing.assert_allclose(x[-1] - x[0], 0.3, rtol=0.02)  # three periods, in which antiphase is seen
+    np.testing.assert_allclose(right.lines[1].get_ydata(), -shown)
+
+
+def test_before_and_after_shows_what_falls_a_thousandfold():
+    figure = before_after([("force, N", 1424.0, 2.1), ("speed, rpm", 570.0, 570.0), ("more", 1.0, 3.0)])
+    axis = figure.axes[0]
+    bars = [bar for bar in axis.patches if bar.get_width() and bar.get_height()]
+    np.testing.assert_allclose([bar.get_x() + bar.get_width() for bar in bars], [2.1 / 1424.0, 3.0])
+    assert axis.get_xscale() == "log" and "1424 → 2.1   (0.00147 x)" in [text.get_text() for text in axis.texts]
+
+
+def test_the_figure_of_jam_modes_names_the_coordinates():
+    scene = jv.Scene(
+        jv.two_mass(mass=[50.0, 80.0], stiffness=[4e4, 6e4], damping=[100.0, 100.0], link_stiffness=2e4, link_damping=20.0),
+        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
+        jv.ConstantSpeed("60 rad/s"),
+    )
+    modes = jv.jam_modes(scene)
+    for found in (modes, modes.select(modes.mode_numbers()[0])):
+        legend = found.plot().axes[1].get_legend()
+        assert [text.get_text() for text in legend.get_texts()] == ["y1", "y2"]
+
+
+def test_axes_that_are_none_are_refused():
+    with pytest.raises(jv.InputError, match=r"ax is \[1.0\]; give matplotlib's Axes"):
+        panels(1, ax=[1.0])

@@ -1,0 +1,199 @@
+"""Sketches of every machine, films of runs and exact jams."""
+
+import re
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import jaxvib as jv
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.show.layout import Tie, lanes
+from jaxvib.show.motion import of_orbit, of_run
+from jaxvib.show.views import view_of
+from jaxvib.show.wheel import Pose, at_rest
+
+SCENE = jv.Scene(
+    jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
+    jv.ConstantSpeed("60 rad/s"),
+)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return jv.simulate(SCENE, 2.0, start="jam", mode=1, samples=4096, estimate=False)
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    return jv.jam_orbit(SCENE, mode=1)
+
+
+def thinned(run, every):
+    """The run as it had kept fewer states."""
+    return eqx.tree_at(lambda r: r.trajectory, run, jax.tree.map(lambda x: x[::every], run.trajectory))
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_every_machine_has_a_sketch_with_its_numbers(kind):
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    axis = Figure().subplots()
+    assert jv.sketch(scene, ax=axis) is axis.figure
+    told = " ".join([axis.get_title(loc="left"), *(text.get_text() for text in axis.texts)])
+    first = float(np.ravel(scene.machine.mass)[0])
+    assert f"{first:.4g} kg" in told and "rpm" in told and f"{scene.loads.count} {scene.loads.kind.replace('_', ' ')}s" in told
+    stiffness = float(np.max(np.asarray(scene.machine.stiffness)))
+    assert f"{stiffness / 1e3:.4g} N/mm" in told
+    # A circle for each load, and nothing outside of the picture.
+    left, right, bottom, top = view_of(scene).limits
+    points = np.concatenate([part.points for part in view_of(scene).parts(at_rest(scene), 0.0)])
+    points = points[np.all(np.isfinite(points), axis=1)]
+    assert left <= points[:, 0].min() and points[:, 0].max() <= right
+    assert bottom <= points[:, 1].min() and points[:, 1].max() <= top
+
+
+def test_springs_cross_no_platform_that_they_do_not_hold():
+    ties = [Tie(0, 1), Tie(0, 2), Tie(0, 3), Tie(1, 2), Tie(1, 3), Tie(2, 3), Tie(2, 2)]
+    order = lanes(ties, 3)
+    place = {k: x for x, k in enumerate(order)}
+    for k, tie in enumerate(ties):
+        for level in range(tie.low + 1, tie.high):
+            own = [place[j] for j, other in enumerate(ties) if level in (other.low, other.high)]
+            assert not min(own) < place[k] < max(own)
+
+
+def test_forces_of_supports_add_up_to_the_force_on_the_bed():
+    rng = np.random.default_rng(0)
+    for kind in TEMPLATES:
+        scene = jv.scene_from_toml(TEMPLATES[kind])
+        view, rest = view_of(scene), at_rest(scene)
+        q, v = rng.normal(size=(2, rest.displacement.size))
+        total = np.sum(view.support_forces(Pose(q, v, rest.angle, 0.0)), axis=0)
+        force = np.asarray(scene.machine.carrier().bed_force(q, v))
+        np.testing.assert_allclose(total[1], force[-1], rtol=1e-9)
+
+
+def test_what_moves_is_drawn_where_it_is():
+    view, rest = view_of(SCENE), at_rest(SCENE)
+    pose = rest._replace(displacement=np.array([0.01]), angle=(np.array([0.0, np.pi / 2.0]),))
+    before, after = view.parts(rest, 5.0), view.parts(pose, 5.0)
+    lifted = {
+        float(np.round(np.mean(b.points - a.points), 6)) for a, b in zip(before, after, strict=True) if len(a.points) == 5
+    }
+    assert lifted == {0.025}  # the platform by 0.05 upward, not across
+    balls = [part.points for part in after if len(part.points) == 31]
+    middle = [np.mean(points[:-1], axis=0) for points in balls]
+    np.testing.assert_allclose(middle[1] - middle[0], [-view.wheel.radius, view.wheel.radius], atol=1e-9)
+
+
+def test_a_run_between_its_samples(run):
+    kept = run.trajectory
+    t = np.asarray(kept.time)
+    some = slice(1000, 1200)
+    found = of_run(run, t[some])
+    np.testing.assert_allclose(found.displacement, kept.state.displacement[some], rtol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * found.angle[0]), np.exp(1j * np.asarray(kept.state.angle[0][some])), rtol=1e-9)
+    # Every other sample, from its neighbours, is what it was.
+    coarse = thinned(run, 2)
+    found = of_run(coarse, t[some])
+    np.testing.assert_allclose(found.displacement, kept.state.displacement[some], atol=1e-5 * float(run.amplitude[0]))
+    np.testing.assert_allclose(np.exp(1j * found.turn), np.exp(60j * t[some]), atol=1e-6)
+
+
+def test_an_orbit_is_the_run_that_settled_on_it(orbit):
+    time = np.linspace(0.0, 0.2, 50)
+    found = of_orbit(orbit, SCENE, time)
+    force = SCENE.machine.stiffness[0] * found.displacement + SCENE.machine.damping[0] * found.velocity
+    np.testing.assert_allclose(found.force, force, rtol=1e-6, atol=1e-6 * float(orbit.foundation_force))
+    np.testing.assert_allclose(found.turn, float(orbit.rotor_speed) * time)
+
+
+def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
+    short = dict(begin=1.5, end=1.6, seconds=0.4, width=3.0)
+    film = jv.animate(run, tmp_path / "a.gif", **short)
+    jv.animate(run, tmp_path / "b.gif", **short)
+    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert picture.n_frames == film.count == 8 and picture.size == (300, picture.size[1])
+        first = np.asarray(picture.convert("RGB"))
+        picture.seek(4)
+        assert np.any(np.asarray(picture.convert("RGB")) != first) and first[0, 0].tolist() == [255, 255, 255]
+    film.save(tmp_path / "a<b>.html")
+    page = (tmp_path / "a<b>.html").read_text()
+    assert not re.search(r"https?:|src=[\"']?//|<link|@import", page) and page.count("iVBOR") == 8
+    assert "<title>a&lt;b&gt;</title>" in page
+    clock = film.figure.axes[0].get_title(loc="left")
+    assert re.match(r"t =\s+1\.[56]\d\d s\s+force on the bed\s+-?\d+ N", clock)
+    assert "slowed down 4 x" in film.figure.axes[0].texts[0].get_text()
+    assert jv.animate(orbit, scene=SCENE, width=3.0).count > 50
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda run, orbit: jv.sketch(3.0), "scene is 3.0; it must be a Scene"),
+        (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "not known under a JAX transformation"),
+        (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not have it"),
+        (lambda run, orbit: jv.animate(run, scene=SCENE), "scene goes with an Orbit only"),
+        (lambda run, orbit: jv.animate(SCENE), "motion is a Scene; give a Run, or an Orbit"),
+        (lambda run, orbit: jv.animate(run, "a.mp4"), "path is 'a.mp4'; films are written as .gif or .html"),
+        (lambda run, orbit: jv.animate(run, "no/such/folder.gif", begin=1.9), "cannot be written"),
+        (lambda run, orbit: jv.animate(run, begin=1.0, end="0.5 s"), "end is 0.5 s; it must be after the beginning, 1 s"),
+        (lambda run, orbit: jv.animate(run, end=3.0), "begin asks for .* the run keeps 0 to 2 s"),
+        (lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0), "end makes the rotor go on by 0.955 turns .* deceives"),
+        (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),
+        (lambda run, orbit: jv.animate(run, magnify=-1.0), "magnify is -1; it must be greater than 0"),
+        (
+            lambda run, orbit: jv.animate(thinned(run, 128), begin=0.1, end=0.3),
+            "run has 32 samples, between which loads turn by up to .* simulate with samples=",
+        ),
+        (lambda run, orbit: run.plot_path(), "machine.kind is 'one_mass', which moves up and down only"),
+        (lambda run, orbit: run.spectrum(0), "parts is 0; it must be a whole number, at least 1"),
+        (lambda run, orbit: run.spectrum(900), "parts is 900, which leaves 9 samples for a piece"),
+        (lambda run, orbit: run.spectrum().plot(show="power"), "show is 'power'; it must be"),
+        (lambda run, orbit: run.spectrum().plot(coordinate="z"), "coordinate is 'z'; there are y1"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(run, orbit, ask, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(jv.InputError, match=says):
+        ask(run, orbit)
+
+
+def test_a_spectrum_has_the_height_of_the_vibration(run):
+    found = run.spectrum()
+    peak = int(np.argmax(found.amplitude[0, :, 0]))
+    np.testing.assert_allclose(found.amplitude[0, peak, 0], run.amplitude[0], rtol=0.03)
+    assert abs(found.frequency[peak] - run.omega) <= found.frequency[1]  # as finely as frequencies are computed
+    figure = found.plot(unit="Hz")
+    np.testing.assert_allclose(figure.axes[0].lines[0].get_xydata()[:, 1], 1e3 * found.amplitude[0, :, 0])
+    assert "resonances" in [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    fall = run.spectrum(6)
+    assert fall.amplitude.shape[0] == 6 and np.all(np.diff(fall.time) > 0.0)
+    labels = [axes.get_ylabel() for axes in fall.plot(unit="rpm").axes]
+    assert labels == ["frequency, rpm", "y1, mm, zero to peak"]
+
+
+def test_mode_shapes_against_the_eigenproblem():
+    scene = jv.scene_from_toml(TEMPLATES["network"])
+    found, carrier = jv.mode_shapes(scene), jax.tree.map(np.asarray, scene.machine.carrier())
+    mass = np.asarray(carrier.mass) + 2.4 * np.outer(carrier.port[0], carrier.port[0])
+    for w, x in zip(np.asarray(found.frequency), np.asarray(found.shape), strict=True):
+        np.testing.assert_allclose(carrier.stiffness @ x, w**2 * mass @ x, atol=1e-9 * np.max(np.abs(carrier.stiffness)))
+        assert np.max(np.abs(x)) == pytest.approx(1.0)
+    bars = [bar.get_height() for bar in found.plot().axes[0].patches]
+    np.testing.assert_allclose(np.sort(bars), np.sort(np.ravel(found.shape)))
+
+
+def test_the_path_of_a_rotors_axis(run):
+    rotor = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), SCENE.loads, SCENE.drive)
+    moved = 1e-3 * np.stack([np.cos(30.0 * np.asarray(run.window.time)), np.sin(30.0 * np.asarray(run.window.time))], axis=1)
+    turned = eqx.tree_at(lambda r: (r.scene, r.window.state.displacement), run, (rotor, moved))
+    axis = turned.plot_path().axes[0]
+    across, up = axis.lines[0].get_data()
+    np.testing.assert_allclose(np.stack([across, up], axis=1), 1e3 * moved[-across.size :])
+    assert axis.get_aspect() == 1.0 and (axis.get_xlabel(), axis.get_ylabel()) == ("across, mm", "up, mm")
