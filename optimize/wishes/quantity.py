@@ -18,7 +18,10 @@ from jaxvib.steady.jams.jam import JamModes
 from jaxvib.units import Number, number
 from optimize.wishes.answers import Answers
 
-__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "number_in", "walk"]
+__all__ = [
+    *("TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier"),
+    *("greatest", "largest", "least", "number_in", "walk"),
+]
 
 Pair = int | tuple[int, int] | None
 """Whose amplitude: a platform's own, or that of one platform relative to another; None: see `between`."""
@@ -72,6 +75,11 @@ class Quantity:
         if _arguments(self.function) == 1:
             return jnp.reshape(self.function(answers.scene), ())
         return jnp.reshape(self.function(answers.scene, answers.modes), ())
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        """Smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity where `sign` is -1: a
+        search may go along the kinks where two of them are alike."""
+        return jnp.reshape(sign * self.read(answers), (1,))
 
     @property
     def words(self) -> str:
@@ -155,6 +163,8 @@ class Asking(Quantity):
     settings: tuple[Any, ...] = ()
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
+    parted: Callable[..., Array] | None = None
+    """What gives its `pieces`: a function of the answers, the sign, the tier and the settings."""
 
     def __post_init__(self) -> None:
         if self.tier not in TIERS:
@@ -165,6 +175,11 @@ class Asking(Quantity):
     def read(self, answers: Answers) -> Array:
         assert self.function is not None
         return jnp.reshape(self.function(answers, self.tier, *self.settings), ())
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        if self.parted is None:
+            return super().pieces(answers, sign)
+        return self.parted(answers, sign, self.tier, *self.settings)
 
     @property
     def words(self) -> str:
@@ -213,9 +228,27 @@ class Combined(Quantity):
             case "**":
                 return values[0] ** values[1]
             case "largest":
-                return jnp.max(jnp.stack(values))
+                return greatest(jnp.stack(values))
             case _:
-                return jnp.min(jnp.stack(values))
+                return -greatest(-jnp.stack(values))
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        if self.operation == "neg":
+            return self.parts[0].pieces(answers, -sign)
+        if self.operation == ("largest" if sign > 0.0 else "least"):
+            return jnp.concatenate([part.pieces(answers, sign) for part in self.parts])
+        if self.operation in ("+", "-"):
+            one = self.parts[0].pieces(answers, sign)
+            other = self.parts[1].pieces(answers, sign if self.operation == "+" else -sign)
+            return (one[:, None] + other[None, :]).reshape(-1)
+        if self.operation in ("*", "/"):
+            for part, other in (self.parts, self.parts[::-1])[: 1 if self.operation == "/" else 2]:
+                numbers = part.pieces(answers, sign)
+                if len(numbers) > 1:  # they are those of the product where the other one is positive
+                    by = other.read(answers)
+                    many = numbers * by if self.operation == "*" else numbers / by
+                    return jnp.where(by > 0.0, many, sign * self.read(answers))
+        return super().pieces(answers, sign)
 
     def at_tier(self, tier: Tier) -> Quantity:
         super().at_tier(tier)
@@ -287,6 +320,12 @@ def _arguments(function: Callable[..., Any]) -> int:
         return 1
     free = [p for p in given if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     return len(free)
+
+
+def greatest(values: Array) -> Array:
+    """The greatest of some numbers (n,), with its derivatives: those of `jnp.max` are 0/0 where a compiler computes two that
+    are alike twice and rounds them differently."""
+    return values[jnp.argmax(values)]
 
 
 @lru_cache(maxsize=256)
