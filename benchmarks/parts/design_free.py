@@ -4,8 +4,8 @@ Asked is a small foundation force per amplitude of the chain's ends in its highe
 from those that are there: (force per amplitude / 1 N/mm)^2 + the mean of (ln k/k0)^2. All searches see the same objective
 between the same bounds and follow the jam from a near design; designs without it count as infinitely bad.
 
-What is compared is when each has first come within 1 % of the least value that any of them found: in seconds and in evaluations,
-of a value with its gradient where gradients are used, of a value elsewhere. Programs are compiled before.
+What is compared is when each has first come within 1 % of the least value that any of them found: in seconds and in
+evaluations, of a value with its gradient where gradients are used, of a value elsewhere. Programs are compiled before.
 """
 
 from __future__ import annotations

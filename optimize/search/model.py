@@ -115,7 +115,8 @@ def curvatures(
     value = point.values[:, 0]
     if problem.parts > 1 or not np.any(value > 0.0):
         return [_positive(projector, bend)]
-    other = constraints + second[:, :, -1] / np.maximum(size * value, 1e-300)[:, None, None]
+    with np.errstate(all="ignore"):  # an objective that is nothing has no such ones
+        other = constraints + second[:, :, -1] / (size * value)[:, None, None]
     apt = usable & (value > 0.0)[:, None, None] & np.all(np.isfinite(other), axis=(1, 2), keepdims=True)
     return [_positive(projector, bend), _positive(projector, np.where(apt, other, bend))]
 
@@ -175,5 +176,7 @@ def fall(problem: Problem, point: Point, bend: np.ndarray, model: Step, size: np
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]
     paid = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
     curved = np.einsum("si,sij,sj->s", model.p, bend, model.p) * size
-    least = np.maximum(np.abs(point.values[:, 0]), _NOTHING * np.max(np.abs(slopes), axis=(1, 2)))
+    # At the tip of a modulus that vanishes slopes say nothing, and how they change does.
+    change = np.max(np.abs(slopes), axis=(1, 2)) + _WIDTH * np.trace(bend, axis1=1, axis2=2) * size
+    least = np.maximum(np.abs(point.values[:, 0]), _NOTHING * change)
     return np.abs(along + paid + 0.5 * curved) / np.maximum(least, 1e-300)
