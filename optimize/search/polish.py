@@ -178,7 +178,8 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             bends = curvatures(problem, here, second[index], seen[index], shares[index], size[index])
             models = [modelled(problem, here, bend, size[index], price[index], reach[index]) for bend in bends]
             model = models[0]
-            left[index] = fall(problem, here, bends[0], model, size[index])
+            falls = [fall(problem, here, b, m, size[index]) for b, m in zip(bends, models, strict=True)]
+            left[index] = np.minimum(falls[0], falls[-1])
             dual = np.concatenate([model.held, model.demands], axis=1)
             # A price below the multipliers lets a constraint be broken that could be kept.
             short = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * price[index]
