@@ -142,7 +142,8 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
-    widest = max([1.5, *np.exp(np.abs(np.log(ratios[drawn])))])
+    # What nearly vanishes leaves the axis: all others would be lines.
+    widest = min(max([1.5, *np.exp(np.abs(np.log(ratios[drawn])))]), 1e4)
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
         if there:
             axis.barh(place, ratio - 1.0, left=1.0, color=COLORS[0] if ratio <= 1.0 else COLORS[1], height=0.6)
