@@ -14,10 +14,11 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.space.numbers import Place, changed, places_of, value_of
 from optimize.wishes.answers import Answers, Key, Recorder
-from optimize.wishes.quantity import Quantity, Tier, greatest
+from optimize.wishes.quantity import Quantity, Tier
 
 __all__ = ["expected", "quantile", "under", "worst"]
 

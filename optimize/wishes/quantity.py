@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import jax.numpy as jnp
@@ -14,14 +12,13 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
-from jaxvib.units import Number, number
+from jaxvib.units import Number
 from optimize.wishes.answers import Answers
+from optimize.wishes.given import arguments, number_in, same_unit
 
-__all__ = [
-    *("TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier"),
-    *("greatest", "largest", "least", "number_in", "walk"),
-]
+__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "number_in", "walk"]
 
 Pair = int | tuple[int, int] | None
 """Whose amplitude: a platform's own, or that of one platform relative to another; None: see `between`."""
@@ -61,7 +58,7 @@ class Quantity:
     of: Pair = None
 
     def __post_init__(self) -> None:
-        if type(self) is Quantity and not (callable(self.function) and _arguments(self.function) in (1, 2)):
+        if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
             problem = "give a function of a scene, or of a scene and its jam modes"
             raise InputError(f"quantity {self.name!r}", f"has the function {self.function!r}; {problem}")
 
@@ -72,7 +69,7 @@ class Quantity:
     def read(self, answers: Answers) -> Array:
         """The quantity's value, a scalar in `unit`, from what is known of a scene."""
         assert self.function is not None
-        if _arguments(self.function) == 1:
+        if arguments(self.function) == 1:
             return jnp.reshape(self.function(answers.scene), ())
         return jnp.reshape(self.function(answers.scene, answers.modes), ())
 
@@ -277,7 +274,7 @@ class Demand:
         other = (
             limit if isinstance(limit, Quantity) else _constant(number_in(limit, quantity.unit, quantity.words), quantity.unit)
         )
-        if not _same_unit(other.unit, quantity.unit):
+        if not same_unit(other.unit, quantity.unit):
             raise InputError(
                 quantity.words, f"is in {quantity.unit or 'no unit'} and compared with {other.words} in {other.unit}"
             )
@@ -312,40 +309,6 @@ class Demand:
         raise InputError(self.words, problem)
 
 
-def _arguments(function: Callable[..., Any]) -> int:
-    """How many arguments a function must be given; 1 where nobody says."""
-    try:
-        given = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return 1
-    free = [p for p in given if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return len(free)
-
-
-def greatest(values: Array) -> Array:
-    """The greatest of some numbers (n,), with its derivatives: those of `jnp.max` are 0/0 where a compiler computes two that
-    are alike twice and rounds them differently."""
-    return values[jnp.argmax(values)]
-
-
-@lru_cache(maxsize=256)
-def _same_unit(one: str, other: str) -> bool:
-    if one == other:
-        return True
-    import pint  # half a second, and most units are written alike
-
-    units = pint.get_application_registry()
-    try:
-        return abs(float((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless")) - 1.0) < 1e-12
-    except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError):
-        return False
-
-
-def number_in(value: Number, unit: str, name: str) -> float:
-    """A number or text in a unit."""
-    return float(number(value, unit, name))
-
-
 def _constant(value: float, unit: str) -> Combined:
     return Combined(f"{value:.6g} {unit}".strip(), unit, operation="constant", constant=value)
 
@@ -376,7 +339,7 @@ def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
 def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
     names = [x.words if isinstance(x, Quantity) else repr(x) for x in (one, other)]
     left, right = _with_unit(one, names[1]), _with_unit(other, names[0])
-    if not _same_unit(left.unit, right.unit):
+    if not same_unit(left.unit, right.unit):
         raise InputError(
             f"{names[0]} {sign} {names[1]}",
             f"puts together {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
@@ -400,7 +363,7 @@ def _product(one: Operand, other: Operand) -> Quantity:
 def _ratio(one: Operand, other: Operand) -> Quantity:
     left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
     below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
-    unit = "" if _same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
+    unit = "" if same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
     return _made("/", f"{_inside(left)} / {_inside(right)}", unit, left, right)
 
 
@@ -408,7 +371,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
     if not quantities or not all(isinstance(q, Quantity) for q in quantities):
         raise InputError(operation, f"has {quantities!r}; give one quantity or several")
     for each in quantities[1:]:
-        if not _same_unit(each.unit, quantities[0].unit):
+        if not same_unit(each.unit, quantities[0].unit):
             raise InputError(operation, f"puts together {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
     name = f"{operation} of ({'; '.join(q.words for q in quantities)})"
     return _made(operation, name, quantities[0].unit, *quantities)

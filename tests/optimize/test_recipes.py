@@ -10,6 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto
 from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune, widest_range
+from optimize.space.numbers import changed, places_of
 
 SCENE = scene("two_mass", speed=120.0)
 
@@ -56,7 +57,9 @@ def test_the_lightest_exciter_shakes_by_what_is_asked_and_no_more():
 @pytest.mark.slow
 def test_the_antiphase_machine_balances_each_platform_on_its_own_spring():
     """Little damped platforms in antiphase leave the bed alone where M1 y1 + M2 y2 = 0 and k1 y1 + k2 y2 = 0: k1/M1 = k2/M2."""
-    light = eqx.tree_at(lambda s: (s.machine.damping, s.machine.link_damping), SCENE, (jnp.array([0.4, 0.2]), jnp.array([0.6])))
+    light = eqx.tree_at(
+        lambda s: (s.machine.damping, s.machine.link_damping), SCENE, (jnp.array([0.04, 0.02]), jnp.array([0.06]))
+    )
     best = antiphase(light).run(starts=32, verify=False)
     k, m = best.scene.machine.stiffness, np.asarray([120.0, 95.0 + 2.4])
     assert best.status_name == "done"
@@ -83,16 +86,16 @@ def test_the_middle_platform_rests_at_the_anti_resonance():
 @pytest.mark.slow
 def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
     found = retune(SCENE, force_per_amplitude(mode=3), starts=8)
-    places = {f"machine.stiffness[{k}]": (lambda s, k=k: s.machine.stiffness[k]) for k in (0, 1)}
-    places["machine.link_stiffness[0]"] = lambda s: s.machine.link_stiffness[0]
     asked = jax.jit(force_per_amplitude(mode=3).__call__)
     least = {}
-    for name, place in places.items():
-        shares = np.geomspace(1.0 / 3.0, 3.0, 301)
-        least[name] = np.nanmin([float(asked(eqx.tree_at(place, SCENE, place(SCENE) * share))) for share in shares])
+    for name, _ in found:
+        place = places_of(SCENE, name, "free")
+        scan = [changed(SCENE, place, place.read(SCENE) * share) for share in np.geomspace(1.0 / 3.0, 3.0, 301)]
+        least[name] = np.nanmin([float(asked(each)) for each in scan])
     assert [name for name, _ in found] == sorted(least, key=lambda name: least[name])
     for name, best in found:
-        assert best.values.min() <= least[name] * (1.0 + 1e-9) and best.values.min() > least[name] * 0.9
+        assert best.values.min() <= least[name] * (1.0 + 1e-9)
+        np.testing.assert_allclose(best.values.min(), float(asked(best.scene)), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -100,7 +103,7 @@ def test_the_lightest_exciter_shakes_so_in_the_full_equations():
     best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=8)
     assert best.run is not None and best.verified is not None
     np.testing.assert_allclose(float(amplitude(mode=3, tier="exact")(best.scene)), 0.042, rtol=0.02)  # to leading order 0.042
-    shaken = next(row for row in best.table if row.what.startswith("amplitude of platform 1 against 2"))
+    shaken = next(row for row in best.table if row.what.startswith("amplitude, mode 3"))
     np.testing.assert_allclose(shaken.time, shaken.exact, rtol=1e-3)
 
 

@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import LinearModel
+from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -301,8 +302,7 @@ def _swing(orders: np.ndarray, harmonics: Array) -> Array:
     symmetric = bool(np.all(orders % 2 == 1))  # the signal turns its sign in half a period
 
     def highest(c: Array) -> Array:
-        peaks = _peaks(orders, c)
-        return peaks[jnp.argmax(peaks)]  # of peaks that are about as high the highest between samples, not of the samples
+        return greatest(_peaks(orders, c))  # the highest between the samples, not that beside the highest sample
 
     def swing(c: Array) -> Array:
         return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0
