@@ -68,7 +68,7 @@ def chain(free: int) -> tuple[DesignSpace, Quantity]:
 
 
 def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
-    """Seconds of one value and of one value with its gradient, each followed from the jam it is at, one design at a time."""
+    """Seconds of processor of one value, and of one with its gradient: one design, followed from the jam it is at."""
     space, wish = chain(free)
     problem = problem_of(space, wish, ())
     z = np.asarray(space.where(space.scene))
@@ -81,11 +81,11 @@ def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
         jax.block_until_ready(function(jnp.asarray(z)))
         least = np.inf
         for _ in range(5):
-            begun = time.perf_counter()
+            begun = time.process_time()
             for _ in range(repeat):
                 out = function(jnp.asarray(z))
             jax.block_until_ready(out)  # pyright: ignore
-            least = min(least, (time.perf_counter() - begun) / repeat)
+            least = min(least, (time.process_time() - begun) / repeat)
         return least
 
     return timed(jax.jit(value)), timed(jax.jit(jax.value_and_grad(value)))
