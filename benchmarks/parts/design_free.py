@@ -199,11 +199,11 @@ def race(free: int, seconds: float) -> None:
     """Prints when each search came within 1 % of the least value found."""
     space, wish = chain(free)
     problem = problem_of(space, wish, ())
-    settings = (8, 200, 10 if free <= 30 else 3)
+    settings = (16, 200, 10 if free <= 30 else 3)
     by_gradients(problem, *settings)
     Values(problem).of(np.full((1, free), 0.5))
     courses = {
-        "gradients, 8 starts": by_gradients(problem, *settings),
+        "gradients, 16 starts": by_gradients(problem, *settings),
         "CMA-ES": by_evolution_strategy(problem, seconds),
         "differential evolution": by_differential_evolution(problem, seconds),
     }
