@@ -168,5 +168,6 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
 
 def _point(lanes: _Lane) -> Point:
     """Where the lanes are; the objective's pieces are not asked on the way."""
-    s, d = lanes.z.shape
-    return Point(*lanes[:5], np.zeros((s, 0)), np.zeros((s, 0, d)))
+    z, values, slopes = (np.asarray(each) for each in lanes[:3])
+    nothing = np.zeros((len(z), 0))
+    return Point(z, values, slopes, lanes.known, lanes.reach, nothing, np.zeros((*nothing.shape, z.shape[1])))

@@ -283,7 +283,7 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
     still = jax.lax.stop_gradient(harmonics)
 
-    def at(c: Array, theta: Array | np.ndarray) -> Array:
+    def at(c: Array | np.ndarray, theta: Array | np.ndarray) -> Array:
         return (jnp.exp(1j * orders.reshape((1,) * np.ndim(theta) + (-1,)) * theta[..., None]) @ c).real
 
     def newton(_: int, theta: Array) -> Array:
