@@ -27,7 +27,7 @@ from optimize.search.sense import influences_of, limits_of, machines_of, neighbo
 from optimize.space import DesignSpace
 from optimize.wishes.answers import Answers
 from optimize.wishes.jams import between
-from optimize.wishes.quantity import Demand, Quantity, walk
+from optimize.wishes.quantity import Demand, Pair, Quantity, walk
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
@@ -112,7 +112,9 @@ def synthesize(
     else:
         status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
 
-    named = _named(space, scene, objective, demands)
+    # A lightest or cheapest machine belongs to no jam mode, and what is demanded of it does.
+    mode = next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
+    named = _named(space, scene, objective, demands, mode)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
     told = reported((*(q for _, q in named), objective, *sides), batch, problem)
@@ -124,12 +126,12 @@ def synthesize(
         raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
     tell("checking", 0.9)
     verify = verify and bool(kept[best])
-    run, unverified = _run(scene, objective.mode, verify)
-    other = _other_tiers(scene, [q for _, q in named], verify, run, objective.mode)
+    run, unverified = _run(scene, mode, verify)
+    other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
     rows = _table(space, scene, named, told[:2, : len(named)], other)
-    n = len(_standard(scene, objective))
+    n = len(_standard(scene, mode, objective.of))
     before, after = (_outcome(space, s, told[k, :n]) for k, s in enumerate((space.scene, scene)))
-    verified = None if run is None else _by_run(space, run, objective)
+    verified = None if run is None else _by_run(space, run, mode or 1, objective.of)
     tell("done", 1.0)
     return Synthesis(
         status=status,
@@ -237,7 +239,7 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
     if mode is None:
-        return None, "the objective belongs to no jam mode that could be integrated"
+        return None, "the objective and the demands belong to no jam mode that could be integrated"
     if not verify:
         return None, "not asked for"
     try:
@@ -246,20 +248,21 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
         return None, str(error)
 
 
-def _standard(scene: Scene, objective: Quantity) -> list[tuple[str, Quantity]]:
+def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
     """What a table of a machine in a jam mode tells besides."""
-    mode = objective.mode
     if mode is None:
         return []
     rows = [("jam frequency", jam_frequency(mode=mode))]
     rows += [(name, amplitude(mode=mode, of=k + 1)) for k, name in enumerate(amplitude_names(scene))]
     rows += [("foundation force", foundation_force(mode=mode))]
-    return [*rows, ("force per amplitude", force_per_amplitude(mode=mode, of=objective.of))]
+    return [*rows, ("force per amplitude", force_per_amplitude(mode=mode, of=of))]
 
 
-def _named(space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand]) -> list[tuple[str, Quantity]]:
+def _named(
+    space: DesignSpace, scene: Scene, objective: Quantity, demands: Sequence[Demand], mode: int | None
+) -> list[tuple[str, Quantity]]:
     """The quantities of the table: the standard ones of a jam, then what is sought, held and demanded besides."""
-    standard = _standard(scene, objective)
+    standard = _standard(scene, mode, objective.of)
     sought = objective.parts[0] if objective.name.startswith("negative ") and objective.parts else objective
     own = [sought, *(h.quantity for h in space.held), *(d.quantity for d in demands)]
     known = {q for _, q in standard}
@@ -315,9 +318,8 @@ def _outcome(space: DesignSpace, scene: Scene, values: np.ndarray) -> Outcome:
     return Outcome(space.parameters(scene), math.isfinite(omega), omega, tuple(amplitudes), force, ratio)
 
 
-def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
+def _by_run(space: DesignSpace, run: Run, mode: int, of: Pair) -> Outcome:
     answers = Answers(run.scene)
-    mode = objective.mode or 1
     answers.keep_run(mode, run)
     return Outcome(
         parameters=space.parameters(run.scene),
@@ -325,5 +327,5 @@ def _by_run(space: DesignSpace, run: Run, objective: Quantity) -> Outcome:
         omega=float(run.omega),
         amplitude=tuple(float(a) for a in run.amplitude),
         foundation_force=float(run.foundation_force),
-        force_per_amplitude=float(force_per_amplitude(mode=mode, of=objective.of, tier="time").read(answers)),
+        force_per_amplitude=float(force_per_amplitude(mode=mode, of=of, tier="time").read(answers)),
     )

@@ -186,7 +186,8 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)
     places = np.arange(len(rows))[::-1]
-    low, high = min([0.7, *ratios[drawn]]), max([1.4, *ratios[drawn]])
+    # What nearly vanishes leaves the axis: all others would be lines.
+    low, high = max(min([0.7, *ratios[drawn]]), 1e-4), min(max([1.4, *ratios[drawn]]), 1e4)
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
         look: Any = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
         if there:

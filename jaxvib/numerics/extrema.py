@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["NODES", "extremum_value", "locate_extrema"]
+__all__ = ["NODES", "extremum_value", "greatest", "locate_extrema"]
 
 NODES = 4
 """Samples beside each other through whose values and slopes a polynomial goes."""
@@ -90,6 +90,12 @@ def extremum_value(x: Array, v: Array, place: Array) -> Array:
     inside = (place != jnp.round(place)) & (curved != 0.0)
     move = jnp.where(inside, _at(slope, place), 0.0) / jax.lax.stop_gradient(jnp.where(inside, curved, 1.0))
     return _at(polynomial, place - move + jax.lax.stop_gradient(move))
+
+
+def greatest(values: Array) -> Array:
+    """The greatest of some numbers (n,), with its derivatives: those of `jnp.max` are 0/0 where a compiler computes two that
+    are alike twice and rounds them differently."""
+    return values[jnp.argmax(values)]
 
 
 def _polynomial(x: Array, v: Array) -> Array:

@@ -78,7 +78,7 @@ def _begin(point: Any, multipliers: Array) -> _Lane:
     one = jnp.ones(n)
     size = jnp.maximum(jnp.abs(point.values[:, 0]), 1e-300)
     worst = jnp.full(n, jnp.inf)
-    z, values, slopes, known, reach = point
+    z, values, slopes, known, reach, *_ = point
     return _Lane(z, values, slopes, known, reach, lane, one, multipliers, 10.0 * one, worst, size, jnp.zeros(n, int))
 
 
@@ -161,6 +161,13 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
         each = jnp.asarray(part)
         lanes, values = chunked(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
         history.append(values)
-        tell((k + 1) / len(rates), Point(*lanes[:5]))
+        tell((k + 1) / len(rates), _point(lanes))
     values = np.concatenate(history, axis=1)[:, :steps]
-    return Descended(Point(*lanes[:5]), lanes.multipliers, values.T)
+    return Descended(_point(lanes), lanes.multipliers, values.T)
+
+
+def _point(lanes: _Lane) -> Point:
+    """Where the lanes are; the objective's pieces are not asked on the way."""
+    z, values, slopes = (np.asarray(each) for each in lanes[:3])
+    nothing = np.zeros((len(z), 0))
+    return Point(z, values, slopes, lanes.known, lanes.reach, nothing, np.zeros((*nothing.shape, z.shape[1])))

@@ -88,7 +88,7 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
     """The search in another space, for few designs."""
-    return Problem(space, problem.objective, problem.demands, problem.keys, problem.constants, problem.scales, _FEW)
+    return replace(problem, space=space, lanes=_FEW)
 
 
 def _spread(problem: Problem) -> bool:

@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
+from optimize.search.model import Step, at_kink, curvatures, fall, least_norm, modelled, seconds, transposed, unlike
 from optimize.search.problem import Point, Problem, evaluate
-from optimize.search.quadratic import Solved, elastic
 
-__all__ = ["FEASIBLE", "Polished", "Starts", "draw_starts", "least_norm", "optimality", "polish", "restored", "violation"]
+__all__ = ["FEASIBLE", "Polished", "Starts", "draw_starts", "optimality", "polish", "restored", "violation"]
 
 FEASIBLE = 1e-8
 """How well what is held, and demands, must be kept in the end, relative to their values."""
 
-_WIDTH = 1e-5
-"""Step of the central differences of derivatives, in parts of a free number's range."""
+_AT_REST = 1e-10
+"""A fall below this that no step brings is not to be had: derivatives of an exact motion have that rounding."""
+
+_EVEN = 4
+"""Steps back onto a kink, each to first order."""
 
 _ACTIVE = 1e-6
 """How near to its limit a demand, relative to it, or to its bound a free number counts as being at it."""
@@ -46,18 +50,6 @@ class Polished(NamedTuple):
     optimality: Optimality
 
 
-def _transposed(a: np.ndarray) -> np.ndarray:
-    return np.swapaxes(a, 1, 2)
-
-
-def least_norm(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The shortest x (s, d) with rows (s, m, d) x = right (s, m)."""
-    gram = rows @ _transposed(rows)
-    ridge = np.finfo(float).eps * (1.0 + np.trace(gram, axis1=1, axis2=2))
-    solved = np.linalg.solve(gram + ridge[:, None, None] * np.eye(gram.shape[1]), right[..., None])
-    return (_transposed(rows) @ solved)[..., 0]
-
-
 def violation(problem: Problem, point: Point) -> np.ndarray:
     """The greatest relative amount (s,) by which anything held is off or a demand exceeded; infinite where there is no
     value."""
@@ -66,11 +58,13 @@ def violation(problem: Problem, point: Point) -> np.ndarray:
     return np.where(point.exists(), np.max(parts, axis=1, initial=0.0), np.inf)
 
 
-def restored(problem: Problem, point: Point, steps: int, demanded: np.ndarray | None = None) -> Point:
+def restored(
+    problem: Problem, point: Point, steps: int, demanded: np.ndarray | None = None, shares: np.ndarray | None = None
+) -> Point:
     """The designs nearest to `point`, to first order, that keep what is held, and demands of which `demanded` (s, mi) is true
-    or that are exceeded, inside the bounds."""
+    or that are exceeded, inside the bounds; and at which the objective's pieces that have `shares` (s, parts) are alike."""
     m, mi = problem.equalities, len(problem.demands)
-    if m + mi == 0:
+    if m + mi == 0 and shares is None:
         return point
     for _ in range(steps):
         finite = point.exists()
@@ -81,6 +75,9 @@ def restored(problem: Problem, point: Point, steps: int, demanded: np.ndarray | 
         if demanded is not None:
             counts[:, m:] |= demanded
         slopes, values = slopes * counts[:, :, None], values * counts
+        if shares is not None:
+            apart, tilts = unlike(point, shares, np.maximum(np.abs(point.values[:, 0]), 1e-300))
+            slopes, values = np.concatenate([slopes, tilts], axis=1), np.concatenate([values, apart], axis=1)
         wanted = -least_norm(slopes, values)
         stopped = ((point.z <= 0.0) & (wanted < 0.0)) | ((point.z >= 1.0) & (wanted > 0.0))
         step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
@@ -148,14 +145,7 @@ def _joined(points: list[Point]) -> Point | None:
     points = [p for p in points if len(p.z)]
     if not points:
         return None
-    first, *more = points
-    return first._replace(
-        z=np.concatenate([first.z, *(p.z for p in more)]),
-        values=np.concatenate([first.values, *(p.values for p in more)]),
-        slopes=np.concatenate([first.slopes, *(p.slopes for p in more)]),
-        known=tuple(np.concatenate(each) for each in zip(first.known, *(p.known for p in more), strict=True)),
-        reach=tuple(np.concatenate(each) for each in zip(first.reach, *(p.reach for p in more), strict=True)),
-    )
+    return jax.tree.map(lambda *each: np.concatenate(each), *points)
 
 
 def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Point], None]) -> Polished:
@@ -165,40 +155,55 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
     Second derivatives of the Lagrangian are central differences of exact first ones. Breaking what is held or a demand costs so
     much of the objective; where it does not vanish at any price, the demands contradict each other.
     """
-    m = problem.equalities
-    size = np.maximum(np.abs(point.values[:, 0]), 1e-300)
+    if problem.parts > 1:  # the descent does not ask for them
+        point = evaluate(problem, point.z, point.known)
+    size = np.maximum(np.abs(point.values[:, 0]), 1e-9 * np.max(np.abs(point.slopes[:, 0]), axis=1))
+    size = np.where(size > 0.0, size, 1.0)
     price, reach = np.full(len(point.z), 10.0), np.full(len(point.z), 0.2)
     point = restored(problem, point, 2)
-    seen = np.zeros((len(point.z), 1 + m + len(problem.demands)))
-    seen[:, 0] = 1.0
-    seen[:, 1:] = _first_guess(problem, point) / size[:, None]
+    seen = _first_guess(problem, point) / size[:, None]
+    shares = np.zeros((len(point.z), problem.parts))
+    shares[np.arange(len(shares)), np.argmax(point.pieces, axis=1) if problem.parts > 1 else 0] = 1.0
+    second = np.zeros((len(point.z), point.z.shape[1], seen.shape[1] + problem.parts + 1, point.z.shape[1]))
     still = point.exists()
+    moved = still.copy()
     left = np.full(len(point.z), np.inf)
     history = [point.values[:, 0]]
     for k in range(steps + 1):
         index = np.flatnonzero(still)
         if len(index):
             here = point.take(index)
-            bend = _curvature(problem, here, seen[index], size[index])
-            model = _model(problem, here, bend, size[index], price[index], reach[index])
-            left[index] = _fall(problem, here, bend, model, size[index])
+            if np.any(moved):
+                second[moved] = seconds(problem, point.take(np.flatnonzero(moved)))
+            bends = curvatures(problem, here, second[index], seen[index], shares[index], size[index])
+            models = [modelled(problem, here, bend, size[index], price[index], reach[index]) for bend in bends]
+            model = models[0]
+            falls = [fall(problem, here, b, m, size[index]) for b, m in zip(bends, models, strict=True)]
+            left[index] = np.minimum(falls[0], falls[-1])
             dual = np.concatenate([model.held, model.demands], axis=1)
             # A price below the multipliers lets a constraint be broken that could be kept.
             short = np.max(np.abs(dual), axis=1, initial=0.0) > 0.9 * price[index]
             price[index] = np.where(short, np.minimum(10.0 * price[index], _DEAREST), price[index])
             if k == steps:
                 break
-            new = _tried(problem, here, model)
-            old_merit, new_merit = (_merit(problem, p, size[index], price[index]) for p in (here, new))
+            tried = [_tried(problem, here, each, size[index], price[index]) for each in models]
+            merits = [_merit(problem, each, size[index], price[index]) for each in tried]
+            first = merits[0] <= merits[-1]
+            new, new_merit = tried[0].where(first, tried[-1]), np.minimum(merits[0], merits[-1])
             kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
-            better = (new_merit < old_merit) | (kept & (violation(problem, here) > FEASIBLE) & new.exists())
+            better = new_merit < _merit(problem, here, size[index], price[index])
+            better |= kept & (violation(problem, here) > FEASIBLE) & new.exists()
             point = point.put(index, new.where(better, here))
-            step = np.max(np.abs(model.p), axis=1)
+            step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
             reach[index] = np.where(better, np.where(step > 0.9 * reach[index], 2.0 * reach[index], reach[index]), 0.25 * step)
             reach = np.clip(reach, 1e-9, 0.5)
-            seen[index, 1:] = np.clip(dual, -1e6, 1e6)
-            at_rest = (left[index] < 1e-13) & (violation(problem, here) < 1e-10) & ~short
+            seen[index] = np.clip(dual, -1e6, 1e6)
+            shares[index] = model.shares
+            least = violation(problem, here) < 1e-10
+            at_rest = least & ~short & ((left[index] < 1e-13) | (~better & (left[index] < _AT_REST)))
             still[index] = ~(at_rest | (~better & (reach[index] <= 1e-9)))
+            moved = np.zeros_like(still)
+            moved[index] = better & still[index]
         history.append(point.values[:, 0])
         tell((k + 1) / max(steps, 1), point)
     return Polished(point, np.asarray(history), left, violation(problem, point), optimality(problem, point))
@@ -209,57 +214,18 @@ def _first_guess(problem: Problem, point: Point) -> np.ndarray:
     return np.nan_to_num(np.concatenate([found.held, found.demands], axis=1))
 
 
-def _curvature(problem: Problem, point: Point, weights: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Second derivatives (s, d, d) of the Lagrangian over the objective's size, not indefinite; only along what constraints
-    that count leave free: across them the linear constraints decide."""
-    d, m = point.z.shape[1], problem.equalities
-    weights = weights.copy()
-    weights[:, 0] = 1.0 / size
-    bend = np.empty((len(point.z), d, d))
-    for i in range(d):
-        sides = [point.z + sign * _WIDTH * np.eye(d)[i] for sign in (1.0, -1.0)]
-        high, low = (evaluate(problem, z, point.ahead(z)) for z in sides)
-        bend[:, i] = np.einsum("sm,smd->sd", weights, high.slopes - low.slopes) / (2.0 * _WIDTH)
-    usable = np.all(np.isfinite(bend), axis=(1, 2), keepdims=True)
-    bend = np.where(usable, bend, np.eye(d))
-    counts = np.ones(weights.shape[1] - 1, bool)[None, :] & np.ones((len(weights), 1), bool)
-    counts[:, m:] = weights[:, 1 + m :] > 1e-12
-    free = 1.0 - (((point.z <= 0.0) | (point.z >= 1.0)) * 1.0)
-    rows = np.where(np.isfinite(point.slopes), point.slopes, 0.0)[:, 1:] * counts[:, :, None] * free[:, None, :]
-    projector = np.eye(d) * np.ones((len(rows), 1, 1))
-    if rows.shape[1]:
-        projector = projector - np.stack([least_norm(rows, rows[:, :, i]) for i in range(d)], axis=2)
-    inner = projector @ (bend + _transposed(bend)) / 2.0 @ _transposed(projector)
-    values, vectors = np.linalg.eigh((inner + _transposed(inner)) / 2.0)
-    top = np.maximum(np.max(np.abs(values), axis=1, keepdims=True), 1e-12)
-    values = np.maximum(np.abs(values), 1e-10 * top)
-    return np.einsum("sij,sj,skj->sik", vectors, values, vectors)
-
-
-def _model(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray, price: np.ndarray, reach: np.ndarray) -> Solved:
-    m = problem.equalities
-    box = np.maximum(-point.z, -reach[:, None]), np.minimum(1.0 - point.z, reach[:, None])
-    held = point.slopes[:, 1 : 1 + m], point.values[:, 1 : 1 + m]
-    demands = point.slopes[:, 1 + m :], point.values[:, 1 + m :]
-    return elastic(bend, point.slopes[:, 0] / size[:, None], held, demands, box, price)
-
-
-def _fall(problem: Problem, point: Point, bend: np.ndarray, model: Solved, size: np.ndarray) -> np.ndarray:
-    """By how much the objective may fall yet, as the model has it, in parts of its value."""
-    along = np.einsum("sd,sd->s", point.slopes[:, 0], model.p)
-    dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]
-    paid = np.einsum("sm,smd,sd->s", dual, point.slopes[:, 1:], model.p)
-    curved = np.einsum("si,sij,sj->s", model.p, bend, model.p) * size
-    return np.abs(along + paid + 0.5 * curved) / np.maximum(np.abs(point.values[:, 0]), 1e-300)
-
-
-def _tried(problem: Problem, point: Point, model: Solved) -> Point:
+def _tried(problem: Problem, point: Point, model: Step, size: np.ndarray, price: np.ndarray) -> Point:
+    """Where the step leads, moved back onto what is held, demands and kinks that the model has it at; the best of these."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.ahead(z))
     active = model.demands > 1e-6
     mended = restored(problem, new, 2, active)
     whole = mended.exists() & (violation(problem, mended) <= violation(problem, new))
-    return mended.where(whole, new)
+    best = mended.where(whole, new)
+    if problem.parts > 1:
+        even = restored(problem, best, _EVEN, active, model.shares)
+        best = even.where(_merit(problem, even, size, price) < _merit(problem, best, size, price), best)
+    return best
 
 
 def _merit(problem: Problem, point: Point, size: np.ndarray, price: np.ndarray) -> np.ndarray:
@@ -277,17 +243,20 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     rows, slope = slopes[:, 1:], slopes[:, 0]
     counts = np.ones((s, m + mi), bool)
     counts[:, m:] = point.values[:, 1 + m :] > -_ACTIVE
+    if problem.parts > 1:
+        slope, tilts, met = at_kink(point, _ACTIVE)
+        rows, counts = np.concatenate([rows, tilts], axis=1), np.concatenate([counts, met], axis=1)
     at_low, at_high = point.z <= _ACTIVE, point.z >= 1.0 - _ACTIVE
     fixed = np.asarray(problem.space.low == problem.space.high)[None, :] & np.ones((s, 1), bool)
     free = ~(at_low | at_high | fixed)
-    dual = np.zeros((s, m + mi))
+    dual = np.zeros(counts.shape)
     rest = slope
-    for _ in range(3 + mi):
+    for _ in range(3 + counts.shape[1] - m):
         part = rows * counts[:, :, None] * free[:, None, :]
-        gram = part @ _transposed(part)
+        gram = part @ transposed(part)
         ridge = np.finfo(float).eps * (1e-300 + np.trace(gram, axis1=1, axis2=2)) + 1e-300
         right = -np.einsum("smd,sd->sm", part, slope * free)
-        dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(m + mi), right[..., None])[..., 0] * counts
+        dual = np.linalg.solve(gram + ridge[:, None, None] * np.eye(counts.shape[1]), right[..., None])[..., 0] * counts
         rest = slope + np.einsum("sm,smd->sd", dual, rows)
         pushed = counts.copy()
         pushed[:, m:] &= dual[:, m:] >= 0.0
@@ -299,4 +268,4 @@ def optimality(problem: Problem, point: Point) -> Optimality:
     size = np.maximum(np.abs(slope).max(axis=1), np.abs(point.values[:, 0]))
     residual = np.max(np.abs(np.where(fixed, 0.0, rest + bounds)), axis=1) / np.maximum(size, 1e-300)
     kkt = np.maximum(residual, violation(problem, point))
-    return Optimality(dual[:, :m], dual[:, m:], bounds, kkt)
+    return Optimality(dual[:, :m], dual[:, m : m + mi], bounds, kkt)

@@ -40,7 +40,7 @@ class Problem(eqx.Module):
     **Attributes**: `space`; `objective`; `demands`, their forms, and
     `constants` (mi,), their limits where these are numbers; `keys` of what is followed; `scales` (mi,): the demands' units,
     positive;
-    `lanes` designs are evaluated together.
+    `lanes` designs are evaluated together; `parts`: of how many smooth pieces the objective is the largest.
     """
 
     space: DesignSpace
@@ -50,16 +50,20 @@ class Problem(eqx.Module):
     constants: Array | np.ndarray
     scales: Array | np.ndarray
     lanes: int = eqx.field(static=True, default=_CHUNK)
+    parts: int = eqx.field(static=True, default=1)
 
     @property
     def equalities(self) -> int:
         """How many quantities are held."""
         return len(self.space.held)
 
-    def values(self, z: Array, near: Sequence[Array] | None) -> tuple[Array, tuple[Array, ...]]:
-        """The objective, by how much what is held is off, and the demands' excess, (1 + me + mi,); and the speeds followed."""
-        answers = Answers(self.space.at(z), None if near is None else dict(zip(self.keys, near, strict=True)))
+    def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
+        """The objective, by how much what is held is off, and the demands' excess, (1 + me + mi,), and the `pieces` of the
+        objective behind them; and the speeds followed."""
+        answers = Answers(self.space.at(z), dict(zip(self.keys, near, strict=True)))
         values = self.read(answers)
+        if pieces:
+            values = jnp.concatenate([values, self.objective.pieces(answers)])
         return values, tuple(answers.found[key] for key in self.keys)
 
     def read(self, answers: Answers) -> Array:
@@ -87,7 +91,13 @@ class Problem(eqx.Module):
         )
         index = np.asarray(kept, int)
         forms = tuple(demands[k] for k in kept)
-        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes)
+        easy = Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes)
+        return easy.in_parts()
+
+    def in_parts(self) -> Problem:
+        """The same search, told of how many pieces its objective is the largest."""
+        pieces = jax.eval_shape(lambda scene: self.objective.pieces(Answers(scene, Recorder())), self.space.scene)
+        return replace(self, parts=pieces.shape[0])
 
     @property
     def forward_only(self) -> bool:
@@ -107,13 +117,16 @@ def _hard(quantity: Quantity) -> bool:
 
 class Point(NamedTuple):
     """Designs z (s, d), their values (s, 1 + me + mi) and derivatives (s, 1 + me + mi, d), the speeds `known` of what is
-    followed and `reach`, by how much these change with z (s, ..., d)."""
+    followed and `reach`, by how much these change with z (s, ..., d); the objective's `pieces` (s, p) and their derivatives
+    `tilts` (s, p, d), none where it is one piece alone."""
 
     z: np.ndarray
     values: np.ndarray
     slopes: np.ndarray
     known: Known
     reach: Known
+    pieces: np.ndarray
+    tilts: np.ndarray
 
     def exists(self) -> np.ndarray:
         """Whether everything has a value and derivatives there (s,)."""
@@ -159,17 +172,19 @@ def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand
         sides = tuple(q for d in demands for q in (d.quantity, d.limit))
         found = np.abs(reported(sides, jax.tree.map(lambda leaf: leaf[None], space.scene))[0]).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
-    return Problem(space, objective, forms, tuple(recorder.keys), constants, scales, _lanes(starts))
+    return Problem(space, objective, forms, tuple(recorder.keys), constants, scales, _lanes(starts)).in_parts()
 
 
-def derive(problem: Problem, z: Array, near: Sequence[Array]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
-    """Values, derivatives, followed speeds and their derivatives of one design."""
+def derive(
+    problem: Problem, z: Array, near: Sequence[Array], pieces: bool = False
+) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Values, derivatives, followed speeds and their derivatives of one design; those of the `pieces` behind the others."""
 
     def twice(x: Array) -> tuple[tuple[Array, tuple[Array, ...]], tuple[Array, tuple[Array, ...]]]:
-        values, found = problem.values(x, near)
+        values, found = problem.values(x, near, pieces)
         return (values, found), (values, found)
 
-    rows = 1 + problem.equalities + len(problem.demands)
+    rows = 1 + problem.equalities + len(problem.demands) + (problem.parts if pieces else 0)
     if z.shape[0] <= 4 * rows or problem.forward_only:
         (slopes, reach), (values, found) = jax.jacfwd(twice, has_aux=True)(z)
     else:
@@ -180,7 +195,7 @@ def derive(problem: Problem, z: Array, near: Sequence[Array]) -> tuple[Array, Ar
 
 @cached
 def _derived(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
-    return jax.vmap(lambda x, w: derive(problem, x, w))(z, near)
+    return jax.vmap(lambda x, w: derive(problem, x, w, problem.parts > 1))(z, near)
 
 
 @cached
@@ -236,7 +251,8 @@ def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
     if len(z) == 0:
         raise ValueError("no designs")
     values, slopes, found, reach = chunked(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
-    return Point(z, values, slopes, found, reach)
+    rows = 1 + problem.equalities + len(problem.demands)
+    return Point(z, values[:, :rows], slopes[:, :rows], found, reach, values[:, rows:], slopes[:, rows:])
 
 
 def looked_up(problem: Problem, z: np.ndarray) -> Known:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -14,6 +14,7 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.space.numbers import Place, changed, places_of, value_of
 from optimize.wishes.answers import Answers, Key, Recorder
@@ -102,9 +103,15 @@ class Under(_OfPart):
     case: Changed = Changed("", ())
 
     def read(self, answers: Answers) -> Array:
+        return self._asked(answers, self.parts[0].read)
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        return self._asked(answers, lambda inner: self.parts[0].pieces(inner, sign))
+
+    def _asked(self, answers: Answers, question: Callable[[Answers], Array]) -> Array:
         scene, path = answers.under(self.case)
         inner = Answers(scene, answers.known, path)
-        value = self.parts[0].read(inner)
+        value = question(inner)
         answers.found.update(inner.found)
         return value
 
@@ -122,6 +129,21 @@ class Robust(_OfPart):
     level: float = 0.0
 
     def read(self, answers: Answers) -> Array:
+        values = self._sampled(answers, self.parts[0].read)
+        if self.statistic == "expected":
+            return jnp.mean(values)
+        if self.statistic == "worst":
+            return greatest(values)
+        # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
+        return jnp.quantile(values, self.level)
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        if self.statistic != "worst" or sign < 0.0:
+            return super().pieces(answers, sign)
+        return self._sampled(answers, self.parts[0].pieces).reshape(-1)
+
+    def _sampled(self, answers: Answers, question: Callable[[Answers], Array]) -> Array:
+        """What every sample answers, (samples, ...)."""
         scenes, path = answers.under(self.case)
         known, keys = answers.known, []
         near: tuple[Array, ...] | None = None
@@ -133,18 +155,13 @@ class Robust(_OfPart):
         def one(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
             recorder = known if isinstance(known, Recorder) else None
             inner = Answers(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
-            value = self.parts[0].read(inner)
+            value = question(inner)
             found[:] = inner.found
             return value, tuple(inner.found.values())
 
         values, speeds = jax.vmap(one)(scenes, near)
         answers.found.update(zip(found, speeds, strict=True))
-        if self.statistic == "expected":
-            return jnp.mean(values)
-        if self.statistic == "worst":
-            return jnp.max(values)
-        # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
-        return jnp.quantile(values, self.level)
+        return values
 
     @property
     def easy(self) -> Quantity:

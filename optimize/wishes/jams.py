@@ -59,9 +59,10 @@ def _asking(
     of: Pair = None,
     settings: tuple[Pair, ...] = (),
     tiers: tuple[Tier, ...] = TIERS,
+    parted: Callable[..., Array] | None = None,
 ) -> Quantity:
     text = f"{text}, mode {mode}"
-    return Asking(name, unit, function, mode, of, tier, (mode, *settings), tiers, text)
+    return Asking(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, parted)
 
 
 def _whose(of: Pair) -> str:
@@ -149,7 +150,7 @@ def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "le
     'N'
     """
     if harmonic is None:
-        return _asking("foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,))
+        return _asking("foundation_force", "N", _force, mode, tier, "foundation force", settings=(None,), parted=_peaks)
     count(harmonic, "harmonic")
     text = f"harmonic {harmonic} of the foundation force"
     tier = "exact" if tier == "leading" else tier
@@ -183,11 +184,22 @@ def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -
     """
     of = _pair(of)
     text = f"force per amplitude{_whose(of)}"
-    return _asking("force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,))
+    return _asking("force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,), parted=_peaks_per_amplitude)
 
 
 def _ratio(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
     return _force(answers, tier, mode, None) / _amplitude(answers, tier, mode, of)
+
+
+def _peaks(answers: Answers, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
+    """The exact force's peaks in parts of the period: where its first harmonic is small, several are about as high."""
+    if tier != "exact" or sign < 0.0:
+        return sign * _force(answers, tier, mode, harmonic)[None]
+    return answers.orbit(mode).force_peaks()
+
+
+def _peaks_per_amplitude(answers: Answers, sign: float, tier: Tier, mode: int, of: Pair) -> Array:
+    return _peaks(answers, sign, tier, mode, None) / _amplitude(answers, tier, mode, of)
 
 
 def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
@@ -226,14 +238,21 @@ def fold_margin(*, mode: int) -> Quantity:
     >>> (fold_margin(mode=3) > "60 rpm").words
     'distance to the fold, mode 3 at least 60 rpm'
     """
-    return _asking("fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",))
+    return _asking(
+        "fold_margin", "rad/s", _margin, mode, "leading", "distance to the fold", tiers=("leading",), parted=_margins
+    )
 
 
 def _margin(answers: Answers, tier: Tier, mode: int) -> Array:
+    return _margins(answers, 1.0, tier, mode)[0]
+
+
+def _margins(answers: Answers, sign: float, tier: Tier, mode: int) -> Array:
     below, above = answers.folds(mode)
     n = answers.scene.drive.speed
     slow, fast = (below, above) if mode % 2 == 1 else (above, below)
-    return jnp.minimum(n - slow, fast - n) + 0.0 * answers.jam(mode).omega
+    both = jnp.stack([n - slow, fast - n]) + 0.0 * answers.jam(mode).omega
+    return -both if sign < 0.0 else jnp.minimum(both[0], both[1])[None]
 
 
 def largest_multiplier(*, mode: int) -> Quantity:

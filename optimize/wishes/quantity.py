@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import jax.numpy as jnp
@@ -14,9 +12,11 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
-from jaxvib.units import Number, number
+from jaxvib.units import Number
 from optimize.wishes.answers import Answers
+from optimize.wishes.given import arguments, number_in, same_unit
 
 __all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "number_in", "walk"]
 
@@ -58,7 +58,7 @@ class Quantity:
     of: Pair = None
 
     def __post_init__(self) -> None:
-        if type(self) is Quantity and not (callable(self.function) and _arguments(self.function) in (1, 2)):
+        if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
             problem = "give a function of a scene, or of a scene and its jam modes"
             raise InputError(f"quantity {self.name!r}", f"has the function {self.function!r}; {problem}")
 
@@ -69,9 +69,14 @@ class Quantity:
     def read(self, answers: Answers) -> Array:
         """The quantity's value, a scalar in `unit`, from what is known of a scene."""
         assert self.function is not None
-        if _arguments(self.function) == 1:
+        if arguments(self.function) == 1:
             return jnp.reshape(self.function(answers.scene), ())
         return jnp.reshape(self.function(answers.scene, answers.modes), ())
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        """Smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity where `sign` is -1: a
+        search may go along the kinks where two of them are alike."""
+        return jnp.reshape(sign * self.read(answers), (1,))
 
     @property
     def words(self) -> str:
@@ -155,6 +160,8 @@ class Asking(Quantity):
     settings: tuple[Any, ...] = ()
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
+    parted: Callable[..., Array] | None = None
+    """What gives its `pieces`: a function of the answers, the sign, the tier and the settings."""
 
     def __post_init__(self) -> None:
         if self.tier not in TIERS:
@@ -165,6 +172,11 @@ class Asking(Quantity):
     def read(self, answers: Answers) -> Array:
         assert self.function is not None
         return jnp.reshape(self.function(answers, self.tier, *self.settings), ())
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        if self.parted is None:
+            return super().pieces(answers, sign)
+        return self.parted(answers, sign, self.tier, *self.settings)
 
     @property
     def words(self) -> str:
@@ -213,9 +225,27 @@ class Combined(Quantity):
             case "**":
                 return values[0] ** values[1]
             case "largest":
-                return jnp.max(jnp.stack(values))
+                return greatest(jnp.stack(values))
             case _:
-                return jnp.min(jnp.stack(values))
+                return -greatest(-jnp.stack(values))
+
+    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+        if self.operation == "neg":
+            return self.parts[0].pieces(answers, -sign)
+        if self.operation == ("largest" if sign > 0.0 else "least"):
+            return jnp.concatenate([part.pieces(answers, sign) for part in self.parts])
+        if self.operation in ("+", "-"):
+            one = self.parts[0].pieces(answers, sign)
+            other = self.parts[1].pieces(answers, sign if self.operation == "+" else -sign)
+            return (one[:, None] + other[None, :]).reshape(-1)
+        if self.operation in ("*", "/"):
+            for part, other in (self.parts, self.parts[::-1])[: 1 if self.operation == "/" else 2]:
+                numbers = part.pieces(answers, sign)
+                if len(numbers) > 1:  # they are those of the product where the other one is positive
+                    by = other.read(answers)
+                    many = numbers * by if self.operation == "*" else numbers / by
+                    return jnp.where(by > 0.0, many, sign * self.read(answers))
+        return super().pieces(answers, sign)
 
     def at_tier(self, tier: Tier) -> Quantity:
         super().at_tier(tier)
@@ -244,7 +274,7 @@ class Demand:
         other = (
             limit if isinstance(limit, Quantity) else _constant(number_in(limit, quantity.unit, quantity.words), quantity.unit)
         )
-        if not _same_unit(other.unit, quantity.unit):
+        if not same_unit(other.unit, quantity.unit):
             raise InputError(
                 quantity.words, f"is in {quantity.unit or 'no unit'} and compared with {other.words} in {other.unit}"
             )
@@ -279,34 +309,6 @@ class Demand:
         raise InputError(self.words, problem)
 
 
-def _arguments(function: Callable[..., Any]) -> int:
-    """How many arguments a function must be given; 1 where nobody says."""
-    try:
-        given = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        return 1
-    free = [p for p in given if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    return len(free)
-
-
-@lru_cache(maxsize=256)
-def _same_unit(one: str, other: str) -> bool:
-    if one == other:
-        return True
-    import pint  # half a second, and most units are written alike
-
-    units = pint.get_application_registry()
-    try:
-        return abs(float((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless")) - 1.0) < 1e-12
-    except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError):
-        return False
-
-
-def number_in(value: Number, unit: str, name: str) -> float:
-    """A number or text in a unit."""
-    return float(number(value, unit, name))
-
-
 def _constant(value: float, unit: str) -> Combined:
     return Combined(f"{value:.6g} {unit}".strip(), unit, operation="constant", constant=value)
 
@@ -337,7 +339,7 @@ def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
 def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
     names = [x.words if isinstance(x, Quantity) else repr(x) for x in (one, other)]
     left, right = _with_unit(one, names[1]), _with_unit(other, names[0])
-    if not _same_unit(left.unit, right.unit):
+    if not same_unit(left.unit, right.unit):
         raise InputError(
             f"{names[0]} {sign} {names[1]}",
             f"puts together {left.unit or 'no unit'} and {right.unit or 'no unit'}; divide each by a value first, for example "
@@ -361,7 +363,7 @@ def _product(one: Operand, other: Operand) -> Quantity:
 def _ratio(one: Operand, other: Operand) -> Quantity:
     left, right = _with_unit(one, "a quantity"), _with_unit(other, "a quantity")
     below = f"({right.unit})" if any(c in right.unit for c in " /*") else right.unit
-    unit = "" if _same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
+    unit = "" if same_unit(left.unit, right.unit) else left.unit if not right.unit else f"{left.unit or '1'}/{below}"
     return _made("/", f"{_inside(left)} / {_inside(right)}", unit, left, right)
 
 
@@ -369,7 +371,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
     if not quantities or not all(isinstance(q, Quantity) for q in quantities):
         raise InputError(operation, f"has {quantities!r}; give one quantity or several")
     for each in quantities[1:]:
-        if not _same_unit(each.unit, quantities[0].unit):
+        if not same_unit(each.unit, quantities[0].unit):
             raise InputError(operation, f"puts together {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
     name = f"{operation} of ({'; '.join(q.words for q in quantities)})"
     return _made(operation, name, quantities[0].unit, *quantities)

@@ -1,13 +1,16 @@
 """Recipes and trade-offs."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import scene
 
 import jaxvib as jv
-from optimize import DesignSpace, Quantity, pareto
+from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto
 from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune, widest_range
+from optimize.space.numbers import changed, places_of
 
 SCENE = scene("two_mass", speed=120.0)
 
@@ -49,6 +52,74 @@ def test_the_lightest_exciter_shakes_by_what_is_asked_and_no_more():
     best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=4, iterations=25, verify=False)
     assert best.status_name == "done" and best.limits[0].active
     np.testing.assert_allclose(best.limits[0].value, 0.042, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_the_antiphase_machine_balances_each_platform_on_its_own_spring():
+    """Little damped platforms in antiphase leave the bed alone where M1 y1 + M2 y2 = 0 and k1 y1 + k2 y2 = 0: k1/M1 = k2/M2."""
+    light = eqx.tree_at(
+        lambda s: (s.machine.damping, s.machine.link_damping), SCENE, (jnp.array([0.04, 0.02]), jnp.array([0.06]))
+    )
+    best = antiphase(light).run(starts=32, verify=False)
+    k, m = best.scene.machine.stiffness, np.asarray([120.0, 95.0 + 2.4])
+    assert best.status_name == "done"
+    np.testing.assert_allclose(k[0] / m[0], k[1] / m[1], rtol=0.01)
+    of = {tier: float(force_per_amplitude(mode=3, tier=tier)(best.scene)) for tier in ("leading", "exact")}
+    assert max(of.values()) < 0.05 * best.before.force_per_amplitude
+
+
+@pytest.mark.slow
+def test_the_middle_platform_rests_at_the_anti_resonance():
+    """Without damping k12/M1 = k23/M3 = w^2, masses with their loads."""
+    machine = jv.three_mass(
+        mass=(30.0, 40.0, 30.0), stiffness=(0.0, 4e4, 0.0), damping=(0.0, 0.01, 0.0), link_stiffness=(2e5, 0.0, 3e5),
+        link_damping=(0.01, 0.0, 0.01), exciter=3,
+    )  # fmt: skip
+    start = jv.Scene(machine, jv.balls(count=2, mass=0.05, radius=0.1, drag=0.2), jv.ConstantSpeed(160.0))
+    best = anti_resonance(start, mode=3).run(starts=32, verify=False)
+    k, omega = best.scene.machine.link_stiffness, best.after.omega
+    np.testing.assert_allclose([k[0] / 30.0, k[2] / 30.1], [omega**2, omega**2], rtol=0.01)
+    orbit = jv.jam_orbit(best.scene, mode=3)
+    assert orbit.amplitude[1] < 0.01 * orbit.relative_amplitude(1, 3)
+
+
+@pytest.mark.slow
+def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
+    found = retune(SCENE, force_per_amplitude(mode=3), starts=8)
+    asked = jax.jit(force_per_amplitude(mode=3).__call__)
+    least = {}
+    for name, _ in found:
+        place = places_of(SCENE, name, "free")
+        scan = [changed(SCENE, place, place.read(SCENE) * share) for share in np.geomspace(1.0 / 3.0, 3.0, 301)]
+        least[name] = np.nanmin([float(asked(each)) for each in scan])
+    assert [name for name, _ in found] == sorted(least, key=lambda name: least[name])
+    for name, best in found:
+        assert best.values.min() <= least[name] * (1.0 + 1e-9)
+        np.testing.assert_allclose(best.values.min(), float(asked(best.scene)), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_lightest_exciter_shakes_so_in_the_full_equations():
+    best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=8)
+    assert best.run is not None and best.verified is not None
+    np.testing.assert_allclose(float(amplitude(mode=3, tier="exact")(best.scene)), 0.042, rtol=0.02)  # to leading order 0.042
+    shaken = next(row for row in best.table if row.what.startswith("amplitude, mode 3"))
+    np.testing.assert_allclose(shaken.time, shaken.exact, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_widest_range_is_that_of_the_whole_branch():
+    """The distance to the fold that the search followed, against the folds of the machine it found."""
+    design = widest_range(SCENE, mode=3, keep=0.9)
+    best = design.run(starts=16, verify=False)
+    modes = jv.jam_modes(best.scene)
+    omega, speed = (np.asarray(a)[np.asarray(modes.folds.exists)] for a in (modes.folds.omega, modes.folds.rotor_speed))
+    jam = float(modes.select(3).omega)
+    above = speed[omega > jam][np.argmin(omega[omega > jam])]  # the folds beside the jam on the branch
+    below = speed[omega < jam][np.argmax(omega[omega < jam])] if np.any(omega < jam) else 0.0
+    np.testing.assert_allclose(-best.values.min(), min(above - 120.0, 120.0 - below), rtol=1e-7)
+    assert -best.values.min() > 1.05 * float(fold_margin(mode=3)(SCENE))
+    assert best.after.amplitude and best.limits[0].broken == 0.0
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,12 @@ from optimize import (
     Synthesis,
     amplitude,
     expected,
+    fold_margin,
     force_per_amplitude,
     hold,
     jam_frequency,
+    largest,
+    least,
     product,
     support_frequency_squared,
     synthesize,
@@ -95,6 +98,45 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     assert "not met" in "\n".join(best.said())
     with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
         found(space, NEAREST, subject_to=demands)
+
+
+def plain(name, function):
+    """A quantity of the two stiffnesses x, y in 1e4 N/m."""
+    return Quantity(name, "", lambda s: function(*(s.machine.stiffness / 1e4)))
+
+
+def both_ways(name, function):
+    return [plain(f"{sign} {name}", lambda x, y, sign=sign: sign * function(x, y)) for sign in (1.0, -1.0)]
+
+
+PARABOLAS = [plain(str(at), lambda x, y, at=at: (x - at) ** 2 + (y - 4.0) ** 2) for at in (3.0, 6.0)]
+BOWL = [*both_ways("x", lambda x, y: x - 5.0), *both_ways("y", lambda x, y: y - 3.0 + 0.25 * (x - 5.0) ** 2)]
+CONE = plain("cone", lambda x, y: jnp.sqrt((x - 5.0 + 0.1 * (y - 2.0) ** 2) ** 2 + (20.0 * (y - 3.0)) ** 2 + 1e-30))
+
+
+@pytest.mark.parametrize(
+    ("wish", "at", "value"),
+    [
+        (largest(*PARABOLAS), [4.5, 4.0], 2.25),  # they meet in the line x = 4.5
+        (0.5 - least(*(-each for each in BOWL)), [5.0, 3.0], 0.5),
+        (CONE, [4.9, 3.0], 0.0),  # a modulus that vanishes: no second derivative shows the tip
+    ],
+)
+def test_searches_end_at_kinks(wish, at, value):
+    best = found(DesignSpace(SCENE, FREE), wish, starts=8)
+    assert best.status_name == "done" and best.same == best.converged == 8
+    assert best.kkt < 1e-6 or wish is CONE  # a cone has no slope at its tip
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness"], 1e4 * np.asarray(at), rtol=1e-6)
+    np.testing.assert_allclose(best.values.min(), value, rtol=1e-9, atol=1e-8)
+
+
+def test_the_worst_of_samples_is_a_kink_where_two_machines_are_as_bad():
+    """Stiffness a k of each sample is to be 5e4; a, A its extremes: the least of the largest |a k/5e4 - 1| is (A-a)/(A+a)."""
+    wish = worst(plain("off", lambda x, y: jnp.abs(x / 5.0 - 1.0)), {"machine.stiffness[0]": 0.05}, samples=16)
+    best = found(DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4, "even")}), wish)
+    low, high = (float(f) for f in np.percentile(np.asarray(wish.case.factors(SCENE)[0][1]), [0.0, 100.0]))
+    np.testing.assert_allclose(best.values.min(), (high - low) / (high + low), rtol=1e-9)
+    assert best.status_name == "done"
 
 
 def test_bounds_that_hinder_are_told():
@@ -180,6 +222,25 @@ def test_a_demand_on_a_machine_costs_what_its_multiplier_says():
     assert told.active and at[1].kkt < 1e-6
     measured = (at[2].values.min() - at[0].values.min()) / 0.002
     np.testing.assert_allclose(told.multiplier, measured, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_design_beside_a_fold_keeps_the_distance_that_is_demanded():
+    """The largest amplitude lies at the fold of the jam; a demand on the distance to it is at its limit, and the fold of the
+    exact branch is where it should be."""
+    space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 2e5), "machine.link_stiffness": (5e4, 5e5)})
+    distance, speed = fold_margin(mode=3), 30.0 / np.pi
+    free = found(space, -amplitude(mode=3), starts=16)
+    kept = found(space, -amplitude(mode=3), starts=16, subject_to=[distance > "100 rpm"])
+    assert float(distance(free.scene)) * speed < 10.0  # 5 rpm more, and that machine would leave its jam
+    assert kept.status_name == "done" and kept.limits[0].active
+    np.testing.assert_allclose(float(distance(kept.scene)) * speed, 100.0, rtol=1e-7)
+    assert -kept.values.min() > 0.99 * -free.values.min()
+    exact = jv.branches(kept.scene, exact=True, points=400)
+    jam = float(jv.jam_orbit(kept.scene, mode=3).omega)
+    folds = [each for each in exact.special if each.kind == "fold"]
+    beside = min((each for each in folds if each.omega > jam), key=lambda each: each.omega)
+    np.testing.assert_allclose((beside.rotor_speed - 120.0) * speed, 100.0, rtol=0.05)  # loads of 2.4 kg are not light
 
 
 @pytest.mark.slow

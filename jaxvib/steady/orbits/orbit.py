@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import LinearModel
+from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -115,6 +116,15 @@ class Orbit(Result):
         """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period."""
         c = self.displacement_harmonics
         return _swing(np.asarray(self.orders), c[i - 1 : i] - c[j - 1 : j])[0]
+
+    def force_peaks(self) -> Array:
+        """The greatest force on the bed in each of 16 equal parts of the period, N, (16,); the largest is `foundation_force`,
+        which bends where another one overtakes it. Of a force that does not turn its sign in half a period, or of two
+        directions, `foundation_force` alone, (1,)."""
+        orders = np.asarray(self.orders)
+        if self.force_harmonics.shape[0] > 1 or np.any(orders % 2 == 0):
+            return self.foundation_force[None]
+        return _peaks(orders, self.force_harmonics[0])
 
     def summary(self) -> str:
         """A few lines a person can read; amplitudes zero to peak."""
@@ -271,28 +281,39 @@ def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, har
     return jnp.min(-jnp.cumsum(needed)[:-1])
 
 
+_PARTS = 16
+"""Of a period, whose peaks are told apart: more than the harmonics that matter have peaks."""
+
+
+def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
+    """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included."""
+    each = max(4, int(orders[-1]) // 4)
+    width = 2.0 * np.pi / _PARTS
+    samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
+    still = jax.lax.stop_gradient(harmonics)
+
+    def at(c: Array | np.ndarray, theta: Array | np.ndarray) -> Array:
+        return (jnp.exp(1j * orders.reshape((1,) * np.ndim(theta) + (-1,)) * theta[..., None]) @ c).real
+
+    def newton(_: int, theta: Array) -> Array:
+        first, second = at(1j * orders * still, theta), at(-(orders**2) * still, theta)
+        step = first / jnp.where(second < 0.0, second, -jnp.inf)
+        return jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
+
+    values = at(still, samples)
+    theta = jnp.take_along_axis(jnp.asarray(samples, values.dtype), jnp.argmax(values, axis=1)[:, None], axis=1)[:, 0]
+    # The value at an extremum does not change with where the extremum is: its place needs no derivative.
+    return at(harmonics, jax.lax.fori_loop(0, 4, newton, theta))
+
+
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
     """(max - min)/2 over the period of the signals with these harmonics (n, K), between the samples too."""
     symmetric = bool(np.all(orders % 2 == 1))  # the signal turns its sign in half a period
-    samples = 2.0 * np.pi * np.arange(max(64, 4 * int(orders[-1]))) / max(64, 4 * int(orders[-1]))
-    spacing = samples[1]
-    signal = (harmonics @ np.exp(1j * orders[:, None] * samples)).real
 
-    def extremum(c: Array, values: Array, sign: float) -> Array:
-        def newton(_: int, theta: Array) -> Array:
-            wave = still * jnp.exp(1j * orders * theta)
-            first, second = jnp.sum(-orders * wave.imag), jnp.sum(-(orders**2) * wave.real)
-            step = first / jnp.where(sign * second < 0.0, second, -sign * jnp.inf)
-            return theta - jnp.clip(step, -spacing, spacing)
+    def highest(c: Array) -> Array:
+        return greatest(_peaks(orders, c))  # the highest between the samples, not that beside the highest sample
 
-        still = jax.lax.stop_gradient(c)
-        theta = jnp.asarray(samples, dtype=values.dtype)[jnp.argmax(sign * values)]
-        # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-        theta = jax.lax.fori_loop(0, 3, newton, theta)
-        return jnp.sum(c * jnp.exp(1j * orders * theta)).real
+    def swing(c: Array) -> Array:
+        return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0
 
-    def swing(c: Array, values: Array) -> Array:
-        highest = extremum(c, values, 1.0)
-        return highest if symmetric else (highest - extremum(c, values, -1.0)) / 2.0
-
-    return jax.vmap(swing)(harmonics, signal)
+    return jax.vmap(swing)(harmonics)

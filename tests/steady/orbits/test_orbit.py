@@ -17,6 +17,7 @@ import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
+from jaxvib.steady.orbits.orbit import _peaks, _swing
 
 
 class Shaker(jv.Machine):
@@ -311,3 +312,15 @@ def test_tiers_differ_in_proportion_to_the_loads_mass():
         assert word in tier.message[0] and "does not exist" in tier.message[2]
         assert np.isfinite(tier.amplitude[:2]).all() and np.isnan(tier.amplitude[2]).all()
     assert found.plot().axes[0].get_xlabel() == "mass of a load, kg"
+
+
+def test_the_highest_of_several_peaks_is_that_between_samples():
+    """Peaks of nearly one height: the highest is none of the 64 samples', and a search along a bend needs to know which."""
+    random = np.random.default_rng(3)
+    orders = np.arange(1, 16, 2)
+    theta = np.linspace(0.0, 2.0 * np.pi, 200001)
+    wave = np.exp(1j * orders[:, None] * theta)
+    harmonics = (random.normal(size=(40, 8)) + 1j * random.normal(size=(40, 8))) * np.array([0.02, 1.0, 0.02, *[1e-3] * 5])
+    dense = np.max((harmonics @ wave).real, axis=1)  # within 1e-9 between its samples
+    np.testing.assert_allclose(_swing(orders, jnp.asarray(harmonics)), dense, rtol=3e-9)
+    np.testing.assert_allclose(_peaks(orders, jnp.asarray(harmonics[0])).max(), dense[0], rtol=3e-9)
