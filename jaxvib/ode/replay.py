@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.ode.control import Decision, WrappedController
-from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Y
+from jaxvib.ode.types import Args, Y
 from jaxvib.runtime.compat import no_host_checks
 
 __all__ = ["solve"]
@@ -40,14 +39,20 @@ def solve(
 ) -> diffrax.Solution:
     """`diffrax.diffeqsolve` from time 0 to `end`, which fails by its result alone.
 
-    Its reverse derivatives are a step-replay adjoint. They go back over checkpoints, from which the run is computed once more;
-    an adaptive controller that chose its steps once more as well would find them a rounding apart, and the next ones further:
-    after some hundred turns they are other steps, whose derivatives do not belong together (off by up to 1e-3). So the end of
-    each step is recorded in a first run, and those steps are differentiated. A run of which no derivative is taken is done
-    once, and records nothing.
+    Its reverse derivatives are a step-replay adjoint: those of the very steps that were taken. A controller that chose its
+    steps once more on the way back would find them a rounding apart, and the next ones further: after some hundred turns they
+    are other steps, whose derivatives do not belong together (off by up to 1e-3). So a run that is to be differentiated notes
+    when each step begins, and the state at every so many of them. On the way back the states in between are computed once
+    more, and each step is transposed by itself, from the last one to the first:
+
+        (y_i+1, dense_i) = step(y_i, t_i, t_i+1, numbers),    saved(t) = within(dense_i, t_i, t_i+1, t)
+
+    Where steps end is constant, but for the last one, which ends at `end`, and for constant steps, which move with `end` and
+    `first_step`. A run of which no derivative is taken is done once, and notes nothing.
 
     **Arguments**: `adjoint` diffrax's, for another way: `diffrax.ForwardMode()` for forward derivatives. No function among the
-    arguments may hold on to traced arrays; `args` is for them. The others are as in diffrax.
+    arguments may hold on to traced arrays; `args` is for them. `saveat` saves states at given times and at the end. The method
+    carries nothing from step to step but rates. The others are as in diffrax.
 
     **Returns** diffrax's `Solution`.
     """
@@ -91,87 +96,233 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
     return _solve(inputs, controller, diffrax.ForwardMode(), *rest)
 
 
+class _Notes(NamedTuple):
+    """Of a run: how many steps it took, when the next one begins after each (max_steps,), the state after every so many."""
+
+    count: Array
+    starts: Array
+    states: Y
+
+
+class _Slopes(NamedTuple):
+    """On the way back: slopes by the state, by the numbers of equations and arguments, by the end and the first step, by the
+    times that are saved; and the last of those that is still ahead."""
+
+    state: Y
+    numbers: PyTree[Array | None]
+    end: Array
+    first_step: Array
+    times: Array
+    ahead: Array
+
+
 @_with_replay.def_fwd
 def _forward(
     perturbed: PyTree[bool], inputs: _Inputs, controller: diffrax.AbstractStepSizeController, *rest: *_Rest
-) -> tuple[diffrax.Solution, Array | None]:
-    """The run, and the times at which its steps end."""
-    if isinstance(controller, (diffrax.ConstantStepSize, diffrax.StepTo)):
-        return _solve(inputs, controller, diffrax.ForwardMode(), *rest), None
+) -> tuple[diffrax.Solution, _Notes]:
+    """The run, and its notes."""
     end, first_step, y0, args, saveat, term = inputs
-    steps = diffrax.SubSaveAt(steps=True, fn=_nothing)
-    recording = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, steps]), term)
-    solution = _solve(recording, controller, diffrax.ForwardMode(), *rest)
+    starts = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: None)
+    states = diffrax.SubSaveAt(steps=_spacing(y0, rest[1]))
+    noting = (end, first_step, y0, args, diffrax.SaveAt(subs=[saveat.subs, starts, states]), term)
+    solution = _solve(noting, controller, diffrax.ForwardMode(), *rest)
     assert solution.ts is not None and solution.ys is not None
-    times = solution.ts[1]
-    return eqx.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], solution.ys[0])), times
+    notes = _Notes(solution.stats["num_accepted_steps"], solution.ts[1], solution.ys[2])
+    return eqx.tree_at(lambda s: (s.ts, s.ys), solution, (solution.ts[0], solution.ys[0])), notes
+
+
+def _spacing(y0: Y, max_steps: int) -> int:
+    """After how many steps a state is noted: after each one where that takes at most 1 MiB."""
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
+    return max(1, min(-(-max_steps * size // 2**20), max_steps))
 
 
 @_with_replay.def_bwd
 def _backward(
-    times: Array | None,
+    notes: _Notes,
     cotangents: PyTree[Array | None],
     perturbed: PyTree[bool],
     inputs: _Inputs,
     controller: diffrax.AbstractStepSizeController,
     *rest: *_Rest,
 ) -> PyTree[Array | None]:
+    end, _, y0, _, saveat, _ = inputs
+    solver = _with_tolerances(rest[0], controller)
     differentiable, fixed = eqx.partition(inputs, perturbed)
+    numbers, others = (differentiable[3], differentiable[5]), (fixed[3], fixed[5])
+    saved = _saved(saveat, cotangents.ys, y0)
+    times = saved.times
 
-    def replayed(differentiable: PyTree[Array | None]) -> PyTree[Array | None]:
-        steps = controller if times is None else _recorded_steps(controller, times)
-        adjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=_checkpoints(inputs[2], rest[1]))
-        solution = _solve(eqx.combine(differentiable, fixed), steps, adjoint, *rest)
-        return eqx.filter(solution, eqx.is_inexact_array)
+    def span(i: Array) -> tuple[Array, Array]:
+        """When step i begins and ends."""
+        starts = notes.starts[jnp.maximum(i - 1, 0)]
+        return jnp.where(i == 0, 0.0, starts), _end_before(controller, notes.starts[i])
 
-    solution, transposed = jax.vjp(replayed, differentiable)
-    # A cotangent of zero comes as None.
-    leaves, rest = jax.tree.leaves(solution), jax.tree.structure(solution)
-    given = rest.flatten_up_to(cotangents)  # pyright: ignore[reportAttributeAccessIssue]
-    whole = [jnp.zeros_like(leaf) if dy is None else dy for leaf, dy in zip(leaves, given, strict=True)]
-    return transposed(jax.tree.unflatten(rest, whole))[0]
+    def step(y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
+        """The state after a step, and what makes states within it."""
+        args, term = eqx.combine(numbers, others)
+        y1, _, dense, _, _ = solver.step(term, t0, t1, y, args, solver.init(term, t0, t1, y, args), False)
+        return y1, dense
+
+    def within(dense: PyTree[Array], t0: Array, t1: Array, t: Array) -> Y:
+        return solver.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t)
+
+    def back(i: Array, y: Y, slopes: _Slopes) -> _Slopes:
+        """Back over step i, which begins at the state y."""
+        t0, t1 = span(i)
+        before = jnp.where(i == 0, -jnp.inf, span(jnp.maximum(i - 1, 0))[1])
+        (_, dense), transposed = jax.vjp(step, y, t0, t1, numbers)
+
+        def is_within(carry: tuple[Array, Array, PyTree[Array]]) -> Array:
+            return (carry[0] >= 0) & (times[carry[0]] > before)
+
+        def taken(carry: tuple[Array, Array, PyTree[Array]]) -> tuple[Array, Array, PyTree[Array]]:
+            k, by_times, by_step = carry
+            *more, by_time = jax.vjp(within, dense, t0, t1, times[k])[1](jax.tree.map(lambda dy: dy[k], saved.states))
+            return k - 1, by_times.at[k].set(by_time), jax.tree.map(jnp.add, by_step, tuple(more))
+
+        none = jax.tree.map(jnp.zeros_like, (dense, t0, t1))
+        carry = (slopes.ahead, slopes.times, none)
+        ahead, by_times, (by_dense, *by_span) = jax.lax.while_loop(is_within, taken, carry) if times.size else carry
+        by_y, by_start, by_end, by_numbers = transposed((slopes.state, by_dense))
+        by_bounds = ((i, by_start + by_span[0]), (i + 1, by_end + by_span[1]))
+        return _Slopes(
+            state=by_y,
+            numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
+            end=slopes.end + sum(_share_of_end(controller, notes.count, j) * by for j, by in by_bounds),
+            first_step=slopes.first_step + sum(jnp.where((j == 1) & (notes.count > 1), by, 0.0) for j, by in by_bounds),
+            times=by_times,
+            ahead=ahead,
+        )
+
+    every = _spacing(y0, rest[1])
+
+    def back_to_note(carry: tuple[Array, _Slopes]) -> tuple[Array, _Slopes]:
+        """Back over the steps since the last state that was noted."""
+        n, slopes = carry
+        first, count = n * every, jnp.minimum(every, notes.count - n * every)
+        noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), y0, notes.states)
+        if every == 1:
+            return n - 1, back(n, noted, slopes)
+
+        def again(j: Array, states: Y) -> Y:
+            y, _ = step(jax.tree.map(lambda ys: ys[j], states), *span(first + j), numbers)
+            return jax.tree.map(lambda ys, y: ys.at[j + 1].set(y), states, y)
+
+        states = jax.tree.map(lambda y: jnp.zeros((every, *y.shape), y.dtype).at[0].set(y), noted)
+        states = jax.lax.fori_loop(0, count - 1, again, states)
+
+        def from_last(j: Array, slopes: _Slopes) -> _Slopes:
+            k = count - 1 - j
+            return back(first + k, jax.tree.map(lambda ys: ys[k], states), slopes)
+
+        return n - 1, jax.lax.fori_loop(0, count, from_last, slopes)
+
+    zero = jnp.zeros_like(end)
+    reached = span(notes.count - 1)[1]
+    slopes = _Slopes(
+        state=saved.last,
+        numbers=jax.tree.map(jnp.zeros_like, numbers),
+        end=zero,
+        first_step=zero,
+        times=jnp.zeros_like(times),
+        ahead=jnp.searchsorted(times, reached, side="right") - 1,
+    )
+    start = ((notes.count - 1) // every, slopes)
+    _, slopes = jax.lax.while_loop(lambda carry: carry[0] >= 0, back_to_note, start)
+    return _by_inputs(differentiable, cotangents, saveat, controller, saved, slopes)
 
 
-def _checkpoints(y0: Y, max_steps: int) -> int | None:
-    """As many as take 1 MiB, for steps between checkpoints are computed once more; not fewer than diffrax's own, None."""
-    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(y0))
-    room = min(2**20 // (3 * size), max_steps)  # the state, its rates, and about as much of the loop's own
-    return room if room > (2.0 * max_steps) ** 0.5 else None
+def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.AbstractStepSizeController) -> diffrax.AbstractSolver:
+    """An implicit method that solves its equations to the controller's tolerances, where it has none of its own."""
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
+        return solver
+    finder = solver.root_finder
+    asked = [name for name in ("rtol", "atol") if not eqx.is_inexact_array_like(getattr(finder, name))]
+    asked += [] if callable(finder.norm) else ["norm"]
+    values = [getattr(controller, name) for name in asked]
+    return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in asked], solver, values) if asked else solver
 
 
-def _nothing(t: RealScalarLike, y: Y, args: Args) -> None:
-    return None
+def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
+    """How far the start of step j of `count` moves with the end of the run: constant steps fill the time that the first one
+    leaves, those that a controller chose stay where they are."""
+    if isinstance(controller, diffrax.ConstantStepSize):
+        return jnp.where((j > 1) | (count == 1), j / count, 0.0)
+    return jnp.where(j == count, 1.0, 0.0)
 
 
-def _recorded_steps(controller: diffrax.AbstractStepSizeController, times: Array) -> diffrax.AbstractStepSizeController:
-    """The controller that takes the recorded steps; one that steps onto `jump_ts` of the field still does."""
-    if isinstance(controller, diffrax.ClipStepSizeController):
-        return eqx.tree_at(lambda c: c.controller, controller, _recorded_steps(controller.controller, times))
-    return RecordedSteps(controller=controller, times=times)  # pyright: ignore[reportCallIssue]
+def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) -> Array:
+    """When the step before the one that begins at `start` ended: there, unless the field jumps between them."""
+    jumps = getattr(controller, "jump_ts", None)
+    if jumps is None:
+        return start
+    jump = jnp.nextafter(start, -jnp.inf)
+    return jnp.where(jnp.any(jump == jumps), jnp.nextafter(jump, -jnp.inf), start)
 
 
-class RecordedSteps(WrappedController):
-    """Takes the steps that end at `times` (max_steps,), in order."""
+class _Saved(NamedTuple):
+    """Of all states that are saved: times, ascending, and slopes by the states then; slopes by the state at the end; and at
+    which place of all lists of times, one after the other, each time stands."""
 
-    controller: diffrax.AbstractStepSizeController
     times: Array
+    states: Y
+    last: Y
+    places: Array
 
-    def wrap(self, direction: IntScalarLike) -> RecordedSteps:
-        return self
 
-    def init(self, *_: object, **__: object) -> tuple[RealScalarLike, Array]:
-        return self.times[0], jnp.asarray(0)
+def _saved(saveat: diffrax.SaveAt, slopes: PyTree[Array | None], y0: Y) -> _Saved:
+    times, states, last = [], [], [jax.tree.map(jnp.zeros_like, y0)]
+    for sub, slope in zip(saveat.subs, slopes, strict=True):
+        count = (0 if sub.ts is None else sub.ts.size) + sub.t1
+        whole = jax.tree.map(
+            lambda y, dy, count=count: jnp.zeros((count, *y.shape), y.dtype) if dy is None else dy, y0, slope, is_leaf=_is_none
+        )
+        if sub.t1:
+            last.append(jax.tree.map(lambda dy: dy[-1], whole))
+        if sub.ts is not None:
+            times.append(sub.ts)
+            states.append(jax.tree.map(lambda dy, n=sub.ts.size: dy[:n], whole))
+    all_times = jnp.concatenate(times) if times else jnp.zeros(0)
+    places = jnp.argsort(all_times)
+    all_states = jax.tree.map(lambda *dy: jnp.concatenate(dy)[places], *states) if states else None
+    return _Saved(all_times[places], all_states, jax.tree.map(lambda *dy: sum(dy), *last), places)
 
-    def adapt_step_size(
-        self,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        y1_candidate: Y,
-        args: Args,
-        y_error: Y,
-        error_order: RealScalarLike,
-        controller_state: Array,
-    ) -> Decision:
-        done = controller_state + 1
-        return jnp.asarray(True), t1, self.times[done], False, done, diffrax.RESULTS.successful
+
+def _is_none(x: object) -> bool:
+    return x is None
+
+
+def _by_inputs(
+    differentiable: PyTree[Array | None],
+    cotangents: PyTree[Array | None],
+    saveat: diffrax.SaveAt,
+    controller: diffrax.AbstractStepSizeController,
+    saved: _Saved,
+    slopes: _Slopes,
+) -> PyTree[Array | None]:
+    """Slopes by the inputs that are differentiated, None for the others."""
+    by_end, by_times = slopes.end, []
+    parts = jnp.zeros_like(slopes.times).at[saved.places].set(slopes.times)
+    for sub, by_ts in zip(saveat.subs, cotangents.ts, strict=True):
+        if sub.ts is not None:
+            by_time, parts = parts[: sub.ts.size], parts[sub.ts.size :]
+            by_times.append(by_time if by_ts is None else by_time + by_ts[: sub.ts.size])
+        if sub.t1 and by_ts is not None:
+            by_end = by_end + by_ts[-1]
+    if cotangents.t1 is not None:
+        by_end = by_end + cotangents.t1
+    end, first_step, _, _, saves, _ = differentiable
+    constant = isinstance(controller, diffrax.ConstantStepSize)
+    where = [k for k, sub in enumerate(saveat.subs) if sub.ts is not None and saves.subs[k].ts is not None]
+    given = dict(zip([k for k, sub in enumerate(saveat.subs) if sub.ts is not None], by_times, strict=True))
+    if where:
+        saves = eqx.tree_at(lambda s: [s.subs[k].ts for k in where], saves, [given[k] for k in where])
+    return (
+        None if end is None else by_end,
+        None if first_step is None else slopes.first_step if constant else jnp.zeros_like(slopes.first_step),
+        slopes.state,
+        slopes.numbers[0],
+        saves,
+        slopes.numbers[1],
+    )

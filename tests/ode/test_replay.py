@@ -37,17 +37,18 @@ def forced(again, jump):
     return diffrax.ODETerm(field)
 
 
-def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=None, end=300.0, noted=False):
+def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=None, end=300.0, noted=False, **options):
     one = (jnp.ones(()), jnp.ones(()))
     if controller is None:
         controller = PIController(tolerance=jnp.asarray(1e-7), unit=one, relative=one)
         if jump:
             controller = diffrax.ClipStepSizeController(controller, jump_ts=jnp.asarray([7.0]))
+    first_step = None if isinstance(controller, diffrax.StepTo) else jnp.asarray(0.1)
+    options = {"first_step": first_step, "max_steps": 2**12, **options}
     solution = solve(
         forced(again, jump),
         solver or (UnrolledDopri8() if again is rounded else diffrax.Dopri8()),
         end=jnp.asarray(end),
-        first_step=None if isinstance(controller, diffrax.StepTo) else jnp.asarray(0.1),
         y0=(jnp.asarray(1.0), jnp.asarray(0.0)),
         args=args,
         saveat=diffrax.SaveAt(steps=True)
@@ -55,7 +56,7 @@ def run(args, *, solver=None, again=plain, jump=0.0, adjoint=None, controller=No
         else diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=jnp.asarray([0.5, 0.9]) * end)]),
         controller=controller,
         adjoint=adjoint,
-        max_steps=2**12,
+        **options,
     )
     return solution.ts if noted else jnp.concatenate([*solution.ys[0], *solution.ys[1]])
 
@@ -116,3 +117,28 @@ def test_given_steps_need_no_noting(controller):
 
     forward = jax.jit(jax.jacfwd(lambda args: value(args, diffrax.ForwardMode())))(ARGS)
     np.testing.assert_allclose(jax.jit(jax.jacrev(value))(ARGS), forward, atol=1e-12)
+
+
+@pytest.mark.parametrize("max_steps", [2**17, 2**20])
+def test_states_that_were_not_noted_are_computed_again(right, max_steps):
+    """Of so many steps only every 2nd and 16th state is noted; 1400 steps are taken, so that the last stretch is a short one."""
+    reverse = jnp.stack(jax.jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
+    np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
+
+
+@pytest.mark.parametrize("controller", [diffrax.ConstantStepSize(), diffrax.PIDController(rtol=1e-7, atol=1e-7)])
+def test_slopes_by_the_end_and_by_constant_steps(controller):
+    """Saved states follow their times, the last step its end; constant steps move all together, chosen ones do not."""
+
+    def value(end, share, adjoint=None):
+        return run(ARGS, end=end, controller=controller, first_step=share, adjoint=adjoint)
+
+    given = (jnp.asarray(30.0), jnp.asarray(1.6))  # steps so long that their error is felt
+    by_end, by_step = jax.jit(jax.jacrev(value, argnums=(0, 1)))(*given)
+    forward = jax.jit(jax.jacfwd(lambda end, share: value(end, share, diffrax.ForwardMode()), argnums=(0, 1)))(*given)
+    np.testing.assert_allclose(by_end, forward[0], atol=1e-6)
+    if isinstance(controller, diffrax.ConstantStepSize):
+        assert float(jnp.max(jnp.abs(forward[1]))) > 1e-4
+        np.testing.assert_allclose(by_step, forward[1], atol=1e-9)
+    else:
+        assert jnp.all(by_step == 0.0)
