@@ -121,7 +121,7 @@ def test_given_steps_need_no_noting(controller):
 
 @pytest.mark.parametrize("max_steps", [2**17, 2**20])
 def test_states_that_were_not_noted_are_computed_again(right, max_steps):
-    """Of so many steps only every 2nd and 16th state is noted; 1400 steps are taken, so that the last stretch is a short one."""
+    """Of so many steps only every 2nd and 16th state is noted; the last stretch is a short one."""
     reverse = jnp.stack(jax.jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
     np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
 
