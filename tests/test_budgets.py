@@ -50,7 +50,7 @@ BUDGETS = {
     "jam_orbit, gradient": (jax.grad(orbit), 7050),
     "simulate": (run, 5260),
     "simulate, forward derivatives": (jax.jacfwd(forward_run), 10100),
-    "simulate, reverse derivatives": (jax.grad(run), 14300),
+    "simulate, reverse derivatives": (jax.grad(run), 9100),
 }
 
 

@@ -54,11 +54,11 @@ def test_to_xarray_has_names_and_units(run):
 
 def test_summary_and_plot_show_the_run(run):
     assert run.summary().startswith("the run reached its end: 20 s") and "zero to peak: y1" in run.summary()
-    assert len(run.plot().axes) == 3
+    assert len(run.plot().axes) == 6  # three quantities, each as a whole and its last periods
 
 
 def test_window_alone_measures_the_same(run, window):
-    assert window.trajectory is None and len(window.plot().axes) == 3
+    assert window.trajectory is None and len(window.plot().axes) == 6
     np.testing.assert_allclose(window.amplitude, run.amplitude, rtol=1e-12)
     np.testing.assert_allclose(window.omega, run.omega, rtol=1e-12)
     np.testing.assert_allclose(window.foundation_force, run.foundation_force, rtol=1e-12)

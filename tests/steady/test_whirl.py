@@ -92,7 +92,7 @@ def test_campbell_diagram_has_both_senses():
     found = jv.whirl(published_rotor(), list(np.linspace(0.0, 600.0, 13)))
     assert found.speed.shape == (13, 4)
     labels = [line.get_label() for line in found.plot().axes[0].lines]
-    assert "forward" in labels and "backward" in labels
+    assert "forward whirl" in labels and "backward whirl" in labels
 
 
 def test_platforms_do_not_whirl():

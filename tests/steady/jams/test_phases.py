@@ -186,12 +186,12 @@ def test_figure_of_a_branch_is_solid_where_it_is_stable():
     changes = np.flatnonzero(np.diff(np.asarray(branch.stable).astype(int)) != 0) + 1
     for line, start, stop in zip(lines, [0, *changes], [*(changes + 1), 53], strict=True):
         np.testing.assert_allclose(line.get_xydata(), expected[start:stop], rtol=1e-12)
-    assert {"rotor", "the scene's drag", "unstable"} <= {line.get_label() for line in axis.lines}
+    assert {"speed of the rotor", "the scene's drag; points: its jams", "unstable"} <= {line.get_label() for line in axis.lines}
     np.testing.assert_allclose(
-        [line.get_ydata()[0] for line in axis.lines if line.get_label() == "rotor"], 460.0 * 30.0 / np.pi
+        [line.get_ydata()[0] for line in axis.lines if line.get_label() == "speed of the rotor"], 460.0 * 30.0 / np.pi
     )
-    with pytest.raises(jv.InputError, match="unit is 'Hz'; it must be 'rad/s' or 'rpm'"):
-        branch.plot(unit="Hz")
+    with pytest.raises(jv.InputError, match="unit is 'mph'; it must be one of 'rad/s', 'rpm', 'Hz'"):
+        branch.plot(unit="mph")
 
 
 def test_figure_of_all_jams_has_each_on_a_line():

@@ -54,6 +54,7 @@ def test_a_threshold_curve_is_captures_beside_each_other():
         jv.threshold_curve(published_torus, [])
 
 
+@pytest.mark.slow
 def test_captures_of_balls_that_are_thrown_without_turning():
     base = published_torus(3.5)
     scene = jv.Scene(base.machine, base.loads, base.drive, (*base.effects, jv.Sliding(0.1)))
