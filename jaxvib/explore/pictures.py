@@ -48,6 +48,9 @@ Amplitudes and forces are zero to peak. What is seen here is the theory of light
 _SPEEDS = 81
 """Rotor speeds of a Campbell diagram."""
 
+_TICKS = 5
+"""So many ticks, at most, an axis has."""
+
 _DOTS = 100
 """Dots an inch of pictures."""
 
@@ -138,13 +141,21 @@ def diagram(scene: Scene, most: float) -> Figure:
     >>> diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0).axes[0].get_ylabel()
     'whirl speed, rpm'
     """
+    from matplotlib.ticker import LogLocator, MaxNLocator  # slow to import: only who draws pays
+
     speed = float(scene.drive.speed)
     most = max(most, 1.15 * speed)
     if has_branches(scene):
         found = jax.device_get(branches(scene, most=most))
         figure = found.plot(unit="rpm", most=most, show=("speed", "force"))
-        for axis in figure.axes:
-            axis.minorticks_off()  # each tick costs a millisecond
+        for axis in figure.axes:  # each tick costs a millisecond, a power of ten set as a formula several
+            axis.minorticks_off()
+            axis.xaxis.set_major_locator(MaxNLocator(_TICKS))
+            if axis.get_yscale() == "log":
+                axis.yaxis.set_major_locator(LogLocator(numticks=_TICKS))
+                axis.yaxis.set_major_formatter("{x:g}")
+            else:
+                axis.yaxis.set_major_locator(MaxNLocator(_TICKS))
         figure.set_layout_engine(None)  # arranging a figure takes longer than drawing it
         figure.subplots_adjust(left=0.075, right=0.99, bottom=0.17, top=0.83, wspace=0.2)
         return figure
@@ -165,7 +176,8 @@ def picture_of_sketch(scene: Scene) -> Figure:
 
     figure = sketch(scene)
     figure.set_layout_engine(None)
-    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.0, top=0.93)
+    lines = figure.axes[0].get_title(loc="left").count("\n") + 1
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.0, top=1.0 - (0.1 + 0.18 * lines) / figure.get_figheight())
     return figure
 
 

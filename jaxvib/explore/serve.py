@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import socket
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from jaxvib.errors import InputError
 
-__all__ = ["require_free", "require_marimo", "serve", "served_path"]
+__all__ = ["leave", "require_free", "require_marimo", "serve", "served_path"]
 
 _VARIABLE = "JAXVIB_EXPLORE"
 """The environment variable by which the page hears of the scene file."""
@@ -49,7 +50,7 @@ def require_free(port: int) -> None:
 
 
 def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) -> None:
-    """Serves the page of a scene file until it is interrupted.
+    """Serves the page of a scene file until it is interrupted, and ends the process.
 
     **Arguments**: `scene` file; `port` of this computer; whether to open a `browser`; `said` is told where the page is.
 
@@ -68,4 +69,11 @@ def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) ->
         opener = threading.Timer(1.0, webbrowser.open, [address])
         opener.daemon = True
         opener.start()
-    uvicorn.run(page, host=_HOST, port=port, log_level="warning")
+    uvicorn.run(page, host=_HOST, port=port, log_level="warning", timeout_graceful_shutdown=1)
+    leave()
+
+
+def leave() -> None:
+    """Ends the process: marimo's threads would wait for pages that are still open."""
+    sys.stdout.flush()
+    os._exit(0)

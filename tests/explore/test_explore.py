@@ -133,6 +133,7 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     served = {}
     monkeypatch.setattr(uvicorn, "run", lambda page, **options: served.update(options, page=page))
     monkeypatch.setattr(pictures, "prepare", lambda scene: None)
+    monkeypatch.setattr(serve, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
     assert "the page is at http://127.0.0.1:27180" in capsys.readouterr().out and serve.served_path() == path.resolve()
