@@ -10,7 +10,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 
 FLOORS = (
     ("jaxvib.cli",),
-    ("jaxvib.sweeps", "jaxvib.report"),
+    ("jaxvib.sweeps", "jaxvib.report", "jaxvib.explore"),
     ("jaxvib.study", "jaxvib.show", "optimize"),
     ("jaxvib.motion",),
     ("jaxvib.steady",),

@@ -68,6 +68,7 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
 _HOMES = {
     "describe": "describe",
     "envelope": "motion.settle",
+    "explore": "explore",
     "growth": "motion.settle",
     "onset": "motion.stability",
     "run-ups": "motion.run_ups",

@@ -73,7 +73,7 @@ class Branches(AbstractJam):
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
-        return picture(self, marks, unit, most, JUDGED, show, ax, np.asarray(self.mode))
+        return picture(self, marks, unit, most, JUDGED, show, ax, np.asarray(self.mode), np.asarray(self.resonances))
 
 
 @overload

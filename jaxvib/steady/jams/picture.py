@@ -62,12 +62,14 @@ def picture(
     show: Sequence[str],
     ax: Onto,
     modes: np.ndarray | None = None,
+    resonances: np.ndarray | None = None,
 ) -> Figure:
     """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
 
     **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
     rotor speed shown, rad/s (a third above the scene's if None); how stability is `judged`; `show` which panels, `ax` onto
-    which axes; `modes` the number of the jam mode at each point, counted by the resonances and the slope if None.
+    which axes; `modes` the number of the jam mode at each point, counted by the resonances and the slope if None; the
+    `resonances` (nd,) rad/s, computed if None.
 
     **Returns** a matplotlib figure. **Raises** `InputError` for another unit or panel.
     """
@@ -77,7 +79,9 @@ def picture(
     top = 4.0 / 3.0 * at if most is None else most
     kinds = sorted({kind for kind, _, _ in marks})
     shown = {kind: np.array([(w, n) for k, w, n in marks if k == kind and n <= top]).reshape(-1, 2) for kind in kinds}
-    rotor_speed, resonances = np.asarray(branch.rotor_speed), np.asarray(natural_frequencies(branch.scene))
+    rotor_speed = np.asarray(branch.rotor_speed)
+    if resonances is None:
+        resonances = np.asarray(natural_frequencies(branch.scene))
     if modes is None:
         modes = 2 * np.searchsorted(resonances, np.asarray(branch.omega)) + (np.asarray(branch.slope) > 0.0)
     return branch_diagram(

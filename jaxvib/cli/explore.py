@@ -1,0 +1,29 @@
+"""jaxvib explore."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import jaxvib as jv
+from jaxvib.cli.app import app
+
+
+@app.command("explore")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--port", type=click.IntRange(1, 65535), default=2718, show_default=True, help="Of this computer.")
+@click.option("--no-browser", is_flag=True, help="Open no browser; only say where the page is.")
+def explore(scene: Path, port: int, no_browser: bool) -> None:
+    """A local page with sliders for SCENE; its diagrams follow, and what is found is saved as TOML.
+
+    Runs until it is interrupted (Ctrl-C). Nobody but this computer reaches the page. Needs: pip install 'jaxvib[explore]'"""
+    from jaxvib.explore.pictures import prepare
+    from jaxvib.explore.serve import require_free, require_marimo, serve  # only who explores pays
+
+    require_marimo()
+    require_free(port)
+    loaded = jv.load_scene(scene)
+    click.echo("compiling ...")
+    prepare(loaded)
+    serve(scene, port, not no_browser, lambda address: click.echo(f"the page is at {address}; Ctrl-C ends it"))

@@ -1,0 +1,86 @@
+"""The page itself, a marimo app: it wires sliders to pictures, and nothing else. `serve` runs it and says which scene."""
+
+import marimo
+
+app = marimo.App(width="full", app_title="jaxvib explore")
+
+
+@app.cell
+def _():
+    import marimo as mo
+
+    from jaxvib.explore import pictures
+    from jaxvib.explore.serve import served_path
+    from jaxvib.explore.sliders import scene_at, sliders_of
+    from jaxvib.machine.files import load_scene
+
+    return load_scene, mo, pictures, scene_at, served_path, sliders_of
+
+
+@app.cell
+def _(load_scene, mo, served_path, sliders_of):
+    path = served_path()
+    scene = load_scene(path)
+    controls = mo.ui.dictionary(
+        {
+            each.name: mo.ui.slider(
+                steps=list(each.steps), value=each.start, label=each.title, show_value=True, full_width=True
+            )
+            for each in sliders_of(scene)
+        }
+    )
+    return controls, path, scene
+
+
+@app.cell
+def _(controls, mo, path, pictures):
+    mo.sidebar([mo.md(f"**{path.name}**"), mo.vstack(list(controls.elements.values()))], width="22rem")
+    return
+
+
+@app.cell
+def _(controls, pictures, scene, scene_at):
+    machine = pictures.tried(lambda: scene_at(scene, controls.value))
+    return (machine,)
+
+
+@app.cell
+def _(machine, mo, pictures, scene):
+    mo.Html(pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine))
+    return
+
+
+@app.cell
+def _(machine, mo, pictures):
+    mo.Html(pictures.text(lambda: pictures.readings(machine.value), machine))
+    return
+
+
+@app.cell
+def _(machine, mo, pictures):
+    mo.Html(pictures.image(lambda: pictures.picture_of_sketch(machine.value), machine))
+    return
+
+
+@app.cell
+def _(mo, pictures, scene):
+    mo.md(pictures.heading(scene) + "\n\n" + pictures.ABOUT)
+    return
+
+
+@app.cell
+def _(machine, mo, path, pictures):
+    mo.sidebar(
+        mo.download(
+            data=pictures.toml(machine).encode(),
+            filename=f"{path.stem}-explored.toml",
+            mimetype="text/plain",
+            label="Save this machine as TOML",
+            disabled=machine.problem != "",
+        )
+    )
+    return
+
+
+if __name__ == "__main__":
+    app.run()

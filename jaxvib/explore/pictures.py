@@ -1,0 +1,191 @@
+"""What the page shows of a scene: diagram, sketch, numbers, file."""
+
+from __future__ import annotations
+
+import base64
+import gc
+import html
+import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxvib.errors import ComputationError, InputError
+from jaxvib.machine.files import scene_to_toml
+from jaxvib.machine.scene import Scene
+from jaxvib.steady.branches import branches
+from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.whirl import critical_speeds, whirl
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "ABOUT",
+    "Tried",
+    "diagram",
+    "has_branches",
+    "heading",
+    "image",
+    "picture_of_sketch",
+    "png",
+    "prepare",
+    "readings",
+    "text",
+    "toml",
+    "tried",
+]
+
+ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
+step. Each number of loads is a program of its own: the first time it takes some seconds, afterwards it is stored.
+
+Amplitudes and forces are zero to peak. What is seen here is the theory of light loads; `jaxvib simulate` and
+`jaxvib modes --exact` answer for the saved machine exactly."""
+"""What stands below the sliders, as Markdown."""
+
+_SPEEDS = 81
+"""Rotor speeds of a Campbell diagram."""
+
+_TICKS = 5
+"""So many ticks, at most, an axis has."""
+
+_DOTS = 100
+"""Dots an inch of pictures."""
+
+
+class Tried(NamedTuple):
+    """What was asked for, or a sentence that says why there is none."""
+
+    value: Scene | None
+    problem: str
+
+
+def tried(ask: Callable[[], Scene]) -> Tried:
+    """The scene that `ask` gives, or what its `InputError` says: a slider may go where no machine is."""
+    try:
+        return Tried(ask(), "")
+    except (InputError, ComputationError) as error:
+        return Tried(None, str(error))
+
+
+def image(draw: Callable[[], Figure], scene: Tried) -> str:
+    """A figure as an HTML image that holds its own data, or the sentence that says why there is none."""
+    return _shown(
+        lambda: f'<img style="max-width:100%" src="data:image/png;base64,{base64.b64encode(png(draw())).decode()}">', scene
+    )
+
+
+def text(read: Callable[[], str], scene: Tried) -> str:
+    """Text as HTML, as it stands, or the sentence that says why there is none."""
+    return _shown(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
+
+
+def _shown(make: Callable[[], str], scene: Tried) -> str:
+    problem = scene.problem
+    if not problem:
+        try:
+            return make()
+        except (InputError, ComputationError) as error:
+            problem = str(error)
+    return f"<p><b>Nothing to show here:</b> {html.escape(problem)}</p>"
+
+
+def toml(scene: Tried) -> str:
+    """The scene file of what the sliders say; empty where they say no machine."""
+    return "" if scene.value is None else scene_to_toml(scene.value)
+
+
+def prepare(scene: Scene) -> None:
+    """Compiles and draws once what the page will ask for, so that its first slider moves as fast as the next."""
+    most = 4.0 / 3.0 * float(scene.drive.speed)
+    given = Tried(scene, "")
+    for _ in range(2):
+        image(lambda: diagram(scene, most), given)
+        text(lambda: readings(scene), given)
+        image(lambda: picture_of_sketch(scene), given)
+    gc.collect()
+    gc.freeze()  # programs and modules stay: to look through them all again takes longer than a picture
+
+
+def has_branches(scene: Scene) -> bool:
+    """Whether jams of the scene lie on branches over the rotor's speed: whether its machine moves up and down only."""
+    return scene.machine.structure().axes == (1,)
+
+
+def heading(scene: Scene) -> str:
+    """What `diagram` shows of this scene, and where the rest is."""
+    if has_branches(scene):
+        return (
+            "Where light loads jam: their speed and the foundation force over the rotor's speed. Solid: stable by slope, for "
+            "loads that stay together; dashed: unstable. Where the line of the rotor's speed crosses, jams stand with the "
+            "numbers of their modes."
+        )
+    return (
+        "Whirl of the rotor over its speed (Campbell diagram), the loads' masses where they run, and its critical speeds. "
+        "There is no branch diagram and no force chart: loads of a machine that moves both ways jam at any phases, which "
+        "`jaxvib modes` finds."
+    )
+
+
+def diagram(scene: Scene, most: float) -> Figure:
+    """Of a machine that moves up and down, the branch diagram with the force chart; of a rotor, the Campbell diagram.
+
+    **Arguments**: `most` the greatest rotor speed shown, rad/s; more where the scene's own speed asks for it.
+
+    **Returns** a matplotlib figure. **Raises** `InputError` for scenes that the theory leaves out; it says which part.
+
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0).axes[0].get_ylabel()
+    'whirl speed, rpm'
+    """
+    from matplotlib.ticker import LogLocator, MaxNLocator  # slow to import: only who draws pays
+
+    speed = float(scene.drive.speed)
+    most = max(most, 1.15 * speed)
+    if has_branches(scene):
+        found = jax.device_get(branches(scene, most=most))
+        figure = found.plot(unit="rpm", most=most, show=("speed", "force"))
+        for axis in figure.axes:  # each tick costs a millisecond, a power of ten set as a formula several
+            axis.minorticks_off()
+            axis.xaxis.set_major_locator(MaxNLocator(_TICKS))
+            if axis.get_yscale() == "log":
+                axis.yaxis.set_major_locator(LogLocator(numticks=_TICKS))
+                axis.yaxis.set_major_formatter("{x:g}")
+            else:
+                axis.yaxis.set_major_locator(MaxNLocator(_TICKS))
+        figure.set_layout_engine(None)  # arranging a figure takes longer than drawing it
+        figure.subplots_adjust(left=0.075, right=0.99, bottom=0.17, top=0.83, wspace=0.2)
+        return figure
+    figure = jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))).plot(at=speed, unit="rpm")
+    figure.set_layout_engine(None)
+    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.12, top=0.86)
+    return figure
+
+
+def readings(scene: Scene) -> str:
+    """The jams at the rotor's speed, or a rotor's critical speeds, as text. **Raises** `InputError` as `diagram`."""
+    return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
+
+
+def picture_of_sketch(scene: Scene) -> Figure:
+    """`jaxvib.sketch`, without the search for its margins."""
+    from jaxvib.show.sketch import sketch  # slow to import: only who draws pays
+
+    figure = sketch(scene)
+    figure.set_layout_engine(None)
+    lines = figure.axes[0].get_title(loc="left").count("\n") + 1
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.0, top=1.0 - (0.1 + 0.18 * lines) / figure.get_figheight())
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """A figure as a PNG file, drawn once: `savefig` draws twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(_DOTS)
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 1})
+    return buffer.getvalue()

@@ -1,0 +1,136 @@
+"""What of a scene is moved by sliders, over which range, and the scene at their values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.machine.files import rebuilt
+from jaxvib.machine.scene import Scene
+from optimize.space.numbers import Place, changed, names_of, places_of, shown_unit
+
+__all__ = ["COUNT", "Slider", "scene_at", "sliders_of"]
+
+COUNT = "loads.count"
+"""The name of the slider that changes the number of loads."""
+
+_WIDE = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
+"""Numbers of a machine that have sliders."""
+
+_MOST = 12
+"""So many sliders stand for numbers of a machine one by one; of a larger one, one slider moves all of a kind."""
+
+_DECADES = np.geomspace(0.1, 10.0, 81)
+_SHARES = np.arange(1, 301) / 100.0
+
+
+class Slider(NamedTuple):
+    """A number of a scene that is moved: its `name`, what a designer calls it (`label`), the `unit` in which it is shown, the
+    values that it takes (`steps`, ascending) with the scene's own among them (`start`), and its `place` in the scene, None for
+    the number of loads. The scene's number is multiplied by value / start, so that at `start` it is itself, bit for bit."""
+
+    name: str
+    label: str
+    unit: str
+    steps: tuple[float, ...]
+    start: float
+    place: Place | None
+
+    @property
+    def title(self) -> str:
+        """What stands at the slider."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
+
+
+def sliders_of(scene: Scene) -> list[Slider]:
+    """The sliders of a scene: springs and dampers, a tenth to ten times their values; mass and drag of the loads alike; the
+    rotor's speed, up to three times its own; the number of loads, where they share every number.
+
+    What is 0 has none, since no factor moves it. **Returns** `Slider`s, those of the drive and the loads first.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> [slider.title for slider in sliders_of(scene)][:3]
+    ['rotor speed, rpm', 'number of loads', 'mass of each ball, g']
+    >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
+    ('stiffness of the support, N/mm', 40.0)
+    """
+    found = [_slider(scene, places_of(scene, "drive.speed", "slider"), _SHARES)]
+    if _shared(scene):
+        counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
+        found.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
+    places = [places_of(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _has(scene, name)]
+    arrays = [places_of(scene, name, "slider") for name in _WIDE if _has(scene, name)]
+    single = [one for place in arrays for one in _entries(scene, place)]
+    places += single if len(single) <= _MOST else arrays
+    return found + [_slider(scene, place, _DECADES) for place in places]
+
+
+def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
+    """The scene with its sliders at these values, in the units of the sliders, by their names; where one is not named, the
+    scene's own.
+
+    **Raises** `InputError` for a name that is no slider of the scene, and for a number of loads that have no room.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> moved = scene_at(scene, {"machine.stiffness[0]": 80.0, "loads.count": 3})
+    >>> float(moved.machine.stiffness[0]), moved.loads.count
+    (80000.0, 3)
+    """
+    sliders = {slider.name: slider for slider in sliders_of(scene)}
+    loads = scene.loads
+    for name, value in values.items():
+        if name not in sliders:
+            raise InputError(name, f"is no slider of this scene; there are: {', '.join(sliders)}")
+        slider = sliders[name]
+        if value == slider.start:
+            continue
+        if slider.place is None:
+            loads = dataclasses.replace(loads, count=int(value))
+        else:
+            scene = changed(scene, slider.place, slider.place.read(scene) * (value / slider.start))
+    if loads.count == scene.loads.count:
+        return scene
+    more = dataclasses.replace(scene.loads, count=loads.count)
+    return Scene(scene.machine, rebuilt(more, "loads"), scene.drive, scene.effects)
+
+
+def _has(scene: Scene, name: str) -> bool:
+    """Whether the scene has that number, not 0, and nothing stands in its place (as a rotor's `stiffness_terms` may)."""
+    part, _, field = name.partition(".")
+    owner = getattr(scene, part)
+    value = getattr(owner, field, None)
+    return value is not None and bool(np.any(np.asarray(value))) and getattr(owner, f"{field}_terms", None) is None
+
+
+def _shared(scene: Scene) -> bool:
+    """Whether a load more is one like the others: all share every number, and none has a station of its own."""
+    return scene.machine.structure().stations is None and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
+
+
+def _entries(scene: Scene, place: Place) -> list[Place]:
+    """A place for each number of an array that is not 0."""
+    if not np.ndim(place.leaf(scene)):
+        return [place]
+    values = np.asarray(place.read(scene))
+    return [places_of(scene, f"{place.name}[{k}]", "slider") for k in range(place.size) if values[k]]
+
+
+def _slider(scene: Scene, place: Place, factors: np.ndarray) -> Slider:
+    values = np.asarray(place.read(scene))
+    if place.size > 1:
+        part, _, field = place.name.partition(".")
+        steps = tuple(float(f"{f:.3g}") for f in factors)
+        return Slider(place.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, place)
+    unit, scale = shown_unit(place.unit, float(values[0]))
+    start = float(f"{scale * values[0]:.6g}")
+    steps = sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)})
+    return Slider(place.name, names_of(scene, place)[0], unit, tuple(steps), start, place)

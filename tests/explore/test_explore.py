@@ -1,0 +1,157 @@
+"""The explorer: sliders, pictures, file, and the page that wires them, without a browser."""
+
+import base64
+import io
+import re
+import socket
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import TWO_MASS
+
+import jaxvib as jv
+from jaxvib.cli.app import run
+from jaxvib.explore import pictures, serve
+from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
+from jaxvib.machine.files import TEMPLATES
+
+
+@pytest.fixture(scope="module")
+def one_mass():
+    return jv.scene_from_toml(TEMPLATES["one_mass"])
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_sliders_at_their_starts_change_no_bit(kind):
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    sliders = sliders_of(scene)
+    assert all(each.start in each.steps and list(each.steps) == sorted(each.steps) for each in sliders)
+    assert len({each.name for each in sliders}) == len(sliders)
+    same = scene_at(scene, {each.name: each.start for each in sliders})
+    assert jv.scene_to_toml(same) == jv.scene_to_toml(scene)
+
+
+def test_each_slider_moves_its_number_alone():
+    loads = jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5, own_radius="20 mm")
+    scene = jv.Scene(jv.two_mass(**TWO_MASS), loads, jv.ConstantSpeed("1500 rpm"))
+    before = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
+    moved = []
+    for each in sliders_of(scene):
+        if each.name == COUNT:
+            continue
+        top = each.steps[-1]
+        after = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene_at(scene, {each.name: top}))])
+        (place,) = np.flatnonzero(after != before)
+        assert after[place] / before[place] == pytest.approx(3.0 if each.name == "drive.speed" else 10.0, rel=1e-3)
+        moved.append(place)
+    assert len(set(moved)) == len(moved) == 9  # four springs and dampers of supports, two of the link, mass, drag, speed
+    assert scene_at(scene, {COUNT: 5}).loads.count == 5
+    with pytest.raises(jv.InputError, match=r"loads\.own_radius .* side by side"):
+        scene_at(scene, {COUNT: 256})
+    with pytest.raises(jv.InputError, match=r"machine\.mass is no slider of this scene; there are: drive\.speed"):
+        scene_at(scene, {"machine.mass": 3.0})
+
+
+def test_what_no_factor_can_move_has_no_slider():
+    machine = jv.three_mass(
+        mass=(30.0, 40.0, 20.0),
+        stiffness=(0.0, 4e4, 0.0),
+        damping=(0.0, 20.0, 0.0),
+        link_stiffness=(1e4, 0.0, 2e4),
+        link_damping=(5.0, 0.0, 7.0),
+        exciter=3,
+    )
+    loads = jv.balls(count=2, mass=(0.8, 0.7), radius=0.12, drag=1.5)
+    names = [each.name for each in sliders_of(jv.Scene(machine, loads, jv.ConstantSpeed(150.0)))]
+    assert COUNT not in names  # a third ball would have no mass
+    assert [name for name in names if name.startswith("machine.stiffness")] == ["machine.stiffness[1]"]
+    assert [name for name in names if "link_damping" in name] == ["machine.link_damping[0]", "machine.link_damping[2]"]
+
+
+def test_a_large_machine_has_a_slider_for_all_springs():
+    n = 10
+    machine = jv.network(
+        mass=[5.0] * n,
+        stiffness=[1e4] * n,
+        damping=[5.0] * n,
+        links=[(k, k + 1) for k in range(1, n)],
+        link_stiffness=[1e4] * (n - 1),
+        link_damping=[1.0] * (n - 1),
+        exciter=n,
+    )
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(150.0))
+    titles = {each.title: each for each in sliders_of(scene)}
+    every = titles["every link stiffness of the machine, times"]
+    np.testing.assert_array_equal(scene_at(scene, {every.name: 2.0}).machine.link_stiffness, np.full(n - 1, 2e4))
+
+
+def test_a_rotor_has_a_campbell_diagram_and_a_sentence_why():
+    scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
+    assert "no branch diagram" in pictures.heading(scene) and "critical speed" in pictures.readings(scene)
+
+
+def test_what_cannot_be_shown_is_said(one_mass):
+    stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
+    bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
+    said = pictures.image(lambda: pictures.diagram(bent, 100.0), pictures.Tried(bent, ""))
+    assert "<b>Nothing to show here:</b> effects.stop" in said
+    no_room = pictures.tried(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
+    assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
+
+
+def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
+    """The page is run as marimo runs it; then what it does with its sliders' values is done again at others."""
+    path = jv.save_scene(one_mass, tmp_path / "ma<chine.toml")
+    monkeypatch.setenv("JAXVIB_EXPLORE", str(path))
+    from jaxvib.explore.page import app
+
+    outputs, found = app.run()
+    shown = "".join(str(getattr(output, "text", "")) for output in outputs)
+    images = re.findall(r'src="data:image/png;base64,([^"]+)"', shown)
+    assert len(images) == 2 and "mode 3: Omega" in shown
+    assert found["controls"].value == {each.name: each.start for each in sliders_of(one_mass)}
+    assert jv.scene_to_toml(found["machine"].value) == jv.scene_to_toml(one_mass)
+    assert all(Image.open(io.BytesIO(base64.b64decode(image))).size[0] > 300 for image in images)
+
+    moved = scene_at(one_mass, {**found["controls"].value, "machine.stiffness[0]": 200.0})
+    before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
+    assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
+    assert f"{float(after.resonances[0]):.6g}" in pictures.text(lambda: pictures.readings(moved), pictures.Tried(moved, ""))
+    drawn = base64.b64encode(pictures.png(pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed)))).decode()
+    assert drawn != images[0]
+    again = jv.scene_from_toml(pictures.toml(pictures.Tried(moved, "")))
+    assert float(again.machine.stiffness[0]) == 2e5
+
+
+def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, monkeypatch, capsys):
+    import uvicorn
+
+    path = jv.save_scene(one_mass, tmp_path / "machine.toml")
+    monkeypatch.setenv("JAXVIB_EXPLORE", "")
+    served = {}
+    monkeypatch.setattr(uvicorn, "run", lambda page, **options: served.update(options, page=page))
+    monkeypatch.setattr(pictures, "prepare", lambda scene: None)
+    monkeypatch.setattr(serve, "leave", lambda: None)
+    assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
+    assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
+    assert "the page is at http://127.0.0.1:27180" in capsys.readouterr().out and serve.served_path() == path.resolve()
+
+
+def test_what_hinders_the_page_is_one_sentence(one_mass, tmp_path, monkeypatch, capsys):
+    path = str(jv.save_scene(one_mass, tmp_path / "machine.toml"))
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert run(["explore", path, "--port", str(port)]) == 2
+    assert f"--port is {port}, which cannot be used" in capsys.readouterr().err
+    assert run(["explore", str(tmp_path / "none.toml"), "--port", "27181"]) == 2
+    assert "none.toml cannot be read" in capsys.readouterr().err
+    monkeypatch.setattr(serve.importlib.util, "find_spec", lambda name: None)
+    assert run(["explore", path]) == 2
+    assert "explore needs marimo; install it with: pip install 'jaxvib[explore]'" in capsys.readouterr().err
+    monkeypatch.delenv("JAXVIB_EXPLORE", raising=False)
+    with pytest.raises(jv.InputError, match="start the page with: jaxvib explore"):
+        serve.served_path()
