@@ -99,7 +99,7 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
 class _Notes(NamedTuple):
     """Of a run: how many steps it took, when the next one begins after each (max_steps,), the state after every so many."""
 
-    count: Array
+    steps: Array
     starts: Array
     states: Y
 
@@ -189,8 +189,8 @@ def _backward(
         return _Slopes(
             state=by_y,
             numbers=jax.tree.map(jnp.add, slopes.numbers, by_numbers),
-            end=slopes.end + sum(_share_of_end(controller, notes.count, j) * by for j, by in by_bounds),
-            first_step=slopes.first_step + sum(jnp.where((j == 1) & (notes.count > 1), by, 0.0) for j, by in by_bounds),
+            end=slopes.end + sum(_share_of_end(controller, notes.steps, j) * by for j, by in by_bounds),
+            first_step=slopes.first_step + sum(jnp.where((j == 1) & (notes.steps > 1), by, 0.0) for j, by in by_bounds),
             times=by_times,
             ahead=ahead,
         )
@@ -200,7 +200,7 @@ def _backward(
     def back_to_note(carry: tuple[Array, _Slopes]) -> tuple[Array, _Slopes]:
         """Back over the steps since the last state that was noted."""
         n, slopes = carry
-        first, count = n * every, jnp.minimum(every, notes.count - n * every)
+        first, count = n * every, jnp.minimum(every, notes.steps - n * every)
         noted = jax.tree.map(lambda y, ys: jnp.where(n == 0, y, ys[jnp.maximum(n - 1, 0)]), y0, notes.states)
         if every == 1:
             return n - 1, back(n, noted, slopes)
@@ -219,7 +219,7 @@ def _backward(
         return n - 1, jax.lax.fori_loop(0, count, from_last, slopes)
 
     zero = jnp.zeros_like(end)
-    reached = span(notes.count - 1)[1]
+    reached = span(notes.steps - 1)[1]
     slopes = _Slopes(
         state=saved.last,
         numbers=jax.tree.map(jnp.zeros_like, numbers),
@@ -228,7 +228,7 @@ def _backward(
         times=jnp.zeros_like(times),
         ahead=jnp.searchsorted(times, reached, side="right") - 1,
     )
-    start = ((notes.count - 1) // every, slopes)
+    start = ((notes.steps - 1) // every, slopes)
     _, slopes = jax.lax.while_loop(lambda carry: carry[0] >= 0, back_to_note, start)
     return _by_inputs(differentiable, cotangents, saveat, controller, saved, slopes)
 
