@@ -78,7 +78,7 @@ class Store:
                     raise ValueError(name)
         except InputError:
             raise
-        except Exception as error:
+        except Exception as error:  # whatever zarr and its codecs say of files that are not what they should be
             raise self.damaged(f"{type(error).__name__}: {error}") from error
 
     def damaged(self, what: str) -> InputError:

@@ -10,7 +10,7 @@ from jaxvib.errors import InputError
 if TYPE_CHECKING:
     from jaxvib.results.fields import Plain
 
-__all__ = ["chosen_steps", "run_document"]
+__all__ = ["chosen_steps", "measured_document", "run_document"]
 
 
 def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
@@ -22,9 +22,9 @@ def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Toleranc
     return None if tolerance is None else jv.Tolerance(tolerance)
 
 
-def run_document(run: jv.Run) -> dict[str, Plain]:
-    """A run's quantities over its last turns, its error and its cost."""
-    structure = run.scene.machine.structure()
+def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, Plain]:
+    """How a motion ended, and what was measured over its last turns."""
+    structure = scene.machine.structure()
     return {
         "status": run.status_name,
         "message": run.message,
@@ -37,11 +37,18 @@ def run_document(run: jv.Run) -> dict[str, Plain]:
         "amplitude": run.amplitude.tolist(),
         "foundation_force": float(run.foundation_force),
         "drift": float(run.drift),
-        "regime": _regime(run.regime),
         "settled": bool(run.settled),
-        "together": bool(run.together),
         "steps": int(run.steps),
         "rejected": int(run.rejected),
+    }
+
+
+def run_document(run: jv.Run) -> dict[str, Plain]:
+    """A run's quantities over its last turns, its error and its cost."""
+    return {
+        **measured_document(run, run.scene),
+        "regime": _regime(run.regime),
+        "together": bool(run.together),
         "error": float(run.error),
         "evaluations": int(run.evaluations),
         "seconds": float(run.seconds),

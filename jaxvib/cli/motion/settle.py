@@ -9,6 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.motion.document import chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
@@ -39,8 +40,6 @@ def settle(
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change; --out keeps the last stretch."""
-    from jaxvib.cli.motion.document import chosen_steps, run_document
-
     loaded = jv.load_scene(scene)
     steps = chosen_steps(tolerance, None)
     run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
@@ -80,24 +79,7 @@ def envelope(
     if data is not None:
         run.save(data)
     output.csv(csv, run, "time")
-    structure = loaded.machine.structure()
-    document = {
-        "status": run.status_name,
-        "message": run.message,
-        "time": float(run.window.time[-1]),
-        "rotor_speed": float(run.window.rotor_speed[-1]),
-        "omega": float(run.omega),
-        "load_speed": run.load_speed.tolist(),
-        "coordinates": list(structure.coordinates),
-        "units": list(structure.units),
-        "amplitude": run.amplitude.tolist(),
-        "foundation_force": float(run.foundation_force),
-        "drift": float(run.drift),
-        "settled": bool(run.settled),
-        "ripple": run.ripple.tolist(),
-        "steps": int(run.steps),
-        "rejected": int(run.rejected),
-    }
+    document = {**measured_document(run, loaded), "ripple": run.ripple.tolist()}
     output.done(document, run.summary, "envelope", run)
 
 
