@@ -16,6 +16,7 @@ from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y as Held
+from jaxvib.runtime.compat import short_end
 
 __all__ = ["PARTS", "Plan", "WatchedRun", "advance", "watched_run"]
 
@@ -23,6 +24,7 @@ PARTS = 64
 """Into so many equal parts a watched run is cut before its window; over each the loads' mean speeds are taken."""
 
 
+@short_end()
 def advance(motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array) -> tuple[Held, Array]:
     """What the integrator holds a `length` of time after `begin`, by steps of the size `step`, and how many those were."""
     solution = diffrax.diffeqsolve(

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.ode.types import Args, Y
-from jaxvib.runtime.compat import no_host_checks
+from jaxvib.runtime.compat import no_host_checks, short_end
 
 __all__ = ["solve"]
 
@@ -65,6 +65,7 @@ def solve(
 
 
 @no_host_checks()
+@short_end()
 def _solve(
     inputs: _Inputs,
     controller: diffrax.AbstractStepSizeController,

@@ -6,6 +6,8 @@ import pathlib
 import subprocess
 import sys
 
+import diffrax
+import equinox.internal
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.runtime import compat
+from jaxvib.runtime.operations import operations
 
 
 def test_backend_started_is_false_before_the_first_array_and_true_after():
@@ -125,6 +128,36 @@ def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "jaxvib" / "flags-99.1.0.json").read_text()) == {flags[0]: True, flags[1]: False}
     monkeypatch.setattr(compat, "starts_with", lambda flags: pytest.fail("asked again"))
     assert compat.accepted_flags(flags) == flags[:1]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_time_loops_find_their_end_at_once(dtype):
+    """diffrax._integrate.loop: how it finds the time a hundred units in the last place before the end."""
+    for x in (0.7, 1.0, 3e-30, 1e30, -2.0):
+        below = number = jnp.asarray(x, dtype)
+        for _ in range(100):
+            below = equinox.internal.prevbefore(below)
+        assert compat.ulps_below(number, 100) == below
+
+    def run(max_steps):  # of each number diffrax keeps the traced loop
+        term = diffrax.ODETerm(lambda t, y, args: -y)
+        return lambda end: diffrax.diffeqsolve(
+            term, diffrax.Heun(), 0 * end, end, end / 3, jnp.ones((), dtype), max_steps=max_steps
+        ).ys[0]
+
+    end = jnp.asarray(0.7, dtype)
+    plain, expected = operations(run(100), end), run(100)(end)
+    with compat.short_end():
+        assert plain - operations(run(101), end) > 290
+        assert run(101)(end) == expected
+    assert operations(run(102), end) == plain
+
+
+def test_time_loops_that_are_written_otherwise_stay(monkeypatch):
+    loop = diffrax._integrate.loop
+    monkeypatch.setattr(compat, "_source", lambda function: "")
+    with compat.short_end():
+        assert diffrax._integrate.loop is loop
 
 
 def test_members_of_enumerations_have_names():
