@@ -48,9 +48,9 @@ BUDGETS = {
     "jam_modes, gradient": (jax.grad(modes), 3950),
     "jam_orbit": (orbit, 6500),
     "jam_orbit, gradient": (jax.grad(orbit), 7050),
-    "simulate": (run, 5260),
-    "simulate, forward derivatives": (jax.jacfwd(forward_run), 10100),
-    "simulate, reverse derivatives": (jax.grad(run), 9100),
+    "simulate": (run, 4630),
+    "simulate, forward derivatives": (jax.jacfwd(forward_run), 9160),
+    "simulate, reverse derivatives": (jax.grad(run), 8680),
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
-__all__ = ["STATE", "AbstractMeasured", "Measured", "Trajectory", "measure"]
+__all__ = ["STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure"]
 
 STATE = {
     "displacement": in_unit("m or rad", "coordinate"),
@@ -95,10 +95,7 @@ def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured
     early, late, whole = _spans(scene, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
-    phi, rate = states.azimuth, states.azimuth_rate
-    turning = jax.vmap(lambda p, w: _mean_speed(times, p, w), in_axes=1)
-    speeds = turning(phi, rate)
-    late_speeds = jax.vmap(lambda p, w: _mean_speed(times[half:], p, w), in_axes=1)(phi[half:], rate[half:])
+    speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
     top = jnp.max(whole[:nd])
     drift = jnp.max(jnp.abs(late - early)[:nd]) / jnp.where(top > 0.0, top, 1.0)
     omega = jnp.mean(speeds)
@@ -161,19 +158,31 @@ def _outputs(scene: Scene, step: Array, state: State, rates: State) -> tuple[Arr
     return jnp.concatenate([state.displacement, force]), jnp.concatenate([rates.displacement, change]) * step
 
 
-def _mean_speed(t: Array, phi: Array, rate: Array) -> Array:
-    """Mean speed over as many whole turns as there are before the last sample; over all of it if there is none."""
-    total = phi[-1] - phi[0]
+def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], last: Sequence[int] | None = None) -> Array:
+    """Mean speeds over stretches of samples, each over as many whole turns as there are before its last one, over all of it
+    where there is none.
+
+    **Arguments**: `times` (n,) s; `angle` (n, m) rad and its `rate`, rad/s; the `first` and the `last` sample of each stretch,
+    the last of all unless said otherwise. **Returns** (stretches, m) rad/s.
+    """
+    ends = [len(times) - 1] * len(first) if last is None else last
+    each = jax.vmap(_mean_speed, in_axes=(None, 1, 1, None, None))
+    return jax.vmap(each, in_axes=(None, None, None, 0, 0))(times, angle, rate, jnp.asarray(first), jnp.asarray(ends))
+
+
+def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) -> Array:
+    total = phi[last] - phi[first]
     turns = jnp.floor(jnp.abs(total) / (2.0 * jnp.pi))
-    target = phi[-1] - jnp.sign(total) * 2.0 * jnp.pi * turns
-    i = jnp.clip(jnp.argmin(jnp.abs(phi - target)), 0, t.shape[0] - 1)
+    target = phi[last] - jnp.sign(total) * 2.0 * jnp.pi * turns
+    k = jnp.arange(t.shape[0])
+    i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
     start = t[i] + (target - phi[i]) / _away_from_zero(rate[i])
     # One secant step on the cubic through the sample: enough, the sample is next to it.
-    j = jnp.where(start > t[i], jnp.minimum(i + 1, t.shape[0] - 1), jnp.maximum(i - 1, 0))
+    j = jnp.where(start > t[i], jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
     h = jnp.where(i == j, 1.0, t[j] - t[i])
     bend = (rate[j] - rate[i]) / h
     start = t[i] + (target - phi[i]) / _away_from_zero(rate[i] + 0.5 * bend * (start - t[i]))
-    return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (t[-1] - start), total / (t[-1] - t[0]))
+    return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (t[last] - start), total / (t[last] - t[first]))
 
 
 def _step(times: Array) -> Array:

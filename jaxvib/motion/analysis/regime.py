@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Trajectory, _mean_speed
+from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
@@ -147,13 +147,12 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     half = times.shape[0] // 2
     turn = stretch.rotor_angle
 
-    def mean_speed(part: slice) -> Array:
-        return jax.vmap(lambda p, w: _mean_speed(times[part], p, w), in_axes=1)(phi[part], rate[part])
-
-    early, late, whole = slice(0, half), slice(half, None), slice(None)
-    speed, rotor = mean_speed(whole), _mean_speed(times, turn, stretch.rotor_speed)
+    angles, rates = jnp.column_stack([phi, turn]), jnp.column_stack([rate, stretch.rotor_speed])
+    end = times.shape[0] - 1
+    whole, early, late = mean_speeds(times, angles, rates, first=(0, 0, half), last=(end, half - 1, end))
+    speed, rotor = whole[:-1], whole[-1]
     reference = jnp.maximum(jnp.abs(rotor), jnp.finfo(rotor.dtype).tiny)
-    change = jnp.max(jnp.abs(mean_speed(late) - mean_speed(early))) / reference
+    change = jnp.max(jnp.abs(late - early)[:-1]) / reference
     steady = change < _SAME_SPEED
     swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
     with_rotor = jnp.abs(speed - rotor) < _SAME_SPEED * reference
