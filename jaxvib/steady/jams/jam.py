@@ -114,18 +114,26 @@ class JamModes(AbstractJam):
         """The numbers of the modes that exist."""
         return [int(k) for k, there in zip(np.asarray(self.mode), np.asarray(self.exists), strict=True) if there]
 
+    def row(self, mode: int) -> int:
+        """Where the numbers of the jam mode of that number stand in the arrays, whether it exists or not.
+
+        **Raises** `InputError` for a number there can never be.
+        """
+        most = self.mode.shape[0]
+        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
+            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+        return int(mode) - 1
+
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """The jam mode of that number.
 
         **Raises** `InputError` for a number there can never be, `ComputationError` (status "absent") where it does not exist
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
-        most = self.mode.shape[0]
-        if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
-            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+        row = self.row(mode)
         fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
-        jam = Jam(**jax.tree.map(lambda leaf: leaf[mode - 1] if eqx.is_array_like(leaf) else leaf, fields))
-        if throw and not traced(self.omega) and not np.asarray(self.exists)[mode - 1]:
+        jam = Jam(**jax.tree.map(lambda leaf: leaf[row] if eqx.is_array_like(leaf) else leaf, fields))
+        if throw and not traced(self.omega) and not np.asarray(self.exists)[row]:
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",

@@ -97,25 +97,27 @@ def jam_orbit(
         given = " and ".join(named) if named else "none"
         raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
     scene = checked(scene)
-    frozen = jax.lax.stop_gradient(scene)
-    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((frozen, omega, near)))
+    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, omega, near)))
+    # What is known has no gradient to stop, and stays the scene that was checked.
+    frozen = scene if concrete else jax.lax.stop_gradient(scene)
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     if accuracy is None:
         accuracy = 1e-9 if floor < 1e-9 else 1e-3
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    drag = jammed_loads(frozen).drag_sum()
-    if not traced(drag) and not float(drag) > 0.0:
+    drag = jammed_loads(frozen).drag
+    if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
         raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
     exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
     if mode is not None:
         if frozen.machine.structure().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
-        jam = jam_modes(frozen).select(mode, throw=False)
+        jams = jam_modes(frozen)
+        light = jams.omega[jams.row(mode)]
         direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
-        exists = jnp.isfinite(jam.omega)
-        start = jnp.where(exists, jam.omega, frozen.drive.speed)
+        exists = jnp.isfinite(light)
+        start = jnp.where(exists, light, frozen.drive.speed)
     elif near is not None:
         start = number(near, "rad/s", "near", low=0.0, open_low=True)
     which: Parameter = "rotor_speed"
@@ -149,7 +151,7 @@ def jam_orbit(
 
     if concrete:
         found = attempt()
-        if mode is not None and not bool(jnp.abs(found.omega / start - 1.0) < _FAR):
+        if mode is not None and not abs(float(found.omega) / float(start) - 1.0) < _FAR:
             # The leading order has no such mode, or it is far from the exact one: look at the whole exact branch.
             searched = exact_mode_speeds(frozen).get(int(mode))
             exists = jnp.asarray(searched is not None)
