@@ -19,10 +19,10 @@ demo: $(VENV)/installed
 	@ls $(OUT)/*/*.png
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
 
 # The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
 LOWEST_PYTHON ?= python3.11

@@ -13,8 +13,6 @@ from jaxvib.runtime.cpu import prepare_cpu
 
 # Tests change parts of the package, which the key of a stored program does not know: every program is traced anew.
 startup.start = lambda: None
-# Each worker is a process of its own.
-prepare_cpu()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Workers share what they compile, and so do clones: JAX's key of a program holds the program, the flags and the versions.
@@ -23,6 +21,16 @@ if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "jaxvib" / "tests"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 matplotlib.use("Agg")
+
+
+def pytest_configure(config):
+    """Each worker is a process of its own. Most of the suite's time is the compiler's, and nearly all its programs are run a
+    few times only: those are compiled without LLVM's optimizations, which takes half as long and changes a number in its last
+    digits. The slow tests run for long, and get the programs that users get; XLA_FLAGS=--xla_backend_optimization_level=3 gives
+    them to all."""
+    if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", "") and config.option.markexpr == "not slow":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+    prepare_cpu()
 
 
 @pytest.fixture(autouse=True, scope="module")
