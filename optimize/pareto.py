@@ -17,12 +17,14 @@ from jaxvib.results.status import Computed
 from jaxvib.units import count
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
+from optimize.space.numbers import shown_unit
 from optimize.synthesize import synthesize
 from optimize.wishes.quantity import Demand, Quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Front", "pareto"]
 
@@ -50,15 +52,19 @@ class Front(Result):
         head = " against ".join(f"{n}, {u}".rstrip(", ") for n, u in zip(self.names, self.units, strict=True))
         return "\n".join([head, *(f"  {a:.5g}  {b:.5g}" for a, b in self.values)])
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """The front. **Returns** a matplotlib figure, that of the axes `ax` where they are given."""
-        from jaxvib.draw.style import COLORS, panels
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """The front, each point with the number by which `scene` gives its machine.
 
-        figure, (axis,) = panels(1, size=(5.5, 4.0), ax=ax)
-        axis.plot(self.values[:, 1], self.values[:, 0], "o-", color=COLORS[0])
-        axis.set_xlabel(f"{self.names[1]}, {self.units[1]}".rstrip(", "))
-        axis.set_ylabel(f"{self.names[0]}, {self.units[0]}".rstrip(", "))
-        return figure
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
+        from jaxvib.draw.charts import front_chart  # slow to import: only who draws pays
+
+        labels, values = [], []
+        for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
+            shown, factor = shown_unit(unit, float(np.max(np.abs(column), initial=0.0)))
+            labels.append(f"{name}, {shown}".rstrip(", "))
+            values.append(factor * column)
+        return front_chart(values[1], values[0], across=labels[1], up=labels[0], ax=ax)
 
 
 def pareto(

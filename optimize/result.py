@@ -20,7 +20,8 @@ from optimize.space.numbers import shown_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Influence", "Limit", "Machine", "Outcome", "Row", "Synthesis", "SynthesisStatus", "amplitude_names", "wanted"]
 
@@ -191,10 +192,10 @@ class Synthesis(Result):
             lines.append(f"  {len(self.machines)} different machines: {seen} {self.unit}".rstrip())
         return lines
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Every quantity after the search against before, by ratio on a logarithmic axis.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.charts import before_after  # slow to import: only who draws pays
 
@@ -204,16 +205,17 @@ class Synthesis(Result):
             shown.append((f"{row.what}, {unit}".rstrip(", "), row.before * factor, row.after * factor))
         return before_after(shown, title=f"search for {wanted(self.objective)}", ax=ax)
 
-    def plot_convergence(self, *, ax: Axes | None = None) -> Figure:
+    def plot_convergence(self, *, ax: Axes | None = None) -> Drawn:
         """The objective of every start over the iterations.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.charts import convergence
 
         best = int(np.argmin(self.values)) if np.any(np.isfinite(self.values)) else 0
-        label = f"{self.objective.replace('_', ' ')}, {self.unit}".rstrip(", ")
-        return convergence(self.history, best=best, label=label, ax=ax)
+        unit, factor = shown_unit(self.unit, float(np.max(np.abs(self.history), initial=0.0, where=np.isfinite(self.history))))
+        label = f"{self.objective.replace('_', ' ')}, {unit}".rstrip(", ")
+        return convergence(factor * self.history, best=best, label=label, ax=ax)
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:

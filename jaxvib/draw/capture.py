@@ -6,17 +6,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Onto, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Onto, legend_above, panels
 
 __all__ = ["curve_chart", "tables_chart", "threshold_chart", "torus_paths"]
 
 
 def threshold_chart(
     speed: np.ndarray, fraction: np.ndarray, error: np.ndarray, threshold: float, *, ax: Axes | None = None
-) -> Figure:
+) -> Drawn:
     """The share of captured starts over the initial speed, with its standard error, and the threshold.
 
     >>> import numpy as np
@@ -34,12 +33,12 @@ def threshold_chart(
     axis.set_ylabel("share of starts captured")
     axis.set_ylim(-0.05, 1.05)
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
 
 
 def curve_chart(
     value: np.ndarray, threshold: np.ndarray, uncertainty: np.ndarray, least: np.ndarray, *, ax: Axes | None = None
-) -> Figure:
+) -> Drawn:
     """Thresholds of capture over a number, with their uncertainty, and the least captured speeds.
 
     >>> import numpy as np
@@ -61,10 +60,10 @@ def curve_chart(
     axis.set_ylabel("initial speed relative to the\nrotor, in the rotor's speed")
     axis.set_ylim(-1.03, 0.0)
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
 
 
-def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray, *, ax: Onto = None) -> Figure:
+def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: np.ndarray, *, ax: Onto = None) -> Drawn:
     """Paths of balls on the unrolled torus, and their speeds.
 
     **Arguments** (T times, N balls): `around` (T, N) rad, the angle relative to the rotor; `across` (T, N) rad, in the tube's
@@ -98,7 +97,7 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
     speeds.set_xlabel("time, s")
     speeds.set_ylabel("speed relative to the\nrotor, in the rotor's speed")
     legend_above(speeds)
-    return figure
+    return figure if ax is None else ax
 
 
 def _within(angle: np.ndarray, least: float) -> np.ndarray:
@@ -106,7 +105,7 @@ def _within(angle: np.ndarray, least: float) -> np.ndarray:
     return np.mod(angle - least, 2.0 * np.pi) + least
 
 
-def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], *, ax: Onto = None) -> Figure:
+def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], *, ax: Onto = None) -> Drawn:
     """Least initial speeds over the gap.
 
     **Arguments**: `rows`, a panel for each: its title, the gaps, by name the speeds; "paper" as points alone.
@@ -131,4 +130,4 @@ def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]
         axis.set_ylabel("least initial speed")
         axis.set_ylim(-1.03, 0.0)
     legend_above(axes[0], 2)
-    return figure
+    return figure if ax is None else ax

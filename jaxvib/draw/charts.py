@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxvib.draw.style import (
     COLORS,
@@ -16,17 +15,19 @@ from jaxvib.draw.style import (
     MARKERS,
     OPERATING,
     UNSTABLE,
+    Drawn,
     Onto,
     SpeedUnit,
     legend_above,
     legend_outside,
+    log_ticks,
     numbered,
     panels,
     speed_scale,
 )
 from jaxvib.errors import InputError
 
-__all__ = ["PARTS", "before_after", "branch_diagram", "convergence", "solid_and_dashed"]
+__all__ = ["PARTS", "before_after", "branch_diagram", "convergence", "front_chart", "solid_and_dashed"]
 
 
 PARTS = ("speed", "amplitude", "force")
@@ -50,7 +51,7 @@ def branch_diagram(
     judged: str = "",
     show: Sequence[str] = PARTS,
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Panels over the rotor's speed: load speed (np,), amplitudes (np, nd) mm, foundation force (np,) N, zero to peak.
 
     `amplitude` is in m, and in rad where `units` (nd,) say "rad", which is drawn in mrad; if None, all is in m. Of more than
@@ -106,10 +107,9 @@ def branch_diagram(
         if label.startswith("speed"):
             _speed_lines(axis, scale, resonances, marks, high)
         else:
-            shown = np.concatenate([values[np.isfinite(rotor_speed)] for _, values in group])
-            top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
             axis.set_yscale("log")
-            axis.set_ylim(1e-5 * top, 2.5 * top)
+            axis.set_ylim(*_reach([values for _, values in group], rotor_speed, omega, resonances))
+            log_ticks(axis)
         if at is not None:
             axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
             heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossings]
@@ -121,7 +121,21 @@ def branch_diagram(
         legend_above(axes[0], 2)
     if judged and ax is None:
         figure.supxlabel(f"stable {judged}", fontsize="small", color="#555555")
-    return figure
+    return figure if ax is None else ax
+
+
+def _reach(
+    curves: Sequence[np.ndarray], rotor_speed: np.ndarray, omega: np.ndarray, resonances: np.ndarray
+) -> tuple[float, float]:
+    """The limits of a logarithmic axis: what the curves reach from half the lowest resonance on; below it, where loads run with
+    the rotor, they fall to nothing."""
+    there = np.isfinite(rotor_speed)
+    shown = np.stack([values[there] for values in curves])
+    top = float(np.max(shown, initial=1e-300, where=np.isfinite(shown)))
+    lowest = float(np.min(resonances, initial=np.inf, where=resonances > 0.0))
+    counts = np.isfinite(shown) & (shown > 0.0) & (omega[there] > 0.5 * lowest)
+    least = float(np.min(shown, initial=top, where=counts))
+    return float(np.clip(0.5 * least, 1e-5 * top, 1e-2 * top)), 2.5 * top
 
 
 def _speed_lines(
@@ -179,7 +193,7 @@ def solid_and_dashed(
         axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name, **sparse)
 
 
-def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Figure:
+def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Drawn:
     """For each (name, before, after) a bar from 1 to after/before on a logarithmic axis, so that what falls a thousandfold is
     as plain as what grows so; the values stand beside it. What has no ratio is written only."""
     figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
@@ -202,23 +216,45 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     axis.set_xlim(low**1.1, high**1.1)
     axis.set_ylim(-0.6, len(rows) - 0.4)
     axis.set_yticks(places, [name for name, _, _ in rows])
-    axis.set_xlabel("after / before")
+    log_ticks(axis, "x")
+    axis.set_xlabel("after / before; amplitudes and forces zero to peak")
     axis.text(1.02, 1.0, "before → after", va="bottom", fontsize=9, fontweight="bold", transform=axis.transAxes)
     if title:
         axis.set_title(title, loc="left", pad=24.0, fontsize="medium")
     axis.grid(False, axis="y")
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
 
 
-def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Figure:
+def convergence(history: np.ndarray, *, best: int, label: str, ax: Axes | None = None) -> Drawn:
     """The objective of every start (iterations, starts) over the iterations, the one numbered `best` bold."""
     figure, (axis,) = panels(1, size=(7.0, 3.6), ax=ax)
     axis.plot(history, color=GUIDE, lw=0.5, alpha=0.5)
     axis.plot([], [], color=GUIDE, lw=0.8, label="other starts")
     axis.plot(history[:, best], color=COLORS[1], lw=2.0, label="best start")
-    axis.set_yscale("log" if np.nanmin(history) > 0.0 else "linear")
+    if np.nanmin(history) > 0.0:
+        axis.set_yscale("log")
+        log_ticks(axis)
     axis.set_xlabel("iteration")
     axis.set_ylabel(label)
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
+
+
+def front_chart(x: np.ndarray, y: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
+    """A front of points (P,), both small where they are good, each with its number.
+
+    >>> figure = front_chart(np.array([2.0, 1.0]), np.array([1.0, 3.0]), across="power, W", up="force, N")
+    >>> figure.axes[0].get_ylabel()
+    'force, N'
+    """
+    figure, (axis,) = panels(1, size=(6.5, 4.4), ax=ax)
+    order = np.lexsort((y, x))
+    axis.plot(x[order], y[order], "o-", color=COLORS[0], mfc="white", ms=5.0, label="front; numbers: its machines")
+    for k, place in enumerate(zip(x, y, strict=True)):
+        axis.annotate(f"{k}", place, xytext=(5, 4), textcoords="offset points", fontsize="small")
+    axis.margins(0.08)
+    axis.set_xlabel(across)
+    axis.set_ylabel(up)
+    legend_above(axis)
+    return figure if ax is None else ax

@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = [
     "CostPanel",
@@ -30,7 +29,7 @@ __all__ = [
 
 def tiers_chart(
     mass: np.ndarray, differences: Mapping[str, np.ndarray], stable: np.ndarray, *, ax: Axes | None = None
-) -> Figure:
+) -> Drawn:
     """Relative differences (n,) by name over the mass of a load (n,) kg; marks are hollow where `stable` (n,) is False."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     for color, mark, stroke, (name, values) in zip(
@@ -43,7 +42,7 @@ def tiers_chart(
     axes.set_xlabel("mass of a load, kg")
     axes.set_ylabel("leading order against exact, relative")
     legend_above(axes)
-    return figure
+    return figure if ax is None else ax
 
 
 class CostPanel(NamedTuple):
@@ -56,7 +55,7 @@ class CostPanel(NamedTuple):
     best: np.ndarray
 
 
-def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float], *, ax: Onto = None) -> Figure:
+def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float], *, ax: Onto = None) -> Drawn:
     """Relative error over seconds, a panel for each title, two in a row; a name has one look in all of them, told in one
     legend. Dotted lines at the errors that are `wanted`.
 
@@ -82,7 +81,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
         figure.legend(handles, [*names, *told], loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
     else:
         legend_above(cells[0], 2, handles=handles, labels=[*names, *told])
-    return figure
+    return figure if ax is None else ax
 
 
 _FLOOR = "#e6e6e6"
@@ -111,7 +110,7 @@ def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Ma
 
 def convergence_chart(
     harmonics: np.ndarray, error: np.ndarray, known: np.ndarray, *, names: Sequence[str], ax: Axes | None = None
-) -> Figure:
+) -> Drawn:
     """Errors (n, w) over the highest harmonic (n,), log scale; their estimates `known` (n, w) dashed."""
     figure, (axes,) = panels(1, size=(7.0, 4.0), ax=ax)
     floor = np.finfo(float).eps
@@ -122,7 +121,7 @@ def convergence_chart(
     axes.set_xlabel("highest harmonic")
     axes.set_ylabel("relative error of the rotor speed")
     legend_above(axes, title="loads at")
-    return figure
+    return figure if ax is None else ax
 
 
 def stability_chart(
@@ -134,7 +133,7 @@ def stability_chart(
     label: str,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Where `stable` (n, P) over load speed `omega` (n, P) rad/s, drawn in `unit`, and another number (n,), with marks (k,
     2) by kind.
     """
@@ -149,7 +148,7 @@ def stability_chart(
     axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)
     legend_above(axes)
-    return figure
+    return figure if ax is None else ax
 
 
 def audit_chart(
@@ -160,7 +159,7 @@ def audit_chart(
     added: np.ndarray,
     *,
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`, grey
     what cannot be told, below the `uncertainty` (n,); and the operations that they add (n,), relative to those of the scene.
 
@@ -192,7 +191,7 @@ def audit_chart(
     right.set_yticks(place, [])
     right.set_ylim(n - 0.4, -0.6)
     right.set_xlabel("operations that it adds, % of the scene's")
-    return figure
+    return figure if ax is None else ax
 
 
 def steps_chart(
@@ -205,7 +204,7 @@ def steps_chart(
     names: Sequence[str],
     route: str,
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Central differences against a derivative, relative, `off` (n, k) over their relative `steps` (k,), a line for each of n
     names; rings where they are `best` (n,), extrapolated (`at_best`, (n,)); dotted the tolerance."""
     figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
@@ -217,7 +216,7 @@ def steps_chart(
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
     legend_above(axes)
-    return figure
+    return figure if ax is None else ax
 
 
 class StressMark(NamedTuple):
@@ -232,7 +231,7 @@ class StressMark(NamedTuple):
     bound: float
 
 
-def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Figure:
+def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Drawn:
     """Errors of hard cases, a row for each: true ones as marks, claimed ones hollow, bounds as bars; a precision has a colour.
 
     What ended in a named status stands at the right as a square, what failed as a cross.
@@ -271,4 +270,4 @@ def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Figu
     handles += [Patch(color=COLORS[k % len(COLORS)]) for k in range(len(dtypes))]
     names = ["true", "claimed", "bound", "named status", "FAILED", *dtypes]
     legend_above(axes, 4, handles=handles, labels=names)
-    return figure
+    return figure if ax is None else ax

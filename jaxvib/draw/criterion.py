@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import GUIDE, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["agreement_maps", "pull_chart"]
 
@@ -30,7 +29,7 @@ def agreement_maps(
     *,
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Planes of rotor speed (S,) rad/s, drawn in `unit`, and load mass (H,), log scale, a panel for each of `maps` (title,
     exact (H, S)), coloured by whether the exact answer is as `predicted` (H, S).
 
@@ -55,7 +54,7 @@ def agreement_maps(
         figure.legend(handles=entries, loc="outside upper left", ncols=2, fontsize="small", frameon=False)
     else:
         legend_above(axes[0], 1, handles=entries)
-    return figure
+    return figure if ax is None else ax
 
 
 def pull_chart(

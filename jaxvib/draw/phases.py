@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import solid_and_dashed
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["drag_diagram"]
 
@@ -28,7 +27,7 @@ def drag_diagram(
     within: float | None = None,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Load speeds over the drag, log scale, of patterns (name, drag, speed, stable), (n,) each; the rotor's a level line.
 
     Patterns of one name have one colour; stable parts are solid, unstable ones dashed. `label` names the drag on its axis; `at`
@@ -64,4 +63,4 @@ def drag_diagram(
     axis.set_xlabel(label)
     axis.set_ylabel("speed of loads, " + unit)
     legend_above(axis, 3)
-    return figure
+    return figure if ax is None else ax

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, GUIDE, Onto, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, Drawn, Onto, legend_above, panels
 
 __all__ = ["record_chart"]
 
 
-def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Figure:
+def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise: float, *, ax: Onto = None) -> Drawn:
     """Two panels over time (n,) s: recorded and fitted angle (n,) rad, in degrees, and fit minus record against 2 `noise`, rad.
 
     >>> import numpy as np
@@ -30,4 +29,4 @@ def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise:
     legend_above(bottom)
     bottom.set_ylabel("fit - record, deg")
     bottom.set_xlabel("time, s")
-    return figure
+    return figure if ax is None else ax

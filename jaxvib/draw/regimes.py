@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["regime_chart"]
 
@@ -24,7 +23,7 @@ def regime_chart(
     *,
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Shares (nd,) of the kinds of motion as stacked areas, and speeds of the loads (nd, ns) rad/s, drawn in `unit`, over
     drag (nd,) N s/m.
 
@@ -58,4 +57,4 @@ def regime_chart(
     bottom.set_xlabel("drag, N s/m")
     bottom.set_xscale("log")
     legend_above(bottom)
-    return figure
+    return figure if ax is None else ax

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = [
     "growth_chart",
@@ -33,7 +32,7 @@ def modes_chart(
     names: Sequence[str],
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Load speeds (k,) rad/s, drawn in `unit`, and amplitudes (k, nd) m, drawn in mm (tilts in mrad), over the numbers of modes
     (k,); filled where stable, resonances level; `names` (nd,) of the coordinates, a mark and a colour each.
 
@@ -63,7 +62,7 @@ def modes_chart(
     if np.any(amplitude > 0.0):
         bottom.set_yscale("log")
     bottom.set_xticks(mode)
-    return figure
+    return figure if ax is None else ax
 
 
 def shapes_chart(
@@ -73,7 +72,7 @@ def shapes_chart(
     names: Sequence[str],
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Mode shapes (k, nd) as bars, a group for each mode with its frequency (k,) rad/s, drawn in `unit`; `names` (nd,).
 
     >>> import numpy as np
@@ -97,10 +96,10 @@ def shapes_chart(
     axis.set_ylabel("mode shape, relative")
     axis.grid(False, axis="x")
     legend_above(axis, 6)
-    return figure
+    return figure if ax is None else ax
 
 
-def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Figure:
+def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) -> Drawn:
     """Angles of loads (count,) rad as points on a circle, and their mean as an arrow: 1 where all are together, 0 where they
     cancel; one circle for each (title, angles), or one pair of `ax` each.
 
@@ -142,7 +141,7 @@ def phase_circles(sets: Sequence[tuple[str, np.ndarray]], *, ax: Onto = None) ->
             axis.annotate("", (np.real(mean), np.imag(mean)), (0.0, 0.0), arrowprops=arrow)
         axis.plot([0.0], [0.0], "+", color="black", ms=7.0)
         axis.set_title(f"{title}\nresultant {round(float(abs(mean)), 3):g}", fontsize="medium")
-    return figure
+    return figure if ax is None else ax
 
 
 def _loads_on_circle(axis: Axes, angles: np.ndarray) -> None:
@@ -171,7 +170,7 @@ def speeds_chart(
     *,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Speeds (n,) rad/s as points with their values on a level line for each (label, speeds), then intervals (n, 2) as bars,
     drawn in `unit`; what is no finite number is left out, an interval without an end goes to the edge.
 
@@ -202,12 +201,12 @@ def speeds_chart(
     axis.set_ylim(-0.6, len(labels) - 0.3)
     axis.set_xlim(0.0, top)
     axis.set_xlabel(f"speed, {unit}")
-    return figure
+    return figure if ax is None else ax
 
 
 def signals_chart(
     x: np.ndarray, signals: Sequence[tuple[str, np.ndarray, Sequence[str]]], *, across: str, ax: Onto = None
-) -> Figure:
+) -> Drawn:
     """One panel for each (label with unit, values (n, k), k names), over x (n,), which `across` labels.
 
     >>> import numpy as np
@@ -222,10 +221,10 @@ def signals_chart(
         if len(names) > 1:
             legend_above(axis, 6)
     axes[-1].set_xlabel(across)
-    return figure
+    return figure if ax is None else ax
 
 
-def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Figure:
+def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = None) -> Drawn:
     """Values (n, k) as points over 1 .. n.
 
     >>> import numpy as np
@@ -238,10 +237,10 @@ def points_chart(values: np.ndarray, *, across: str, up: str, ax: Axes | None = 
         axis.plot(np.arange(1, values.shape[0] + 1), values[:, k], mark, ms=3.5, color=COLORS[k % len(COLORS)])
     axis.set_xlabel(across)
     axis.set_ylabel(up)
-    return figure
+    return figure if ax is None else ax
 
 
-def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Figure:
+def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Drawn:
     """Floquet multipliers (n,) in the complex plane, and the unit circle.
 
     >>> import numpy as np
@@ -263,10 +262,10 @@ def multiplier_chart(multipliers: np.ndarray, *, ax: Axes | None = None) -> Figu
     axis.set_aspect("equal")
     axis.set_xlabel("real part")
     axis.set_ylabel("imaginary part")
-    return figure
+    return figure if ax is None else ax
 
 
-def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Figure:
+def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertainty: float, *, ax: Axes | None = None) -> Drawn:
     """Rates of growth (n,) 1/s of stretches that end at `time` (n,) s; the exponent with its standard error."""
     figure, (axes,) = panels(1, ax=ax)
     axes.plot(time, rates, "o-", ms=3.5, color=COLORS[0], label="each stretch")
@@ -277,4 +276,4 @@ def growth_chart(time: np.ndarray, rates: np.ndarray, exponent: float, uncertain
     axes.set_xlabel("time, s")
     axes.set_ylabel("growth of disturbances, 1/s")
     legend_above(axes)
-    return figure
+    return figure if ax is None else ax

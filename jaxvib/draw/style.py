@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from jaxvib.errors import InputError
 
@@ -21,11 +22,13 @@ __all__ = [
     "OPERATING",
     "STROKES",
     "UNSTABLE",
+    "Drawn",
     "Onto",
     "SpeedUnit",
     "legend_above",
     "legend_outside",
     "load_names",
+    "log_ticks",
     "numbered",
     "panels",
     "speed_scale",
@@ -36,6 +39,9 @@ SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
 
 Onto: TypeAlias = "Axes | Sequence[Axes] | None"
 """The axes that a figure goes onto: one, or as many as it has panels; None for a figure of its own."""
+
+Drawn: TypeAlias = "Figure | Any"
+"""What a plot gives back: its figure, or, where axes were given, what was given: who calls knows which (`Any`)."""
 
 COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
 """Colours that readers with any colour vision tell apart, and of unlike greys where they follow each other; further series
@@ -115,6 +121,29 @@ def panels(
             rows, columns, squeeze=False, sharex=share_x, width_ratios=None if widths is None else [*widths], subplot_kw=look
         )
     return figure, list(grid.ravel())
+
+
+def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
+    """Ticks of a logarithmic axis, call it when its limits are set: powers of ten over three decades or more, else plain
+    numbers, with as many between as there is room for.
+
+    >>> figure, (axis,) = panels(1)
+    >>> _ = axis.set_yscale("log"), axis.set_ylim(0.4, 3.0)
+    >>> log_ticks(axis)
+    >>> [float(y) for y in axis.get_yticks() if 0.4 < y < 3.0]
+    [0.5, 1.0, 2.0]
+    """
+    line = axis.xaxis if which == "x" else axis.yaxis
+    low, high = line.get_view_interval()
+    decades = math.log10(high / low)
+    line.set_minor_formatter(NullFormatter())
+    if decades >= 3.0:
+        line.set_major_locator(LogLocator(numticks=9))
+        line.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False))
+        return
+    between = (1.0, 2.0, 5.0) if decades > 0.6 else (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    line.set_major_locator(LogLocator(subs=(1.0, 3.0) if decades > 1.5 else between))
+    line.set_major_formatter("{x:g}")
 
 
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, Drawn, panels
 
 __all__ = ["distribution_chart", "label_map", "points_over", "shares_chart", "tornado_chart", "value_map"]
 
@@ -32,7 +31,7 @@ def label_map(
     lines: Mapping[str, Sequence[tuple[np.ndarray, np.ndarray]]] | None = None,
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """The plane of x (n,) and y (m,) coloured by labels, codes (m, n) of `names`, -1 for none; over it lines by their kind.
 
     >>> import numpy as np
@@ -62,7 +61,7 @@ def label_map(
     _scales(axis, across, up, log)
     axis.grid(False)
     axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small")
-    return figure
+    return figure if ax is None else ax
 
 
 def _light(colour: str) -> tuple[float, float, float]:
@@ -90,7 +89,7 @@ def value_map(
     label: str,
     log: tuple[bool, bool] = (False, False),
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """The plane of x (n,) and y (m,) coloured by values (m, n), grey where they are NaN.
 
     >>> import numpy as np
@@ -103,12 +102,10 @@ def value_map(
     figure.colorbar(drawn, ax=axis, label=label)
     _scales(axis, across, up, log)
     axis.grid(False)
-    return figure
+    return figure if ax is None else ax
 
 
-def points_over(
-    x: np.ndarray, values: np.ndarray, *, across: str, up: str, log: bool = False, ax: Axes | None = None
-) -> Figure:
+def points_over(x: np.ndarray, values: np.ndarray, *, across: str, up: str, log: bool = False, ax: Axes | None = None) -> Drawn:
     """Values (n, k) as points over x (n,).
 
     >>> import numpy as np
@@ -119,7 +116,7 @@ def points_over(
     for k in range(values.shape[1]):
         axis.plot(x, values[:, k], ".", color=COLORS[k % len(COLORS)], ms=4.0)
     _scales(axis, across, up, (log, False))
-    return figure
+    return figure if ax is None else ax
 
 
 def shares_chart(
@@ -130,7 +127,7 @@ def shares_chart(
     log: bool = False,
     level: str = "95 %",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Shares (n,) over x (n,), each with the lower and the upper end of its interval as a band.
 
     >>> import numpy as np
@@ -146,10 +143,10 @@ def shares_chart(
     axis.set_ylim(-0.03, 1.03)
     _scales(axis, across, f"share of the cases, band {level}", (log, False))
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small")
-    return figure
+    return figure if ax is None else ax
 
 
-def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax: Axes | None = None) -> Figure:
+def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax: Axes | None = None) -> Drawn:
     """How many cases (n,) lie between edges (n + 1,), and the running share of them on an axis of its own.
 
     >>> import numpy as np
@@ -165,12 +162,12 @@ def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax
     share.set_ylim(0.0, 1.02)
     share.set_ylabel("share below", color=COLORS[1])
     share.grid(False)
-    return figure
+    return figure if ax is None else ax
 
 
 def tornado_chart(
     names: list[str], low: np.ndarray, high: np.ndarray, middle: float, *, across: str, ax: Axes | None = None
-) -> Figure:
+) -> Drawn:
     """Bars from `low` to `high` (n,) about a middle, the longest on top: what a quantity is where a number is small and large.
 
     >>> import numpy as np
@@ -189,4 +186,4 @@ def tornado_chart(
     axis.grid(False, axis="y")
     entries = [Patch(color=COLORS[0], label="lowest fifth"), Patch(color=COLORS[1], label="highest fifth")]
     axis.legend(handles=entries, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize="small")
-    return figure
+    return figure if ax is None else ax

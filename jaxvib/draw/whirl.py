@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, GUIDE, OPERATING, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["campbell_diagram"]
 
@@ -20,7 +19,7 @@ def campbell_diagram(
     at: float | None = None,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Whirl speeds (ns, nd) rad/s over rotor speed (ns,) rad/s, drawn in `unit`: forward ones solid, backward ones dashed; the
     line w = n with the `critical` speeds (k,), forward or not (k,), written beside it; `at` the operating speed.
 
@@ -56,7 +55,7 @@ def campbell_diagram(
     axis.set_xlabel(f"rotor speed, {unit}")
     axis.set_ylabel(f"whirl speed, {unit}")
     legend_above(axis, 3)
-    return figure
+    return figure if ax is None else ax
 
 
 def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: float, top: float) -> None:

@@ -35,9 +35,8 @@ from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
@@ -101,10 +100,10 @@ class Ensemble(Result):
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The mean speed of each load in `unit`, over the runs.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
         from jaxvib.draw.style import speed_scale

@@ -27,7 +27,8 @@ from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Growth", "GrowthStatus", "growth"]
 
@@ -63,8 +64,8 @@ class Growth(Result):
         lasts = "" if math.isinf(self.horizon) else f", horizon {self.horizon:.3g} s"
         return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{lasts}"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """The rate of each stretch and the exponent over time. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """The rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import growth_chart  # slow to import: only who draws pays
 
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)

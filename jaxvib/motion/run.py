@@ -28,9 +28,8 @@ from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["Run", "RunStatus"]
 
@@ -127,13 +126,13 @@ class Run(AbstractMeasured, Result):
             return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
         return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Time histories: platforms, load speeds against the rotor's, foundation force. To the left the whole run as bands
         between its peaks (the window if nothing else was kept), to the right its last three periods, where phases are seen.
 
         **Arguments**: `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto, as many as there are panels, by rows.
 
-        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for another unit or
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or
         number of axes.
         """
         from jaxvib.draw.motion.histories import time_histories  # slow to import: only who draws pays
@@ -155,10 +154,10 @@ class Run(AbstractMeasured, Result):
         """
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
-    def plot_path(self, *, ax: Axes | None = None) -> Figure:
+    def plot_path(self, *, ax: Axes | None = None) -> Drawn:
         """The path of a rotor's axis across and up over the last three periods, mm; of one that tilts at every station.
 
-        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for a machine that moves
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves
         up and down only.
         """
         from jaxvib.draw.motion.histories import last_periods  # slow to import: only who draws pays

@@ -54,7 +54,8 @@ class Result(eqx.Module):
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """What came out, as a matplotlib figure. Where it has one panel, `plot(ax=axes)` draws onto axes that are there."""
+        """What came out, as a matplotlib figure; `plot(ax=axes)` draws onto axes that are there, one or as many as there are
+        panels, and gives them back."""
 
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import jax
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxvib.draw.machine.parts import put
-from jaxvib.draw.style import panels
+from jaxvib.draw.style import Drawn, panels
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.views import View, view_of
@@ -20,7 +19,7 @@ _INCH = 0.62
 """Inches of a drawing's unit."""
 
 
-def sketch(scene: Scene, *, ax: Axes | None = None) -> Figure:
+def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
     """Draws a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
 
     Platforms stand above each other, numbered from the bed upward; a rotor is seen along its axis, one that tilts from the side
@@ -28,7 +27,7 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Figure:
 
     **Arguments**: `scene`, of any machine; `ax` axes to draw onto.
 
-    **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for what is no scene, or one
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for what is no scene, or one
     whose numbers are not known (within `jit`, `grad`).
 
     >>> import jaxvib as jv
@@ -46,7 +45,7 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Figure:
     for text in view.texts():
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
     axis.set_title(caption(scene), loc="left", fontsize="small")
-    return figure
+    return figure if ax is None else ax
 
 
 def checked_scene(scene: object) -> Scene:

@@ -25,9 +25,7 @@ from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
     from jaxvib.steady.orbits.diagram import ExactBranches
 
 __all__ = ["Branches", "branches"]
@@ -59,7 +57,7 @@ class Branches(AbstractJam):
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,
-    ) -> Figure:
+    ) -> Drawn:
         """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed;
         where the scene's rotor speed crosses them, jams stand with the numbers of their modes.
 
@@ -67,7 +65,7 @@ class Branches(AbstractJam):
         third above the scene's unless said otherwise); `show` which panels, such as `("force",)`; `ax` axes to draw onto, as
         many as there are panels.
 
-        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for another unit, panel or
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or
         number of axes.
         """
         folds = self.folds

@@ -19,9 +19,8 @@ from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["ModeShapes", "mode_shapes"]
 
@@ -47,10 +46,10 @@ class ModeShapes(Result):
         ]
         return "\n".join(parts)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The shapes as bars, a group for each mode with its frequency in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import shapes_chart  # slow to import: only who draws pays
 

@@ -23,9 +23,8 @@ from jaxvib.units import Numbers, numbers, traced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["CriticalSpeeds", "Whirl", "critical_speeds", "whirl"]
 
@@ -53,10 +52,10 @@ class CriticalSpeeds(Result):
         lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
         return "\n".join(lines) or "no critical speed"
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Forward and backward critical speeds, on a line each, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 
@@ -88,11 +87,11 @@ class Whirl(Result):
             lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
         return "\n".join([*lines, self.critical.summary()])
 
-    def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, the synchronous line with the
         critical speeds on it, and the speed `at` which the rotor runs, rad/s, where it is given. Speeds are drawn in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
 

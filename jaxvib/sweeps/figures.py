@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from jaxvib.draw.style import Drawn
+
 __all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
 
 _MOST = 1500
@@ -58,7 +60,7 @@ def wilson(hits: np.ndarray, cases: np.ndarray, z: float = 1.959964) -> tuple[np
     return np.where(none, 0.0, np.maximum(middle - half, 0.0)), np.where(none, 1.0, np.minimum(middle + half, 1.0))
 
 
-def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Figure:
+def plot_sweep(store: str | Path, *, ax: Axes | None = None) -> Drawn:
     """The figure that fits a study: over two axes a map, of regimes where they were measured; over samples alone the
     distribution of what was measured first; over one axis that as points."""
     opened = Store(Path(store))
@@ -107,14 +109,14 @@ def plot_map(
     y: str | None = None,
     theory: bool = True,
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """A map over two axes: of labels (regimes, jam modes) with the folds and torus points of exact jams drawn in, or of values.
 
     **Arguments**: `measure` its name in the store, the regime where there is one unless said otherwise; `x`, `y` names of axes;
     along further axes the middle one is shown. `theory`: whether lines are drawn where exact jams fold or lose their stability;
     they are computed by `branches(scene, exact=True)` where one of the axes is the rotor's speed.
 
-    **Returns** a matplotlib figure. **Raises** `InputError` for names that the store does not have.
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for names that the store does not have.
     """
     from jaxvib.draw.sweeps import label_map, value_map
 
@@ -147,9 +149,9 @@ def plot_map(
     return value_map(xs, ys, values, label=_measure_label(opened, name), **labels, ax=ax)
 
 
-def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Figure:
+def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None = None) -> Drawn:
     """The share of the cases that each label has (regimes with their jam modes) over one axis, all other axes taken together,
-    with the intervals of Wilson that hold it with 95 %. **Returns** a matplotlib figure."""
+    with the intervals of Wilson that hold it with 95 %. **Returns** a matplotlib figure, or the given `ax`."""
     from jaxvib.draw.sweeps import shares_chart
 
     opened = Store(Path(store))
@@ -174,8 +176,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     return shares_chart(opened.read(over), shares, across=_axis_label(opened, over), log=log, ax=ax)
 
 
-def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Figure:
-    """How a measure is distributed over all cases that have one. **Returns** a matplotlib figure."""
+def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
+    """How a measure is distributed over all cases that have one. **Returns** a matplotlib figure, or the given `ax`."""
     from jaxvib.draw.sweeps import distribution_chart
 
     opened = Store(Path(store))
@@ -192,10 +194,10 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
     return distribution_chart(edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
 
 
-def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Figure:
+def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
     """What a measure is on average where each of the numbers that change is in the lowest and the highest fifth of its range.
 
-    **Returns** a matplotlib figure, the number with the largest influence on top.
+    **Returns** a matplotlib figure, or the given `ax`, the number with the largest influence on top.
     """
     from jaxvib.draw.sweeps import tornado_chart
 

@@ -30,7 +30,8 @@ from optimize.wishes.quantity import Tier
 if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
 
@@ -83,8 +84,8 @@ class Sweep(Result):
             lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
         return "\n".join(lines)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
-        """The figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, that of `ax` where it is given."""
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
+        """The figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.sweeps.figures import plot_sweep
 
         return plot_sweep(self.store, ax=ax)

@@ -42,7 +42,7 @@ def thinned(run, every):
 def test_every_machine_has_a_sketch_with_its_numbers(kind):
     scene = jv.scene_from_toml(TEMPLATES[kind])
     axis = Figure().subplots()
-    assert jv.sketch(scene, ax=axis) is axis.figure
+    assert jv.sketch(scene, ax=axis) is axis
     told = " ".join([axis.get_title(loc="left"), *(text.get_text() for text in axis.texts)])
     first = float(np.ravel(scene.machine.mass)[0])
     assert f"{first:.4g} kg" in told and "rpm" in told and f"{scene.loads.count} {scene.loads.kind.replace('_', ' ')}s" in told

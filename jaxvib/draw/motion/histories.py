@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, STROKES, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
+from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, SpeedUnit, legend_above, load_names, panels, speed_scale
 
 __all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
 
@@ -67,7 +66,7 @@ def time_histories(
     directions: Sequence[str] = ("force",),
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Two columns over time: the `whole` run as bands between its peaks, and the last periods of its `end` as they are. Rows:
     displacements mm, tilts mrad where there are any, speeds of the loads and the rotor in `unit`, force on the bed N.
 
@@ -117,7 +116,7 @@ def time_histories(
         axis.text(1.0, 1.02, text, transform=axis.transAxes, ha="right", va="bottom", fontsize="small", color="#555555")
     for axis in axes[-2:]:
         axis.set_xlabel("time, s")
-    return figure
+    return figure if ax is None else ax
 
 
 def _band(
@@ -143,7 +142,7 @@ def amplitude_histories(
     directions: Sequence[str] = ("force",),
     unit: SpeedUnit = "rad/s",
     ax: Onto = None,
-) -> Figure:
+) -> Drawn:
     """Panels over time (nt,) s of an averaged run: amplitudes (nt, nd) mm and mrad, speeds of the loads (nt, count) and of the
     rotor (nt,), amplitude of the force on the bed (nt, nb) N; zero to peak."""
     scale = speed_scale(unit)
@@ -169,4 +168,4 @@ def amplitude_histories(
         legend_above(axes[-1])
     axes[-1].set_xlabel("time, s")
     axes[0].text(1.0, 1.02, "zero to peak", transform=axes[0].transAxes, ha="right", va="bottom", fontsize="small")
-    return figure
+    return figure if ax is None else ax

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, GUIDE, STROKES, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
 __all__ = ["path_chart", "spectrum_chart", "waterfall_chart"]
 
@@ -26,7 +25,7 @@ def spectrum_chart(
     *,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Amplitudes (nf,) by name with unit, log scale, over frequency (nf,) rad/s, drawn in `unit`; speeds (1,) of rotor and
     loads and resonances as upright lines."""
     scale = speed_scale(unit)
@@ -45,7 +44,7 @@ def spectrum_chart(
     axis.set_xlabel(f"frequency, {unit}")
     axis.set_ylabel("amplitude, zero to peak")
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
 
 
 def waterfall_chart(
@@ -59,7 +58,7 @@ def waterfall_chart(
     *,
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
-) -> Figure:
+) -> Drawn:
     """Amplitudes (P, nf), `name` with unit, as darkness over time (P,) s and frequency (nf,) rad/s; the rotor's and the
     loads' speed (P,) as lines, resonances level."""
     scale = speed_scale(unit)
@@ -84,10 +83,10 @@ def waterfall_chart(
     axis.set_xlabel("time, s")
     axis.set_ylabel(f"frequency, {unit}")
     legend_above(axis)
-    return figure
+    return figure if ax is None else ax
 
 
-def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Figure:
+def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None) -> Drawn:
     """Paths of points by name: across and up (nt,) m, drawn in mm; a mark where each ends.
 
     >>> import numpy as np
@@ -106,4 +105,4 @@ def path_chart(paths: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes |
     axis.set_xlabel("across, mm")
     axis.set_ylabel("up, mm")
     legend_above(axis, 3)
-    return figure
+    return figure if ax is None else ax

@@ -22,7 +22,8 @@ from jaxvib.steady.whirl import whirl
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["REGIMES", "Regime", "RegimeName", "regime"]
 
@@ -114,10 +115,10 @@ class Regime(Result):
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 

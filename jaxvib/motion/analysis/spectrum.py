@@ -18,9 +18,8 @@ from jaxvib.units import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["Spectrum", "spectrum_of"]
 
@@ -72,14 +71,14 @@ class Spectrum(Result):
         coordinate: str | None = None,
         unit: SpeedUnit = "rad/s",
         ax: Axes | None = None,
-    ) -> Figure:
+    ) -> Drawn:
         """Of one piece amplitudes over frequency; of several a waterfall over time, darker where it is stronger. Resonances,
         the rotor's speed and the loads' are marked.
 
         **Arguments**: `show` displacements or the force on the bed; `coordinate` by name, in a waterfall the one that moves
         most unless said otherwise; `unit` of frequencies, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto.
 
-        **Returns** a matplotlib figure, that of `ax` where they are given. **Raises** `InputError` for other words.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for other words.
         """
         from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow to import: only who draws pays
 

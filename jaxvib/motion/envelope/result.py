@@ -16,9 +16,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
 
@@ -87,7 +85,7 @@ class Envelope(AbstractMeasured, Result):
             ]
         )
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time; arguments as
         `Run.plot`.
         """

@@ -19,9 +19,8 @@ from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
 
@@ -68,10 +67,10 @@ class Criterion(Result):
         lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Characteristic speeds with damping, and the intervals between them, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 

@@ -23,9 +23,8 @@ from jaxvib.units import traced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
 
@@ -89,10 +88,10 @@ class CharacteristicSpeeds(Result):
             lines.append(line)
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Resonances and additional speeds, without and with damping, on a line each, in `unit`.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.results import speeds_chart  # slow to import: only who draws pays
 

@@ -12,7 +12,8 @@ from jaxvib.results.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["BalancedStability", "StabilityStatus"]
 
@@ -52,10 +53,10 @@ class BalancedStability(Result):
             f"known to {self.error:.1e}"
         )
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The multipliers in the complex plane, and the unit circle.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.results import multiplier_chart  # slow to import: only who draws pays
 

@@ -26,9 +26,7 @@ from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, 
 from jaxvib.steady.balance.stability import BalancedStability
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = [
     "BalanceStatus",
@@ -97,8 +95,8 @@ class BalancedStates(Result):
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
         return "\n".join([self.message, *rows, directions])
 
-    def plot(self, *, ax: Onto = None) -> Figure:
-        """The arrangements in the rotor's frame, a circle each, onto axes `ax` if given. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """The arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 
         return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)

@@ -23,9 +23,7 @@ from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, rotor_s
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
 
@@ -85,7 +83,7 @@ class Jam(AbstractJam):
             return "loads cannot stay together"
         return f"{'stable' if self.stable else 'unstable'} by slope"
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """The speed of the loads in `unit`, and the amplitudes; onto two axes `ax` if given. **Returns** a matplotlib
         figure.
         """
@@ -147,15 +145,15 @@ class JamModes(AbstractJam):
         lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
         return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Speeds of the loads in `unit` among the resonances, and amplitudes, by mode; onto two axes `ax` where they are given.
 
-        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         return _modes_chart(self, self.resonances, unit, ax)
 
 
-def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Figure:
+def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Drawn:
     from jaxvib.draw.results import modes_chart  # slow to import: only who draws pays
 
     mode, omega, stable, amplitude = map(np.asarray, (jams.mode, jams.omega, jams.stable, jams.amplitude))

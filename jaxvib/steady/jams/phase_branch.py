@@ -16,9 +16,8 @@ from jaxvib.steady.jams.phases import PhaseStatus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["PhaseBranch", "drag_curve"]
 
@@ -61,11 +60,11 @@ class PhaseBranch(Result):
             f"{np.max(factor[there]):.4g} times the scene's drag"
         )
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Speed of the loads, and of the rotor, over the drag (N s/m, or times the scene's where loads differ in it); stable
         solid, unstable dashed.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 

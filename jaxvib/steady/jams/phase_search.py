@@ -37,9 +37,8 @@ from jaxvib.units import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
@@ -84,11 +83,11 @@ class PhaseJams(AbstractPhaseJam):
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
         scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 

@@ -27,7 +27,8 @@ from jaxvib.units import traced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_apart", "phase_jam", "phase_torques"]
 
@@ -94,10 +95,10 @@ class PhaseJam(AbstractPhaseJam):
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
         return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Where the loads stand, on a circle.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 

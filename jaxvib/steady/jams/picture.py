@@ -12,9 +12,7 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["MARKS", "branch_summary", "picture"]
 
@@ -63,7 +61,7 @@ def picture(
     ax: Onto,
     modes: np.ndarray | None = None,
     resonances: np.ndarray | None = None,
-) -> Figure:
+) -> Drawn:
     """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed.
 
     **Arguments**: `marks` special points (kind, load speed, rotor speed); `unit` of the speeds on the axes; `most` the greatest
@@ -71,7 +69,7 @@ def picture(
     which axes; `modes` the number of the jam mode at each point, counted by the resonances and the slope if None; the
     `resonances` (nd,) rad/s, computed if None.
 
-    **Returns** a matplotlib figure. **Raises** `InputError` for another unit or panel.
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or panel.
     """
     from jaxvib.draw.charts import branch_diagram  # slow to import: only who draws pays
 

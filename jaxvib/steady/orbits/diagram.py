@@ -28,9 +28,7 @@ from jaxvib.steady.orbits.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
@@ -89,7 +87,7 @@ class ExactBranches(Result):
         most: float | None = None,
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,
-    ) -> Figure:
+    ) -> Drawn:
         """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
         return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
 

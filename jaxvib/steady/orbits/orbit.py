@@ -29,9 +29,7 @@ from jaxvib.steady.orbits.collocation import (
 from jaxvib.steady.orbits.floquet import Floquet, floquet
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
 
@@ -140,9 +138,9 @@ class Orbit(Result):
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )
 
-    def plot(self, *, ax: Onto = None) -> Figure:
+    def plot(self, *, ax: Onto = None) -> Drawn:
         """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed; onto three
-        axes `ax` where they are given. **Returns** a matplotlib figure."""
+        axes `ax` where they are given. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         theta = np.linspace(0.0, 2.0 * np.pi, 721)

@@ -16,9 +16,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["WANTED", "Cost", "CostRow", "cost_figure", "relative", "row_of", "timed"]
 
@@ -72,20 +70,20 @@ class Cost(Result):
             lines.append(f"  to {wanted:.0e}: {way}")
         return "\n".join([*lines, *(f"  {reason}" for reason in self.left_out)])
 
-    def plot(self, *, ax: Onto = None) -> Figure:
+    def plot(self, *, ax: Onto = None) -> Drawn:
         """Error against seconds, a line for each method; see `cost_figure`; onto axes `ax` if given. **Returns** a
-        matplotlib figure.
+        matplotlib figure, or the given `ax`.
         """
         return cost_figure({"": self}, ax=ax)
 
 
-def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Figure:
+def cost_figure(costs: Mapping[str, Cost], *, ax: Onto = None) -> Drawn:
     """Error against seconds, a panel for each of `costs` by its title, a line for each method, the same in all panels.
 
     Rings mark the cheapest way to each of the errors `WANTED`.
 
     **Arguments**: `costs` a `Cost` for each title, which stands above its panel; `ax` as many axes to draw onto. **Returns**
-    a matplotlib figure.
+    a matplotlib figure, or the given `ax`.
 
     >>> import jaxvib as jv
     >>> rows = [CostRow("full", "Tsit5", "float64", f"{error:.0e}", error, seconds, 1.0)

@@ -22,7 +22,8 @@ from jaxvib.results.status import member
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["GradientCheck", "GradientStatus", "ImplicitRoute", "check_gradients"]
 
@@ -109,10 +110,10 @@ class GradientCheck(Result):
             raise ComputationError(self.status_name, self.summary())
         return self
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Central differences against the first route over their step, a line for each number, and where they were best.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.comparison import steps_chart  # slow to import: only who draws pays
 

@@ -27,7 +27,8 @@ from jaxvib.units import Number, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["HarmonicConvergence", "harmonic_convergence"]
 
@@ -49,10 +50,10 @@ class HarmonicConvergence(Result):
         rows = zip(self.harmonics, np.max(self.error, axis=1), np.max(self.known, axis=1), strict=True)
         return "\n".join(f"{int(n)} harmonics: error {error:.1e}, estimated {known:.1e}" for n, error, known in rows)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Error over the highest harmonic, a line a load speed; the jams' own estimates dashed.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         names = [f"{w:.4g} rad/s" for w in self.omega]
         from jaxvib.draw.comparison import convergence_chart  # slow to import: only who draws pays

@@ -20,7 +20,8 @@ from jaxvib.steady.orbits.orbit import Orbit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["TierValues", "Tiers", "compare_tiers"]
 
@@ -56,10 +57,10 @@ class Tiers(Result):
             lines.append(f"load of {mass:.4g} kg: leading order {light}, exact {exact}")
         return "\n".join(lines)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Relative differences over the load's mass: load speed, amplitude, foundation force; hollow where unstable.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         differences = {
             "load speed": np.abs(self.leading.omega / self.exact.omega - 1.0),

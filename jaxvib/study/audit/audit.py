@@ -27,9 +27,7 @@ from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["Audit", "AuditStatus", "audit"]
 
@@ -84,9 +82,9 @@ class Audit(Result):
             lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.says}")
         return "\n".join(lines)
 
-    def plot(self, *, ax: Onto = None) -> Figure:
+    def plot(self, *, ax: Onto = None) -> Drawn:
         """What each effect changes against the accuracy asked for, and what it costs, onto two axes `ax` if given.
-        **Returns** a matplotlib figure.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 

@@ -17,7 +17,8 @@ from jaxvib.units import count
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_points"]
 
@@ -71,10 +72,10 @@ class Decrement(Result):
             f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
         )
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """mu1 of each pair of swings, first to last.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.results import points_chart  # slow to import: only who draws pays
 

@@ -23,9 +23,7 @@ from jaxvib.study.bearing.record import Record
 from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["Identified", "IdentifyStatus", "identify"]
 
@@ -117,7 +115,7 @@ class Identified(Result):
         lines.append(f"frequency {shown(self.frequency)} rad/s, noise {self.noise:.2g} rad; {self.message}")
         return "\n".join([*lines, *self.notes])
 
-    def plot(self, *, ax: Onto = None) -> Figure:
+    def plot(self, *, ax: Onto = None) -> Drawn:
         """The record with the fit, and what the fit leaves; onto two axes `ax` if given."""
         from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
 

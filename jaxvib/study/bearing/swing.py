@@ -24,9 +24,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
 
@@ -114,8 +112,8 @@ class Swing(Result):
         first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
         return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"
 
-    def plot(self, *, ax: Onto = None) -> Figure:
-        """Angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure."""
+    def plot(self, *, ax: Onto = None) -> Drawn:
+        """Angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))

@@ -27,7 +27,8 @@ from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "steps_per_second", "thrown_state"]
 
@@ -109,10 +110,10 @@ class Capture(Result):
         lone = f"; below it {100.0 * np.mean(below):.3g} % are captured all the same" if np.any(below > 0.0) else ""
         return f"{head}\n  {where}{lone}"
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The share of starts captured over the initial speed, and the threshold; onto the axes `ax` where they are given.
 
-        **Returns** a matplotlib figure.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
 

@@ -22,7 +22,8 @@ from jaxvib.units import Number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["ThresholdCurve", "threshold_curve"]
 
@@ -53,10 +54,10 @@ class ThresholdCurve(Result):
             lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; the least {least:.4f}"))
         return "\n".join(lines)
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Thresholds with their uncertainty over the values, and the least captured speeds.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.capture import curve_chart  # slow to import: only who draws pays
 

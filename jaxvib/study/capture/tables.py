@@ -35,9 +35,7 @@ from jaxvib.study.capture.published_torus import (
 from jaxvib.units import count
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto
+    from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
@@ -160,10 +158,10 @@ class TorusTables(Result):
                     lines.append(f"{point}  {name:8s}{numbers}  {self.fraction[m, i]:5.2f}  {pattern}")
         return "\n".join(lines)
 
-    def plot(self, *, ax: Onto = None) -> Figure:
+    def plot(self, *, ax: Onto = None) -> Drawn:
         """The speeds nearest to the paper's over the gap, a panel for each row; onto as many axes `ax` where they are given.
 
-        **Returns** a matplotlib figure.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.capture import tables_chart  # slow to import: only who draws pays
 

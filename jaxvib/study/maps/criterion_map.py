@@ -20,9 +20,7 @@ from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["CriterionMap", "criterion_map"]
 
@@ -64,11 +62,11 @@ class CriterionMap(Result):
             lines.append(f"{factor:>16.3g}" + "".join(f"{cell:>16}" for cell in cells))
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """One panel a drag: rotor speed in `unit` against load mass, where the criterion is right and where not; onto as many
         axes `ax` where they are given.
 
-        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         from jaxvib.draw.criterion import agreement_maps  # slow to import: only who draws pays
 

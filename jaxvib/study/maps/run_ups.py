@@ -27,9 +27,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, numbers
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from jaxvib.draw.style import Onto, SpeedUnit
+    from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
 __all__ = ["RunUps", "run_ups"]
 
@@ -81,10 +79,10 @@ class RunUps(Result):
             lines.append(f"drag {drag:.4g} N s/m: {', '.join(said)}")
         return "\n".join(lines)
 
-    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Figure:
+    def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Shares of the kinds of motion, and speeds of the loads in `unit`, over drag; onto two axes `ax` where they are given.
 
-        **Returns** a matplotlib figure. **Raises** `InputError` for another unit or number of axes.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         shares = {kind: self.fraction(kind) for kind in (*REGIMES, _FAILED) if np.any(self.kind == kind)}
         rotor = np.max(np.asarray(self.regime.rotor_speed), initial=0.0, where=self.finished)

@@ -18,9 +18,8 @@ from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import SpeedUnit
+    from jaxvib.draw.style import Drawn, SpeedUnit
 
 __all__ = ["StabilityMap", "stability_map", "stability_onset"]
 
@@ -44,10 +43,10 @@ class StabilityMap(Result):
             lines.append(f"{x:.6g}: {np.mean(stable):.1%} of the load speeds stable; {kinds or 'no special point'}")
         return "\n".join(lines)
 
-    def plot(self, *, label: str = "x", unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Figure:
+    def plot(self, *, label: str = "x", unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Stable jams shaded over the load speed in `unit` and x, special points as marks by kind; `label` names x on its axis.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given. **Raises** `InputError` for another unit.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
         marks: dict[str, list[tuple[float, float]]] = {}
         for x, points in zip(self.value, self.special, strict=True):

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from jaxvib.draw.style import COLORS, panels
+from jaxvib.draw.style import COLORS, Drawn, panels
 from jaxvib.study.published.entry import MISPRINT, NOT_REPRODUCIBLE, REPRODUCED, PublishedRow
 
 __all__ = ["verdict_chart"]
@@ -17,7 +16,7 @@ _LOOKS = {REPRODUCED: ("o", COLORS[0]), MISPRINT: ("D", COLORS[1]), NOT_REPRODUC
 _LEAST, _MOST = 1e-9, 30.0
 
 
-def verdict_chart(rows: Sequence[PublishedRow], *, ax: Axes | None = None) -> Figure:
+def verdict_chart(rows: Sequence[PublishedRow], *, ax: Axes | None = None) -> Drawn:
     """Relative differences of printed and computed numbers, a line for each row, its bound a bar, a mark for each verdict;
     what cannot be computed stands at the right."""
     figure, (axes,) = panels(1, size=(9.0, 1.6 + 0.2 * max(len(rows), 4)), ax=ax)
@@ -37,4 +36,4 @@ def verdict_chart(rows: Sequence[PublishedRow], *, ax: Axes | None = None) -> Fi
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlabel("computed less printed, relative (right edge: nothing to compute)")
     axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=4, fontsize=8)
-    return figure
+    return figure if ax is None else ax

@@ -14,7 +14,8 @@ from jaxvib.study.published.entry import MISPRINT, NOT_REPRODUCIBLE, REPRODUCED,
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Reproduced", "ReproducedStatus", "reproduced_of"]
 
@@ -59,10 +60,10 @@ class Reproduced(Result):
                     lines.append(f"  {row.quantity} ({row.place}): {_told(row)}")
         return "\n".join([*lines, self.message])
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """How far each number is from the printed one, relative, by verdict, on a logarithmic scale.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.study.published.chart import verdict_chart  # slow to import: only who draws pays
 

@@ -14,7 +14,8 @@ from jaxvib.study.stress.case import StressRow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from jaxvib.draw.style import Drawn
 
 __all__ = ["Stress", "StressStatus", "stress_of"]
 
@@ -46,10 +47,10 @@ class Stress(Result):
             lines.append(f"  {row.case}, {row.dtype}: {row.status}{known}")
         return "\n".join([*lines, self.message])
 
-    def plot(self, *, ax: Axes | None = None) -> Figure:
+    def plot(self, *, ax: Axes | None = None) -> Drawn:
         """True errors of all cases in both precisions on a logarithmic scale, the errors claimed, and the bounds.
 
-        **Returns** a matplotlib figure, that of the axes `ax` where they are given.
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         from jaxvib.draw.comparison import StressMark, stress_chart  # slow to import: only who draws pays
 
