@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import called, closest, load_scene, read_toml
+from jaxvib.machine.files import called, closest, load_scene, out_of_place, read_toml
 from jaxvib.units import count, number
 from optimize import quantities
 from optimize.quantities import Quantity
@@ -85,7 +85,7 @@ def load_design(path: str | Path) -> Design:
     tables = read_toml(path)
     for name in tables:
         if name not in _SECTIONS:
-            raise InputError(name, f"is no part of a design file; {closest(name, _SECTIONS)}")
+            raise out_of_place(name, tables, "design", _SECTIONS)
     for name in ("scene", "free", "objective"):
         if name not in tables and not (name == "free" and "choices" in tables):
             raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
@@ -161,13 +161,14 @@ def quantity_from_table(table: Any, section: str, more: tuple[str, ...]) -> tupl
 TEMPLATE = """# A design: which numbers of the scene may change, what keeps its value, what is wanted.
 scene = "machine.toml"            # path of the scene file, from here
 
-[free]                            # bounds, SI or with units; machine.stiffness[0] frees one entry only
+[free]                            # bounds, SI or with units; of every support, also of one that is not there yet (0);
+                                  # machine.stiffness[0] frees one entry only
 "machine.stiffness" = ["10 N/mm", "200 N/mm"]
 "machine.link_stiffness" = ["50 N/mm", "500 N/mm"]
 
 [[hold]]                          # keeps its value during the search
 quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
-mode = 3
+mode = 3                          # jam modes go by resonance: 2 r - 1 is the jam just below resonance r
 value = "570 rpm"                 # left out: what it is in the scene
 
 [[hold]]

@@ -42,12 +42,12 @@ def animate(
     kind: str,
     output: Output,
 ) -> None:
-    """A film of the machine as it moves, in slow motion, into --out: animation.gif and animation.html.
+    """A film of the machine as it moves, in slow motion: animation.gif and animation.html, in --out or here.
 
-    SOURCE is a run.npz that `jaxvib simulate` kept, or a scene file: with --until it is simulated first, with --mode its
-    exact jam is shown."""
-    if output.folder is None:
-        raise InputError("--out", "is missing; name the folder that the film goes into")
+    SOURCE is a run.npz that `jaxvib simulate` kept, or its folder, or a scene file: with --until it is simulated first, with
+    --mode its exact jam is shown."""
+    if source.is_dir():
+        source = source / "run.npz"
     if source.suffix == ".npz":
         if until is not None or start is not None or mode is not None:
             raise InputError("--until", "goes, as --start and --mode, with a scene file; a kept run has its own")
@@ -62,9 +62,8 @@ def animate(
             motion, scene = jv.jam_orbit(loaded, mode=mode), loaded
     film = jv.animate(motion, scene=scene, begin=begin, end=end, seconds=seconds, fps=fps, magnify=magnify, width=width)
     for suffix in ("gif", "html"):
-        path = output.file(f"animation.{suffix}") if kind in (suffix, "both") else None
-        if path is not None:
-            film.save(path)
+        if kind in (suffix, "both"):
+            film.save(output.made(f"animation.{suffix}"))
     first, last = film.figure.axes[1].get_xlim()
     document = {"pictures": film.count, "fps": film.fps, "begin": first, "end": last}
     output.done(document, lambda: f"{film.count} pictures of {first:.6g} to {last:.6g} s", "animate")
@@ -74,9 +73,6 @@ def animate(
 @click.argument("scene", type=click.Path(path_type=Path))
 @shared
 def sketch(scene: Path, output: Output) -> None:
-    """A drawing of SCENE with its numbers, into --out: sketch.png."""
-    picture = output.file("sketch.png")
-    if picture is None:
-        raise InputError("--out", "is missing; name the folder that the sketch goes into")
-    jv.sketch(jv.load_scene(scene)).savefig(picture)
+    """A drawing of SCENE with its numbers: sketch.png, in --out or here."""
+    jv.sketch(jv.load_scene(scene)).savefig(output.made("sketch.png"))
     output.done({"status": "done"}, lambda: "a sketch of the machine", "sketch")

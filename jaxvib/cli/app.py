@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import importlib
 import json
+import re
 import sys
-import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,33 +65,48 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     return capture.get().rstrip()
 
 
-_HOMES = {
-    "describe": "describe",
-    "envelope": "motion.settle",
-    "explore": "explore",
-    "growth": "motion.settle",
-    "onset": "motion.stability",
-    "run-ups": "motion.run_ups",
-    "settle": "motion.settle",
-    "stability-map": "motion.stability",
-    "animate": "animate",
-    "sketch": "animate",
-    "audit": "study.audit",
-    "capture": "study.capture",
-    "cost": "study.cost",
-    "identify": "study.identify",
-    "reproduce": "study.reproduce",
-    "show": "study.sweep",
-    "stress": "study.stress",
-    "sweep": "study.sweep",
-    "whirl": "whirl",
-    "criterion": "criterion",
-    "modes": "modes",
-    "new": "commands",
-    "optimize": "optimize",
-    "simulate": "commands",
+_GROUPS = {
+    "To begin": {"new": "commands", "describe": "describe", "sketch": "animate", "explore": "explore"},
+    "How it can jam": {
+        "modes": "modes",
+        "criterion": "criterion",
+        "whirl": "whirl",
+        "stability-map": "motion.stability",
+        "onset": "motion.stability",
+    },
+    "How it moves": {
+        "simulate": "commands",
+        "settle": "motion.settle",
+        "envelope": "motion.settle",
+        "run-ups": "motion.run_ups",
+        "growth": "motion.settle",
+        "capture": "study.capture",
+        "animate": "animate",
+    },
+    "Designs and studies": {
+        "optimize": "optimize",
+        "sweep": "study.sweep",
+        "show": "study.sweep",
+        "identify": "study.identify",
+    },
+    "What an answer is worth": {
+        "cost": "study.cost",
+        "audit": "study.audit",
+        "stress": "study.stress",
+        "reproduce": "study.reproduce",
+    },
 }
-"""The module of `jaxvib.cli` that holds each command."""
+"""The commands by what they are for, each with the module of `jaxvib.cli` that holds it."""
+
+_HOMES = {name: home for group in _GROUPS.values() for name, home in group.items()}
+
+_ARGUMENTS = {
+    "scene": "a scene file, such as `jaxvib new two-mass > machine.toml` makes",
+    "design": "a design file, such as `jaxvib new design > design.toml` makes",
+    "study": "a study file, such as `jaxvib new sweep > study.toml` makes",
+    "source": "a scene file, or a run.npz that `jaxvib simulate` kept",
+}
+"""What arguments of commands are, where one is missing."""
 
 
 class _Lazy(click.Group):
@@ -101,9 +116,11 @@ class _Lazy(click.Group):
         return sorted(_HOMES)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """A line for each command, read from its module's text: importing them all would take a second."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, _first_line(name)) for name in self.list_commands(ctx)])
+        """What each command does, read from its module's text: importing them all would take a second."""
+        widest = max(map(len, _HOMES))
+        for title, group in _GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(widest), _first_line(name)) for name in group])
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in _HOMES:
@@ -112,11 +129,11 @@ class _Lazy(click.Group):
 
 
 def _first_line(name: str) -> str:
-    """What a command's docstring begins with."""
+    """What a command's docstring says first."""
     source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):
-            return textwrap.shorten((ast.get_docstring(node) or "").split("\n\n")[0], 62, placeholder="...")
+            return " ".join(re.split(r"[.;](?=\s|$)", ast.get_docstring(node) or "", maxsplit=1)[0].split())
     return ""
 
 
@@ -174,7 +191,11 @@ def run(arguments: list[str]) -> int:
     except click.UsageError as error:
         field = error.ctx.command.name if error.ctx else "jaxvib"
         hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
-        message = " ".join(error.format_message().split()) + hint
+        message = " ".join(error.format_message().split())
+        if isinstance(error, click.MissingParameter) and error.param is not None:
+            told = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
+            message = f"{message.rstrip('.')}: {told.rstrip('.')}" if told else message
+        message += hint
         return _failed(wants_json, 2, {"kind": "input", "field": field, "message": message})
     except click.exceptions.Exit as stop:
         return stop.exit_code

@@ -22,12 +22,18 @@ if TYPE_CHECKING:
     from jaxvib.motion.start import Start
 
 
-@app.command("new")
-@click.argument("kind", type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement", "sweep"]))
+@app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
+@click.argument(
+    "kind",
+    metavar="KIND",
+    type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement", "sweep"]),
+)
 @shared
 def new(kind: str, output: Output) -> None:
-    """Print a commented scene file of that KIND of machine, a design file, a measurement file for `identify`, or a study
-    file for `sweep`."""
+    """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.
+
+    KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus for a machine; design for `optimize`; sweep, a
+    study, for `sweep`; measurement, a recorded swing, for `identify`."""
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATE as DESIGN

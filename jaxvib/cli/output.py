@@ -59,6 +59,12 @@ class Output:
         self.files.append(str(self.folder / name))
         return self.folder / name
 
+    def made(self, name: str) -> Path:
+        """The path of a file that is what the command is for: in the folder, in the current one where none was asked for."""
+        path = (self.folder or Path()) / name
+        self.files.append(str(path))
+        return path
+
     def picture(self, name: str, draw: Callable[[], Figure]) -> None:
         """Draws a figure where a folder or a report was asked for: into the file of that name, and onto the report."""
         path = self.file(name)

@@ -31,6 +31,7 @@ __all__ = [
     "called",
     "closest",
     "load_scene",
+    "out_of_place",
     "read_toml",
     "rebuilt",
     "save_scene",
@@ -81,6 +82,30 @@ def read_toml(path: str | Path) -> Tables:
         ) from error
     except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), f"is no TOML file: {error}") from error
+
+
+_MARKS = {
+    "scene": (*SECTIONS, "effects"),
+    "design": ("free", "choices", "objective", "search"),
+    "study": ("axes", "measure"),
+    "measurement": ("record", "pendulum", "identify"),
+}
+"""Names by which each kind of file is known."""
+
+
+def out_of_place(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
+    """What is said of a `name` that a file of that `kind` has no use for: what was meant, or that it is a file of another kind.
+
+    >>> str(out_of_place("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
+    'machine is no part of a design file: this is a scene file'
+    """
+    other = next((each for each, marks in _MARKS.items() if each != kind and any(mark in tables for mark in marks)), None)
+    if other is None or any(mark in tables for mark in _MARKS[kind]):
+        return InputError(name, f"is no part of a {kind} file; {closest(name, allowed)}")
+    if kind == "scene":
+        return InputError(name, f"is no part of a scene file: this is a {other} file; give the scene file that it is about")
+    new = "sweep" if kind == "study" else kind
+    return InputError(name, f"is no part of a {kind} file: this is a {other} file; `jaxvib new {new}` prints a {kind} file")
 
 
 def load_scene(path: str | Path) -> Scene:
@@ -162,7 +187,7 @@ def scene_from_tables(tables: Tables) -> Scene:
     """A scene from the tables of a scene file, see `scene_from_toml`."""
     for name in tables:
         if name not in (*SECTIONS, "effects"):
-            raise InputError(name, f"is no table of a scene file; {closest(name, [*SECTIONS, 'effects'])}")
+            raise out_of_place(name, tables, "scene", [*SECTIONS, "effects"])
     parts = {}
     for name, kinds in SECTIONS.items():
         if name not in tables:

@@ -87,7 +87,7 @@ class Run(AbstractMeasured, Result):
         """What happened, for a person to read; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
-        state = "settled" if bool(self.settled) else "not settled"
+        state = "settled" if bool(self.settled) else "not settled: run longer"
         glued = ["  all loads ran at one angle, as they started: whether they would stay so was not tested; start them apart"]
         return "\n".join(
             [

@@ -198,7 +198,8 @@ def _two_directions(scene: Scene) -> LinearModel:
     if carrier.axes != (0, 1):
         raise InputError(
             "machine.kind",
-            f"is {scene.machine.kind!r}, which moves up and down only; whirl needs a rotor such as rotor(...)",
+            f"is {scene.machine.kind!r}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
+            "whirl needs a rotor such as rotor(...)",
         )
     if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):
         raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")

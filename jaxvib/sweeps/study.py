@@ -10,7 +10,7 @@ from typing import TypeAlias, cast
 
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
-from jaxvib.machine.files import closest, load_scene, read_toml
+from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
@@ -148,7 +148,7 @@ def load_study(path: str | Path) -> Study:
     tables = read_toml(path)
     for name in tables:
         if name not in _FIELDS:
-            raise InputError(name, f"is no part of a study file; {closest(name, _FIELDS)}")
+            raise out_of_place(name, tables, "study", _FIELDS)
     for name in ("scene", "axes", "measure"):
         if name not in tables:
             raise InputError(name, "is missing; a study file needs scene, [axes] and [[measure]]")

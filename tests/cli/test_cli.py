@@ -29,8 +29,8 @@ def typed(capsys, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("kind", TEMPLATES)
 def test_new_prints_a_scene_file_that_loads(typed, kind):
-    code, out, _ = typed("new", kind.replace("_", "-"))
-    assert code == 0
+    code, out, _ = typed("new", kind)
+    assert code == 0 and f" {kind.replace('_', '-')}" in typed("new", "--help")[1]
     assert jv.scene_from_toml(out).machine.kind == {"torus": "planar_rotor"}.get(kind, kind)
     assert "#" in out and "kg" in out
 
@@ -216,7 +216,7 @@ WRONG = [
     (("count = 3", "count = 0"), "loads.count is 0; it must be a whole number, at least 1"),
     (("speed = 150.0", "speed = -1"), "drive.speed is -1 rad/s; it must be greater than 0"),
     (('kind = "two_mass"', 'kind = "two-mass"'), "machine.kind is 'two-mass'; did you mean 'two_mass'"),
-    (("[machine]", "[machin]"), "machin is no table of a scene file; did you mean 'machine'"),
+    (("[machine]", "[machin]"), "machin is no part of a scene file; did you mean 'machine'"),
     (("[machine]", "[machine"), "is no TOML file"),
 ]
 
@@ -236,9 +236,9 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
     [
         (("modes", "nothing.toml"), 2, "cannot be read"),
         (("modes", "machine.toml", "--speed", "5 kg"), 2, "is not in rad/s"),
-        (("modes",), 2, "Missing argument 'SCENE'"),
+        (("modes",), 2, "Missing argument 'SCENE': a scene file, such as `jaxvib new two-mass"),
         (("mode", "machine.toml"), 2, "No such command"),
-        (("simulate", "machine.toml"), 2, "--until"),
+        (("simulate", "machine.toml"), 2, "Missing option '--until': End time, such as 20s"),
         (("simulate", "machine.toml", "--until", "5 kg"), 2, "until is '5 kg', which is not in s"),
         (("simulate", "machine.toml", "--until", "-1"), 2, "until is -1 s; it must be greater than 0"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam"), 2, "mode is missing"),
@@ -250,11 +250,13 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         ),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
         (("simulate", "machine.toml", "--until", "1s", "--tolerance", "1e-30"), 2, "tolerance is 1e-30"),
-        (("optimize", "machine.toml"), 2, "is no part of a design file"),
+        (("optimize", "machine.toml"), 2, "machine is no part of a design file: this is a scene file; `jaxvib new design`"),
+        (("modes", "design.toml"), 2, "scene is no part of a scene file: this is a design file; give the scene file"),
         (("new", "four-mass"), 2, "four-mass"),
     ],
 )
-def test_failures_have_their_exit_code_and_one_sentence(typed, words, code, says):
+def test_failures_have_their_exit_code_and_one_sentence(typed, tmp_path, words, code, says):
+    (tmp_path / "design.toml").write_text('scene = "machine.toml"\n[free]\n')
     got, out, err = typed(*words)
     assert (got, out) == (code, "")
     assert says in err and err.count("\n") == 1
@@ -300,8 +302,8 @@ def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
 
 
 def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
-    code, out, err = typed("sketch", "machine.toml", "--out", "a")
-    assert code == 0 and (tmp_path / "a" / "sketch.png").stat().st_size > 10_000, err
+    code, out, err = typed("sketch", "machine.toml")
+    assert code == 0 and (tmp_path / "sketch.png").stat().st_size > 10_000 and out.endswith("wrote sketch.png\n"), err
     small = ["--seconds", "0.5", "--width", "3", "--end", "0.05s"]
     code, out, err = typed("animate", "machine.toml", "--mode", "3", *small, "--out", "a", "--json")
     assert code == 0 and json.loads(out) == {"pictures": 10, "fps": 20.0, "begin": 0.0, "end": pytest.approx(0.045)}, err
@@ -311,8 +313,7 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["animate", "machine.toml", "--until", "1s"], "--out is missing; name the folder"),
-        (["sketch", "machine.toml"], "--out is missing; name the folder"),
+        (["animate", ".", "--out", "a"], "there is no such file"),
         (["animate", "machine.toml", "--out", "a"], "--until is missing; say how long to simulate, or by --mode"),
         (["animate", "run.npz", "--mode", "3", "--out", "a"], "--until goes, as --start and --mode, with a scene file"),
         (["animate", "missing.npz", "--out", "a"], "there is no such file"),

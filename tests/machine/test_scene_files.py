@@ -123,7 +123,7 @@ def tables(**changed):
     [
         (dict(machine=None), "machine is missing; a scene file needs the table [machine]"),
         (dict(machine=5), "machine is 5; it must be a table, write [machine]"),
-        (dict(machin={}), "machin is no table of a scene file; did you mean 'machine'? allowed: machine, loads"),
+        (dict(machin={}), "machin is no part of a scene file; did you mean 'machine'? allowed: machine, loads"),
         (dict(machine__kind=None), "machine.kind is missing; allowed: one_mass, two_mass, three_mass, network"),
         (dict(machine__kind="twomass"), "machine.kind is 'twomass'; did you mean 'two_mass'? allowed: one_mass, two_mass"),
         (dict(machine__kind=["two_mass"]), "machine.kind is ['two_mass']; "),

@@ -73,7 +73,7 @@ class Envelope(AbstractMeasured, Result):
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
-        state = "settled" if bool(self.settled) else "not settled"
+        state = "settled" if bool(self.settled) else "not settled: run longer"
         return "\n".join(
             [
                 f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import Tables, called, closest
+from jaxvib.machine.files import Tables, called, closest, out_of_place
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number, number
@@ -47,7 +47,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     names = ["record", "pendulum", "identify"]
     for name, table in tables.items():
         if name not in names:
-            raise InputError(name, f"is no table of a measurement file; {closest(name, names)}")
+            raise out_of_place(name, tables, "measurement", names)
         if not isinstance(table, Mapping):
             raise InputError(name, f"is {table!r}; it must be a table, write [{name}]")
     pendulum = called(BearingPendulum, tables.get("pendulum", {}), "pendulum")

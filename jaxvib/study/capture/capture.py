@@ -193,7 +193,8 @@ def capture(
     """
     scene = checked(scene)
     if len(scene.loads.rest()) != 2 or getattr(scene.loads, "own_radius", None) is None:
-        raise InputError("loads.kind", f"is {scene.loads.kind!r}; capture asks for balls in a torus: torus_balls(...)")
+        told = "capture asks for balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
+        raise InputError("loads.kind", f"is {scene.loads.kind!r}; {told}")
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:
