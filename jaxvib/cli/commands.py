@@ -13,20 +13,21 @@ from jaxvib.cli.app import UNIT, Output, app, shared
 from jaxvib.cli.motion.document import chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
-from jaxvib.machine.files import TEMPLATES
-from jaxvib.ode.progress import ProgressBar
-from jaxvib.units import number
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import SpeedUnit
     from jaxvib.motion.start import Start
 
 
+_MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "rotor", "torus")
+"""The names of `jaxvib.machine.files.TEMPLATES`, whose import is slow."""
+
+
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
 @click.argument(
     "kind",
     metavar="KIND",
-    type=click.Choice([*(name.replace("_", "-") for name in TEMPLATES), "design", "measurement", "sweep"]),
+    type=click.Choice([*_MACHINES, "design", "measurement", "sweep"]),
 )
 @shared
 def new(kind: str, output: Output) -> None:
@@ -34,6 +35,7 @@ def new(kind: str, output: Output) -> None:
 
     KIND is one-mass, two-mass, three-mass, network, planar-rotor, rotor, torus for a machine; design for `optimize`; sweep, a
     study, for `sweep`; measurement, a recorded swing, for `identify`."""
+    from jaxvib.machine.files import TEMPLATES
     from jaxvib.study.bearing.measurement import TEMPLATE as MEASUREMENT
     from jaxvib.sweeps.study import TEMPLATE as STUDY
     from optimize.files import TEMPLATE as DESIGN
@@ -83,6 +85,8 @@ def simulate(
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE; --out keeps the motion (run.npz) and its picture."""
+    from jaxvib.ode.progress import ProgressBar  # slow to import, and --help needs none of it
+
     if csv is not None and window:
         raise InputError("--csv", "goes without --window, which keeps no trajectory to write")
     loaded = jv.load_scene(scene)
@@ -108,4 +112,6 @@ def simulate(
 
 def _long(scene: jv.Scene, until: str) -> bool:
     """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
+    from jaxvib.units import number
+
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

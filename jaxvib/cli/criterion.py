@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import jax
-import jax.numpy as jnp
-import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
-from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
-from jaxvib.steady.balance.states import balanced_intervals
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jaxvib.draw.style import SpeedUnit
 
-_RPM = 30.0 / np.pi
+_RPM = 30.0 / math.pi
 
 
 @app.command("criterion")
@@ -32,6 +28,9 @@ _RPM = 30.0 / np.pi
 @shared
 def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...], output: Output) -> None:
     """Where collected loads of SCENE stay together and where they spread and balance the rotor, by the empirical criterion."""
+    from jaxvib.steady.balance.criterion import criterion_table  # slow to import, and --help needs none of it
+    from jaxvib.steady.balance.states import balanced_intervals
+
     loaded = loaded_scene(scene, without)
     judged = jv.criterion(loaded)
     document = criterion_table(judged)
@@ -44,8 +43,13 @@ def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...
         document["exact_up_to"] = top
 
     def figure() -> Figure:
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+
         from jaxvib.draw.criterion import pull_chart
         from jaxvib.draw.style import panels
+        from jaxvib.steady.balance.criterion import criterion_functional
 
         crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import jax
-import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
-from jaxvib.results.status import sentence
-from jaxvib.steady.jams.jam import JUDGED
-from jaxvib.steady.jams.phases import degrees, growth_apart
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import SpeedUnit
 
-_RPM = 30.0 / np.pi
+_RPM = 30.0 / math.pi
 
 
 @app.command("modes")
@@ -46,6 +42,12 @@ def modes(
 
     Of a rotor, and with --phases: every jam of light loads at any phases; --out draws them over the loads' drag. --exact goes
     with platforms and with a rotor that does not tilt, where no load has a station of its own and nothing is out of balance."""
+    import jax  # slow to import, as what follows, and --help needs none of it
+    import numpy as np
+
+    from jaxvib.steady.jams.jam import JUDGED
+    from jaxvib.steady.jams.phases import growth_apart
+
     loaded = loaded_scene(scene, without)
     if speed is not None:
         loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
@@ -122,7 +124,7 @@ def modes(
 
 def _apart(growth: float) -> str:
     """What is known of a jam whose loads may part."""
-    return "not known" if np.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
+    return "not known" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:
@@ -133,6 +135,9 @@ def _left_out(scene: jv.Scene) -> list[str]:
 
 def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     """The jams of light loads at any phases."""
+    from jaxvib.results.status import sentence
+    from jaxvib.steady.jams.phases import degrees
+
     found = jv.phase_jams(scene)
     output.picture("phases.png", lambda: found.plot(unit=unit))
     jams = [found.select(k) for k in range(found.omega.shape[0])]
@@ -184,7 +189,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
     light = jv.jam_modes(scene)
     numbers = sorted({*light.mode_numbers(), *exact_mode_speeds(scene)})
     jams = {k: jv.jam_orbit(scene, mode=k, throw=False) for k in numbers}
-    known = {k: jam for k, jam in jams.items() if bool(np.isfinite(jam.rotor_speed))}
+    known = {k: jam for k, jam in jams.items() if math.isfinite(jam.rotor_speed)}
     diagram = jv.branches(scene, exact=True)
     output.picture("branches.png", lambda: diagram.plot(unit=unit))
     output.csv(csv, diagram, "point")

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import click
-import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import UNIT, Output, app, shared, table
 from jaxvib.cli.output import CSV
-from jaxvib.units import number
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import SpeedUnit
 
-_RPM = 30.0 / np.pi
+_RPM = 30.0 / math.pi
 
 
 @app.command("whirl")
@@ -32,6 +31,10 @@ def whirl(
     scene: Path, speed: str | None, loads: Literal["fixed", "none"], unit: SpeedUnit, csv: Path | None, output: Output
 ) -> None:
     """Whirl speeds of the rotor in SCENE, forward and backward, and its critical speeds; --out draws the Campbell diagram."""
+    import numpy as np  # slow to import, as what follows, and --help needs none of it
+
+    from jaxvib.units import number
+
     loaded = jv.load_scene(scene)
     rotor_speed = float(loaded.drive.speed) if speed is None else float(number(speed, "rad/s", "--speed", low=0.0))
     found = jv.whirl(loaded, [rotor_speed], loads=loads)

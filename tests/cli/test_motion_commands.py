@@ -13,8 +13,10 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.cli.app import _HOMES, app, run
-from jaxvib.machine.files import EFFECTS, SECTIONS
+from jaxvib.machine.files import EFFECTS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
+from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
+from jaxvib.study.stress.run import PRECISIONS
 
 DATA = pathlib.Path(__file__).parents[1] / "data"
 
@@ -193,3 +195,17 @@ def test_help_is_fast_and_says_of_each_command_what_the_command_itself_says():
         command = app.get_command(None, name)
         begins = command.get_short_help_str(30).removesuffix("...").split()[:4]
         assert " ".join(begins) in " ".join(said.split())
+
+
+def test_help_of_every_command_imports_nothing_slow_and_its_choices_are_those_of_the_library():
+    code = "import sys; from jaxvib.cli.app import _HOMES, run\n"
+    code += "for name in _HOMES: assert run([name, '--help']) == 0\nprint('numpy' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.endswith("False\n")
+    options = {
+        (name, p.name): tuple(getattr(p.type, "choices", ())) for name in _HOMES for p in app.get_command(None, name).params
+    }
+    assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
+    assert options["stress", "precisions"] == PRECISIONS
+    machines = tuple(name.replace("_", "-") for name in TEMPLATES)
+    assert options["new", "kind"] == (*machines, "design", "measurement", "sweep")

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.errors import InputError
-from jaxvib.study.audit.compared import EffectRow
-from jaxvib.study.audit.prices import PriceRow, prices
-from jaxvib.units import number
+
+if TYPE_CHECKING:
+    from jaxvib.study.audit.compared import EffectRow
+    from jaxvib.study.audit.prices import PriceRow
 
 
 @app.command("audit")
@@ -52,6 +53,8 @@ def audit(
     Each effect is taken out, and each that the scene has not and could have is put in with usual numbers. --out adds the
     figure."""
     if priced:
+        from jaxvib.study.audit.prices import prices  # slow to import, and --help needs none of it
+
         if scene is not None:
             raise InputError("--prices", "goes without a scene; leave one of them out")
         rows = prices()
@@ -59,6 +62,8 @@ def audit(
         return
     if scene is None:
         raise InputError("SCENE", "is missing; give the path of a scene file, or --prices")
+    from jaxvib.units import number
+
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
     possible = None if put_in else ()
     loaded = loaded_scene(scene, without)

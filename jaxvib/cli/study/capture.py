@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.motion.start import Turning
-from jaxvib.study.capture.capture import thrown_state
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from jaxvib.motion.start import Turning
 
 
 @app.command("capture")
@@ -46,6 +45,8 @@ def capture(
     output: Output,
 ) -> None:
     """From which initial speeds the balls in a torus of SCENE come to turn with the rotor; --out adds pictures."""
+    import numpy as np  # slow to import, and --help needs none of it
+
     if not -1.0 <= low < high <= 0.0:
         raise jv.InputError("--from", f"is {low:g} with --to {high:g}; speeds go up from -1 at least to 0 at most")
     loaded = jv.load_scene(scene)
@@ -56,6 +57,7 @@ def capture(
 
     def paths() -> Figure:
         from jaxvib.draw.capture import torus_paths
+        from jaxvib.study.capture.capture import thrown_state
 
         # One run just above the threshold, or from the highest speed where none was found.
         speed = min(high, float(found.threshold) + 2.0 * float(found.uncertainty)) if math.isfinite(found.threshold) else high

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.study.accuracy.cost import WANTED, Cost, CostRow
-from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS, Quantity
+
+if TYPE_CHECKING:
+    from jaxvib.study.accuracy.cost import Cost, CostRow
+    from jaxvib.study.accuracy.work_precision import Quantity
+
+_QUANTITIES = ("amplitude", "foundation_force", "final_state", "gradient")
+_SOLVERS = ("default", "Tsit5", "Dopri8")
+"""The names of `jaxvib.study.accuracy.work_precision`, whose import is slow."""
 
 
 @app.command("cost")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--quantity", type=click.Choice(QUANTITIES), default="amplitude", show_default=True, help="What is computed.")
+@click.option("--quantity", type=click.Choice(_QUANTITIES), default="amplitude", show_default=True, help="What is computed.")
 @click.option("--mode", type=int, help="Number of the jam mode [the last below the rotor's own speed that is stable].")
 @click.option(
     "--until", help="End of the time integration, such as 20s [20 slow periods; for a jam until it forgets its start]."
 )
 @click.option(
-    "--solver", "solvers", type=click.Choice(list(SOLVERS)), multiple=True, help="Method of time integration, repeatable [all]."
+    "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
 )
 @click.option("--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timings; the fastest counts.")
 @shared
@@ -35,14 +41,17 @@ def cost(
     output: Output,
 ) -> None:
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
-    chosen = solvers or tuple(SOLVERS)
-    found = jv.work_precision(jv.load_scene(scene), quantity, mode=mode, until=until, solvers=chosen, repeats=repeats)
+    found = jv.work_precision(
+        jv.load_scene(scene), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
+    )
     output.picture("cost.png", found.plot)
     output.done(cost_document(found), lambda: cost_table(found), "cost", found)
 
 
 def cost_document(cost: Cost) -> dict[str, Any]:
     """All of a `Cost` as JSON has it."""
+    from jaxvib.study.accuracy.cost import WANTED
+
     best = {f"{error:.0e}": cost.cheapest(error) for error in WANTED}
     return {
         "quantity": cost.quantity,
@@ -56,6 +65,8 @@ def cost_document(cost: Cost) -> dict[str, Any]:
 
 def cost_table(cost: Cost) -> str:
     """A `Cost` as a person reads it."""
+    from jaxvib.study.accuracy.cost import WANTED
+
     head = ["tier", "method", "precision", "setting", "error", "seconds", "first call, s"]
     rows = [
         [row.tier, row.method, row.dtype, row.setting, f"{row.error:.1e}", f"{row.seconds:.2e}", f"{row.compile:.2f}"]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import click
-import numpy as np
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.machine.files import Tables, read_toml
-from jaxvib.study.bearing.decrement import Estimate
-from jaxvib.study.bearing.measurement import measurement_from_tables
+
+if TYPE_CHECKING:
+    from jaxvib.machine.files import Tables
+    from jaxvib.study.bearing.decrement import Estimate
 
 Command = TypeVar("Command", bound=Callable)
 
@@ -45,6 +45,11 @@ def _named(command: Command) -> Command:
 def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     """Friction of a bearing from RECORD: a CSV file of time and angle of a pendulum that swings down on it, or a measurement
     file (TOML) that names one; options replace what the file says. --out adds the picture and the fit (fit.csv)."""
+    import numpy as np  # slow to import, as what follows, and --help needs none of it
+
+    from jaxvib.machine.files import read_toml
+    from jaxvib.study.bearing.measurement import measurement_from_tables
+
     is_file = record.suffix.lower() == ".toml"
     tables: Tables = read_toml(record) if is_file else {"record": {"file": record.name}}
     for name, value in given.items():

@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
 from jaxvib.errors import InputError
-from jaxvib.sweeps.execute import Progress
-from jaxvib.sweeps.sweep import Sweep, open_sweep, run_study
+
+if TYPE_CHECKING:
+    from jaxvib.sweeps.execute import Progress
+    from jaxvib.sweeps.sweep import Sweep
 
 _QUIET = 10.0
 """Seconds from one line of progress to the next where nobody looks on."""
@@ -38,7 +41,8 @@ def sweep(
 
     --out adds the figure that fits the study (sweep.png).
     """
-    from jaxvib.sweeps.study import load_study
+    from jaxvib.sweeps.study import load_study  # slow to import, as what follows, and --help needs none of it
+    from jaxvib.sweeps.sweep import run_study
 
     path = store or study.with_suffix(".zarr")
     if not resume and path.exists():
@@ -64,6 +68,8 @@ def sweep(
 def show(store: Path, measure: str | None, over: tuple[str, str] | None, theory: bool, output: Output) -> None:
     """Say what is in STORE, which `jaxvib sweep` wrote; --out adds its figures: map.png, shares.png, distribution.png,
     tornado.png, as far as they fit the study."""
+    from jaxvib.sweeps.sweep import open_sweep
+
     found = open_sweep(store)
     if output.folder is not None or output.report is not None:
         from jaxvib.sweeps.figures import figures
