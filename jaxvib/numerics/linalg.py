@@ -104,7 +104,8 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
     The vectors of equal eigenvalues, which are not unique, have derivative 0 among each other in place of NaN.
     """
     if square.shape[-1] > 3 or jnp.iscomplexobj(square):
-        return jnp.linalg.eigh(square)
+        values, vectors = jnp.linalg.eigh(square)  # a named pair, which its derivative could not be
+        return values, vectors
     return _small_modes(square)
 
 

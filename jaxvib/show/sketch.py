@@ -44,7 +44,7 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
         put(axis, part)
     for text in view.texts():
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
-    axis.set_title(caption(scene), loc="left", fontsize="small")
+    axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a place given, none is looked for at each drawing
     return figure if ax is None else ax
 
 

@@ -19,6 +19,7 @@ from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Numbers, numbers, traced
 
 if TYPE_CHECKING:
@@ -124,10 +125,13 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
     Source: Artyunin 2013, section IV; free motion of equation (1).
     """
     model = _two_directions(scene)
-    carrier = model.carrier
     speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
-    speeds = jnp.atleast_1d(speeds)
-    mass = _mass(model, loads)
+    return _whirl(model, jnp.atleast_1d(speeds), loads)
+
+
+@cached
+def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
+    carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
     part = _TIE * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
@@ -178,6 +182,7 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
     return _critical_speeds(_two_directions(scene), loads)
 
 
+@cached
 def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     carrier, mass = model.carrier, _mass(model, loads)
     inertia = mass if carrier.gyroscopic is None else mass - 1j * carrier.gyroscopic
