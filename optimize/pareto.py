@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 __all__ = ["Front", "pareto"]
 
 
+_ALIKE = 1e-6
+"""Machines whose quantities differ by less, relative, are one point."""
+
+
 class Front(Result):
     """Machines of which none is better in one quantity without being worse in the other.
 
@@ -84,7 +88,8 @@ def pareto(
 
     **Arguments**: `points` at most so many machines, the rest as `synthesize`.
 
-    **Returns** `Front`, machines with the least `first` first. **Raises** as `synthesize`.
+    **Returns** `Front`, machines with the least `first` first; a single one where it is the best of both. **Raises** as
+    `synthesize`.
     """
     count(points, "points", low=2)
 
@@ -98,13 +103,19 @@ def pareto(
     ends = [search(first, given), search(second, given)]
     (_, worst), (_, least) = (both(end) for end in ends)
     found = [ends[0]]
-    for limit in np.linspace(worst, least, points)[1:]:
+    # Where one machine is the best of both there is nothing to give up.
+    limits = [] if np.isclose(worst, least, rtol=_ALIKE, atol=0.0) else np.linspace(worst, least, points)[1:]
+    for limit in limits:
         try:
             found.append(search(first, [*given, second < float(limit)]))
         except ComputationError:  # the least value itself may be out of reach by a rounding
             continue
     values = np.asarray([both(each) for each in found])
-    kept = [k for k in range(len(values)) if not np.any(np.all(values < values[k] * (1.0 - 1e-9 * np.sign(values[k])), axis=1))]
+    kept: list[int] = []
+    for k, own in enumerate(values):
+        beaten = np.any(np.all(values < own * (1.0 - 1e-9 * np.sign(own)), axis=1))
+        if not beaten and not any(np.allclose(values[j], own, rtol=_ALIKE, atol=0.0) for j in kept):
+            kept.append(k)
     return Front(
         values=values[kept],
         names=(first.words, second.words),

@@ -186,6 +186,8 @@ def solid_and_dashed(
     sparse = {"marker": marker, "markevery": 0.11, "ms": 4.0, "mfc": "white"} if marker else {}
     labelled = False
     for start, stop in zip([0, *cuts], [*(cuts + 1), len(x)], strict=True):
+        if not np.any(np.isfinite(x[start:stop]) & np.isfinite(y[start:stop])):
+            continue  # matplotlib places no marks on a line without a point
         solid = bool(stable[start])
         name = label if solid and not labelled else None
         labelled = labelled or solid

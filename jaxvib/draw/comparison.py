@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
-from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
 __all__ = [
     "CostPanel",
@@ -39,6 +39,8 @@ def tiers_chart(
         axes.loglog(mass[stable], values[stable], mark, color=color, ms=5)
         axes.loglog(mass[~stable], values[~stable], mark, color=color, mfc="white", ms=5)
     axes.plot([], [], "o", color="black", mfc="white", label="hollow: unstable")
+    log_ticks(axes, "x")
+    log_ticks(axes)
     axes.set_xlabel("mass of a load, kg")
     axes.set_ylabel("leading order against exact, relative")
     legend_above(axes)
@@ -141,9 +143,11 @@ def stability_chart(
     height = np.broadcast_to(value[:, None], omega.shape)
     if value.size > 1:
         axes.contourf(speed_scale(unit) * omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])
-        axes.set_yscale("log" if value[0] > 0.0 and value[-1] > 3.0 * value[0] else "linear")
+        if value[0] > 0.0 and value[-1] > 3.0 * value[0]:
+            axes.set_yscale("log")
+            log_ticks(axes)
     for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
-        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
+        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind, clip_on=False)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)
@@ -182,6 +186,7 @@ def audit_chart(
         left.plot(np.maximum(100.0 * values, low), place, mark, color=color, ms=6, alpha=0.85, label=name)
     left.set_xscale("log")
     left.set_xlim(left=low)
+    log_ticks(left, "x")
     left.axvline(100.0 * accuracy, color="black", ls=":", lw=1.2, label="accuracy asked for")
     left.set_yticks(place, labels)
     left.set_ylim(n - 0.4, -0.6)

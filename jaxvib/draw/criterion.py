@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import GUIDE, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
 __all__ = ["agreement_maps", "pull_chart"]
 
@@ -46,6 +46,7 @@ def agreement_maps(
         axis.pcolormesh(speed_scale(unit) * speed, height, both, cmap=colours, norm=norm, shading="nearest", rasterized=True)
         if np.size(height) > 1:
             axis.set_yscale("log")
+            log_ticks(axis)
         axis.set_xlabel(f"rotor speed, {unit}")
         axis.set_title(title, loc="right", fontsize="medium")
     axes[0].set_ylabel("load mass, times the scene's")

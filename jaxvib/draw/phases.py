@@ -9,7 +9,19 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jaxvib.draw.charts import solid_and_dashed
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, OPERATING, UNSTABLE, Drawn, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import (
+    COLORS,
+    GUIDE,
+    MARKERS,
+    OPERATING,
+    UNSTABLE,
+    Drawn,
+    SpeedUnit,
+    legend_above,
+    log_ticks,
+    panels,
+    speed_scale,
+)
 
 __all__ = ["drag_diagram"]
 
@@ -59,6 +71,7 @@ def drag_diagram(
     axis.set_xscale("log")
     if within is not None:
         axis.set_xlim(at / within, at * within)
+    log_ticks(axis, "x")
     axis.set_ylim(0.0, 1.05 * scale * rotor_speed)
     axis.set_xlabel(label)
     axis.set_ylabel("speed of loads, " + unit)

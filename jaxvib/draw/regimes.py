@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxvib.draw.style import COLORS, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import COLORS, Drawn, Onto, SpeedUnit, legend_above, log_ticks, panels, speed_scale
 
 __all__ = ["regime_chart"]
 
@@ -56,5 +56,6 @@ def regime_chart(
     bottom.set_ylabel(f"speed of loads, {unit}")
     bottom.set_xlabel("drag, N s/m")
     bottom.set_xscale("log")
+    log_ticks(bottom, "x")
     legend_above(bottom)
     return figure if ax is None else ax

@@ -8,7 +8,19 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Onto, SpeedUnit, legend_above, panels, speed_scale
+from jaxvib.draw.style import (
+    COLORS,
+    GUIDE,
+    MARKERS,
+    STROKES,
+    Drawn,
+    Onto,
+    SpeedUnit,
+    legend_above,
+    log_ticks,
+    panels,
+    speed_scale,
+)
 
 __all__ = [
     "growth_chart",
@@ -61,6 +73,7 @@ def modes_chart(
     bottom.set_xlabel("number of the jam mode")
     if np.any(amplitude > 0.0):
         bottom.set_yscale("log")
+        log_ticks(bottom)
     bottom.set_xticks(mode)
     return figure if ax is None else ax
 

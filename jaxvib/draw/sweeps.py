@@ -10,7 +10,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxvib.draw.style import COLORS, Drawn, panels
+from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
 
 __all__ = ["distribution_chart", "label_map", "points_over", "shares_chart", "tornado_chart", "value_map"]
 
@@ -75,8 +75,10 @@ def _scales(axis: Axes, across: str, up: str, log: tuple[bool, bool]) -> None:
     axis.set_ylabel(up)
     if log[0]:
         axis.set_xscale("log")
+        log_ticks(axis, "x")
     if log[1]:
         axis.set_yscale("log")
+        log_ticks(axis)
 
 
 def value_map(

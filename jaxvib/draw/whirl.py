@@ -46,7 +46,7 @@ def campbell_diagram(
     axis.plot([0.0, top], [0.0, top], color=GUIDE, lw=0.9, ls=":", label="whirl speed = rotor speed")
     if critical is not None:
         _critical_marks(axis, scale * critical[0], critical[1], right, top)
-        axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds, {unit}", ls="")
+        axis.plot([], [], "o", ms=6.0, mfc="white", mec="black", label=f"critical speeds (no damping), {unit}", ls="")
     if at is not None:
         axis.axvline(scale * at, label="operating speed", **OPERATING)
     left = scale * float(np.min(rotor_speed)) if len(rotor_speed) > 1 else 0.0

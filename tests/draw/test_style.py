@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxvib as jv
-from jaxvib.draw.charts import before_after, branch_diagram
+from jaxvib.draw.charts import before_after, branch_diagram, solid_and_dashed
 from jaxvib.draw.motion.histories import band, time_histories
 from jaxvib.draw.style import COLORS, legend_above, numbered, panels
 
@@ -98,6 +98,23 @@ def test_more_than_two_coordinates_have_a_panel_each_and_panels_are_chosen():
     assert np.isin(axis.lines[0].get_ydata(), omega**3).all()
     with pytest.raises(jv.InputError, match=r"show is \('power',\); it names some of: speed, amplitude, force"):
         diagram(show=("power",))
+
+
+def test_a_stretch_without_a_point_is_left_out_and_the_rest_drawn():
+    axis = panels(1)[1][0]
+    there = np.where(np.arange(20) < 10, 1.0, np.nan)
+    solid_and_dashed(axis, there, there, np.arange(20) < 12, "black", "loads", marker="o")
+    axis.figure.canvas.draw()
+    assert [line.get_label() for line in axis.lines] == ["loads"]
+
+
+def test_a_logarithmic_axis_reaches_down_to_what_matters():
+    speed = np.linspace(0.1, 20.0, 400)
+    omega = 0.5 * speed
+    force = omega**4 / ((1.0 - (omega / 4.0) ** 2) ** 2 + 1e-2)
+    own = dict(amplitude=force[:, None], force=force, resonances=np.array([4.0]), names=("y1",))
+    low, high = branch_diagram(speed, omega, omega > 0.0, **own).axes[2].get_ylim()
+    assert low == pytest.approx(0.5 * np.min(force[omega > 2.0])) and high > np.max(force) and np.min(force) < 1e-5 * low
 
 
 def test_a_band_holds_the_signal_and_the_last_periods_are_the_signal():

@@ -28,6 +28,8 @@ def test_a_front_holds_the_machines_between_two_best_ones():
     np.testing.assert_allclose(np.sqrt(np.abs(front.values)).sum(axis=1), 4.0, atol=1e-4)  # the root of a rounding near 0
     np.testing.assert_allclose(front.scene(1).machine.stiffness[1], 5e4, rtol=1e-5)
     assert "distance to [2.0, 5.0] against" in front.summary()
+    both = pareto(space, distance([2.0, 5.0]), distance([2.0, 5.0]) + 1.0, points=4, starts=4)
+    assert len(both.values) == len(both.machines) == 1  # one machine is the best of both
 
 
 def test_one_spring_is_chosen_to_be_exchanged():
