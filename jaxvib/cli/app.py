@@ -175,7 +175,8 @@ def run(arguments: list[str]) -> int:
         # a command that computed all it was asked, and found a failure, exits by itself with its code
         return app.main(args=arguments, prog_name="jaxvib", standalone_mode=False, obj=tuple(arguments)) or 0
     except InputError as error:
-        return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": str(error)})
+        message = f"{error}{_way_out(arguments, error)}"
+        return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
         return _failed(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
     except click.exceptions.NoArgsIsHelpError as error:
@@ -201,6 +202,15 @@ def run(arguments: list[str]) -> int:
         return stop.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _failed(wants_json, 1, {"kind": "computation", "status": "interrupted", "message": "interrupted"})
+
+
+def _way_out(arguments: list[str], error: InputError) -> str:
+    """How a command's --without leaves out the effect that it refuses; nothing of other errors."""
+    table, _, effect = error.field.partition(".")
+    command = app.commands.get(arguments[0]) if arguments else None
+    if table != "effects" or not effect.isidentifier() or command is None:
+        return ""
+    return f" (--without {effect})" if any(option.name == "without" for option in command.params) else ""
 
 
 def _failed(wants_json: bool, code: int, error: dict[str, Any]) -> int:

@@ -127,7 +127,7 @@ def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]
                 axis.plot(gap, speed, color=COLORS[(k - 1) % len(COLORS)], label=name, **look)
         axis.set_title(title, loc="right", fontsize="medium")
         axis.set_xlabel("gap, in eccentricities")
-        axis.set_ylabel("least initial speed")
+        axis.set_ylabel("least initial speed relative\nto the rotor, in its speed")
         axis.set_ylim(-1.03, 0.0)
     legend_above(axes[0], 2)
     return figure if ax is None else ax

@@ -80,7 +80,8 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     handles += [Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"), Patch(color=_FLOOR)]
     told = ["cheapest within " + ", ".join(f"{error:.0e}" for error in wanted), "reference's own error"]
     if ax is None:
-        figure.legend(handles, [*names, *told], loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
+        place: Any = {"loc": "outside upper left", "ncols": 3 * columns, "frameon": False, "fontsize": "small"}
+        figure.legend(handles, [*names, *told], **place)
     else:
         legend_above(cells[0], 2, handles=handles, labels=[*names, *told])
     return figure if ax is None else ax

@@ -262,6 +262,13 @@ def test_failures_have_their_exit_code_and_one_sentence(typed, tmp_path, words, 
     assert says in err and err.count("\n") == 1
 
 
+def test_an_effect_that_a_command_refuses_is_told_with_the_option_that_leaves_it_out(typed, tmp_path):
+    (tmp_path / "rotor.toml").write_text(TEMPLATES["planar_rotor"])
+    for words, effect in ((("criterion",), "gravity"), (("envelope", "--until", "2s"), "static_imbalance")):
+        code, out, err = typed(words[0], "rotor.toml", *words[1:])
+        assert (code, out) == (2, "") and err.endswith(f" (--without {effect})\n")
+
+
 def test_failure_with_json_is_one_document(typed):
     code, out, _ = typed("simulate", "machine.toml", "--until", "9s", "--max-steps", "50", "--json")
     error = json.loads(out)["error"]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared
+from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared
 from jaxvib.cli.motion.document import chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
@@ -57,6 +57,7 @@ def settle(
 @_MODE
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-4].")
+@WITHOUT
 @CSV
 @shared
 def envelope(
@@ -66,11 +67,12 @@ def envelope(
     mode: int | None,
     spin_up: str | None,
     tolerance: float | None,
+    without: tuple[str, ...],
     csv: Path | None,
     output: Output,
 ) -> None:
     """Integrate the averaged equations of SCENE: long run-ups in steps of many turns; --out keeps them (envelope.npz)."""
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene, without)
     begin = ("rest" if mode is None else "jam") if start is None else start
     steps = None if tolerance is None else jv.Tolerance(tolerance)
     run = jv.envelope(loaded, until, start=begin, mode=mode, spin_up=spin_up, stepsize_controller=steps)
