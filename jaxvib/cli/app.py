@@ -19,15 +19,19 @@ from jaxvib.errors import ComputationError, InputError
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
 
-__all__ = ["UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
+__all__ = ["SPEED", "UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
 
 
-def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
-    """The scene of a file, the effects of the kinds `without` left out. **Raises** `InputError` for one that it has not."""
-    from jaxvib.machine.files import load_scene  # slow to import, and --help needs none of it
+def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None) -> Scene:
+    """The scene of a file, the effects of the kinds `without` left out, at a constant `speed` of the rotor where one is given.
+    **Raises** `InputError` for an effect that it has not, and for what is no speed."""
+    from jaxvib.machine.drive import ConstantSpeed  # slow to import, as what follows, and --help needs none of it
+    from jaxvib.machine.files import load_scene
     from jaxvib.machine.scene import Scene
 
     scene = load_scene(path)
+    if speed is not None:
+        scene = Scene(scene.machine, scene.loads, ConstantSpeed(speed), scene.effects)
     there = [effect.kind for effect in scene.effects]
     for kind in without:
         if kind not in there:
@@ -38,6 +42,10 @@ def loaded_scene(path: Path, without: Sequence[str]) -> Scene:
 
 WITHOUT = click.option("--without", multiple=True, metavar="EFFECT", help="Leave out an effect of SCENE, such as gravity.")
 """The option of commands whose theories do not know every effect."""
+
+
+SPEED = click.option("--speed", help="Constant rotor speed in place of the scene's drive, such as '1200 rpm'.")
+"""The option of commands that ask what a machine does at a constant speed."""
 
 
 UNIT = click.option(
@@ -205,12 +213,13 @@ def run(arguments: list[str]) -> int:
 
 
 def _way_out(arguments: list[str], error: InputError) -> str:
-    """How a command's --without leaves out the effect that it refuses; nothing of other errors."""
-    table, _, effect = error.field.partition(".")
+    """The option of a command that leaves out the effect, or replaces the drive, that it refuses; nothing of other errors."""
+    table, _, name = error.field.partition(".")
     command = app.commands.get(arguments[0]) if arguments else None
-    if table != "effects" or not effect.isidentifier() or command is None:
-        return ""
-    return f" (--without {effect})" if any(option.name == "without" for option in command.params) else ""
+    options = [] if command is None else [option.name for option in command.params]
+    if table == "effects" and name.isidentifier() and "without" in options:
+        return f" (--without {name})"
+    return " (--speed gives one)" if table == "drive" and name in ("", "kind") and "speed" in options else ""
 
 
 def _failed(wants_json: bool, code: int, error: dict[str, Any]) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import UNIT, WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.app import SPEED, UNIT, WITHOUT, Output, app, loaded_scene, shared, table
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
@@ -21,7 +21,7 @@ _RPM = 30.0 / math.pi
 
 @app.command("modes")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--speed", help="Rotor speed in place of the scene's, such as '1200 rpm'.")
+@SPEED
 @UNIT
 @click.option("--exact", is_flag=True, help="Periodic motions of the full equations in place of light loads' jams.")
 @click.option("--phases", is_flag=True, help="Jams of light loads at any phases; for a rotor always so but with --exact.")
@@ -48,9 +48,7 @@ def modes(
     from jaxvib.steady.jams.jam import JUDGED
     from jaxvib.steady.jams.phases import growth_apart
 
-    loaded = loaded_scene(scene, without)
-    if speed is not None:
-        loaded = jv.Scene(loaded.machine, loaded.loads, jv.ConstantSpeed(speed), loaded.effects)
+    loaded = loaded_scene(scene, without, speed)
     if exact and phases:
         raise InputError("--phases", "goes without --exact: jams at unequal phases are known for light loads only")
     if exact:

@@ -99,7 +99,9 @@ def growth(
     """
     scene = checked(scene)
     if not scene.drive.constant:
-        raise InputError("drive", f"is {scene.drive.kind!r}; how disturbances grow is asked under a constant speed only")
+        raise InputError(
+            "drive", f"is {scene.drive.kind!r}; how disturbances grow is asked under a constant speed: use ConstantSpeed"
+        )
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
     end = float(number(until, "s", "until", low=0.0, open_low=True))

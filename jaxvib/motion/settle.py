@@ -62,7 +62,7 @@ def settle(
     """
     scene = checked(scene)
     if not scene.drive.constant:
-        raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed only")
+        raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
     drift = (1e-6 if double else 1e-3) if drift is None else drift

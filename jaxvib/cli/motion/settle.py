@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared
+from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
 from jaxvib.cli.motion.document import chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
@@ -29,6 +29,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @click.option("--drift", type=float, help="Relative change that counts as none [1e-6].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
+@SPEED
 @shared
 def settle(
     scene: Path,
@@ -37,10 +38,11 @@ def settle(
     drift: float | None,
     tolerance: float | None,
     stretches: int,
+    speed: str | None,
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change; --out keeps the last stretch."""
-    loaded = jv.load_scene(scene)
+    loaded = loaded_scene(scene, speed=speed)
     steps = chosen_steps(tolerance, None)
     run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
     output.picture("history.png", run.plot)
@@ -90,13 +92,17 @@ def envelope(
 @click.option("--until", required=True, help="How long all stretches are together, such as 60s.")
 @_START
 @_MODE
+@SPEED
 @click.option("--stretches", type=int, default=40, show_default=True, help="Into how many stretches it is cut, 8 at least.")
 @shared
-def growth(scene: Path, until: str, start: Start | None, mode: int | None, stretches: int, output: Output) -> None:
+def growth(
+    scene: Path, until: str, start: Start | None, mode: int | None, speed: str | None, stretches: int, output: Output
+) -> None:
     """How fast motions of SCENE part that begin next to each other: regular or chaotic, and what derivatives are worth."""
     if start == "spin_up":
         raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
     begin = ("rest" if mode is None else "jam") if start is None else start
-    found = jv.growth(jv.load_scene(scene), until, start=begin, mode=mode, stretches=stretches)
+    loaded = loaded_scene(scene, speed=speed)
+    found = jv.growth(loaded, until, start=begin, mode=mode, stretches=stretches)
     output.picture("growth.png", found.plot)
     output.done(found.as_dict(), found.summary, "growth", found)

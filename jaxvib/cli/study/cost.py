@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import jaxvib as jv
-from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.app import SPEED, Output, app, loaded_scene, shared, table
 
 if TYPE_CHECKING:
     from jaxvib.study.accuracy.cost import Cost, CostRow
@@ -30,6 +30,7 @@ _SOLVERS = ("default", "Tsit5", "Dopri8")
     "--solver", "solvers", type=click.Choice(_SOLVERS), multiple=True, help="Method of time integration, repeatable [all]."
 )
 @click.option("--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timings; the fastest counts.")
+@SPEED
 @shared
 def cost(
     scene: Path,
@@ -38,11 +39,12 @@ def cost(
     until: str | None,
     solvers: tuple[str, ...],
     repeats: int,
+    speed: str | None,
     output: Output,
 ) -> None:
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
     found = jv.work_precision(
-        jv.load_scene(scene), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
+        loaded_scene(scene, speed=speed), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
     )
     output.picture("cost.png", found.plot)
     output.done(cost_document(found), lambda: cost_table(found), "cost", found)
