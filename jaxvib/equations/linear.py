@@ -172,9 +172,8 @@ def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
         raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
     loads, drive = scene.loads, scene.drive
     if not loads.circular:
-        raise InputError(
-            "loads.kind", f"is {loads.kind!r}; this holds for loads on a circle (property circular): ball, roller, pendulum"
-        )
+        holds = "this holds for loads on a circle (property circular): ball, roller, pendulum"
+        raise InputError("loads.kind", f"is {loads.kind!r}; {holds}; simulate others")
     if not drive.ideal:
         raise InputError(
             "drive.kind",

@@ -143,7 +143,10 @@ def run_ups(
     """
     scene = checked(scene)
     if not scene.loads.circular:
-        raise InputError("loads.kind", f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle")
+        raise InputError(
+            "loads.kind",
+            f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle; of balls in a torus ask capture",
+        )
     loads = cast(CircularLoads, scene.loads)
     given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)
     if drag is None and given.ndim:
