@@ -89,7 +89,7 @@ class View(abc.ABC):
 class PlatformView(View):
     """Platforms above each other, numbered from the bed upward, each spring in a lane of its own."""
 
-    pitch, thick, lane = 1.9, 0.34, 1.75
+    pitch, thick, lane = 1.9, 0.34, 2.0
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
