@@ -17,6 +17,7 @@ from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, 
 from jaxvib.machine.effects.registry import EFFECTS
 from jaxvib.machine.loads import balls, pendulums, rollers
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
+from jaxvib.machine.rotor import TEMPLATES as ROTORS
 from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TEMPLATE as TORUS
@@ -311,31 +312,6 @@ speed = "{speed}"
 # cubic_support = [{{ stiffness = 1e9, platform = 1 }}]
 """
 
-_ROTOR = """
-[loads]
-kind = "pendulum"           # ball, roller, pendulum
-count = 4
-mass = "50 g"               # of one load
-radius = "80 mm"            # of the mass centre from the axis
-drag = 0.14                 # N s/m at that radius; a bearing's viscous friction mu (N m s) is drag = mu / radius^2
-# inertia = 0.0             # kg m^2 about the mass centre, pendulums only
-
-[drive]
-kind = "run_up"             # constant_speed, spin_up, run_up, dc_motor, induction_motor
-speed = "460 rad/s"
-acceleration = 230.0        # rad/s^2
-
-[effects]                   # only what the scene calls for; an empty table is the usual case
-gravity = true              # gravity on the loads
-static_imbalance = { moment = "8 g m" }
-# moment_imbalance = { moment = 1e-4 }    # kg m^2
-# dry_friction = { coefficient = 0.0015, diameter = "12 mm" }
-# [[effects.stop]]
-# position = 0.165
-# stiffness = 1e7
-# gap = "1 mm"
-"""
-
 TEMPLATES: dict[str, str] = {
     "one_mass": """# A platform on a support; the auto-balancer's loads shake it.
 # Numbers are SI; text may carry any unit of the same dimension.
@@ -383,29 +359,7 @@ link_damping = [20.0, 20.0, 20.0]
 exciter = 4                           # the platform with the auto-balancer
 """
     + _REST.format(speed="1500 rpm"),
-    "planar_rotor": """# A rotor on one support that is alike across and up; it does not tilt.
-# Numbers are SI; text may carry any unit of the same dimension.
-[machine]
-kind = "planar_rotor"
-mass = 37.0                 # kg, auto-balancer's body included, loads not counted
-stiffness = "1160 N/mm"     # of the support, across and up
-damping = 840.0             # N s/m
-"""
-    + _ROTOR,
-    "rotor": """# A rigid rotor on two supports; it moves across and up and tilts both ways.
-# Numbers are SI; text may carry any unit of the same dimension. Places along the axis are counted from the mass centre.
-[machine]
-kind = "rotor"
-mass = 37.0                               # kg, loads not counted
-transverse_inertia = 0.479                # kg m^2, about an axis across, loads not counted
-polar_inertia = 0.093                     # kg m^2, about the axis of rotation
-stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
-damping = [439.0, 404.0]                  # N s/m
-position = [0.165, -0.155]                # m, of the supports
-stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number where all run in one plane
-# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of what the supports make
-"""
-    + _ROTOR,
+    **ROTORS,
     "torus": TORUS,
 }
 """A commented scene file for every kind of machine, and for a rotor whose balls run in a torus."""

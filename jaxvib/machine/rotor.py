@@ -13,7 +13,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.units import Number, Numbers, number, numbers, traced
 
-__all__ = ["PlanarRotor", "Rotor", "planar_rotor", "rotor"]
+__all__ = ["TEMPLATES", "PlanarRotor", "Rotor", "planar_rotor", "rotor"]
 
 
 class Rotor(Machine):
@@ -212,3 +212,56 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
         damping=number(damping, "N s/m", "machine.damping", low=0.0),
         kind="planar_rotor",
     )
+
+
+_ROTOR = """
+[loads]
+kind = "pendulum"           # ball, roller, pendulum
+count = 4
+mass = "50 g"               # of one load
+radius = "80 mm"            # of the mass centre from the axis
+drag = 0.14                 # N s/m at that radius; a bearing's viscous friction mu (N m s) is drag = mu / radius^2
+# inertia = 0.0             # kg m^2 about the mass centre, pendulums only
+
+[drive]
+kind = "run_up"             # constant_speed, spin_up, run_up, dc_motor, induction_motor
+speed = "460 rad/s"
+acceleration = 230.0        # rad/s^2
+
+[effects]                   # only what the scene calls for; an empty table is the usual case
+gravity = true              # gravity on the loads
+static_imbalance = { moment = "8 g m" }
+# moment_imbalance = { moment = 1e-4 }    # kg m^2
+# dry_friction = { coefficient = 0.0015, diameter = "12 mm" }
+# [[effects.stop]]
+# position = 0.165
+# stiffness = 1e7
+# gap = "1 mm"
+"""
+
+TEMPLATES = {
+    "planar_rotor": """# A rotor on one support that is alike across and up; it does not tilt.
+# Numbers are SI; text may carry any unit of the same dimension.
+[machine]
+kind = "planar_rotor"
+mass = 37.0                 # kg, auto-balancer's body included, loads not counted
+stiffness = "1160 N/mm"     # of the support, across and up
+damping = 840.0             # N s/m
+"""
+    + _ROTOR,
+    "rotor": """# A rigid rotor on two supports; it moves across and up and tilts both ways.
+# Numbers are SI; text may carry any unit of the same dimension. Places along the axis are counted from the mass centre.
+[machine]
+kind = "rotor"
+mass = 37.0                               # kg, loads not counted
+transverse_inertia = 0.479                # kg m^2, about an axis across, loads not counted
+polar_inertia = 0.093                     # kg m^2, about the axis of rotation
+stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
+damping = [439.0, 404.0]                  # N s/m
+position = [0.165, -0.155]                # m, of the supports
+stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number where all run in one plane
+# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of what the supports make
+"""
+    + _ROTOR,
+}
+"""A commented scene file for each kind of rotor."""

@@ -88,7 +88,7 @@ class Run(AbstractMeasured, Result):
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
-        glued = "  all loads ran at one angle, as they started: whether they would stay so was not tested; start them apart ('3 deg')"
+        glued = "  all loads ran at one angle, as they started: whether they would stay so was not tested; give apart='3 deg'"
         return "\n".join(
             [
                 f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
