@@ -164,11 +164,11 @@ scene = "machine.toml"            # path of the scene file, from here
 [free]                            # bounds, SI or with units; of every support, also of one that is not there yet (0);
                                   # machine.stiffness[0] frees one entry only
 "machine.stiffness" = ["10 N/mm", "200 N/mm"]
-"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]
+"machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # of a single platform leave this line out
 
 [[hold]]                          # keeps its value during the search
 quantity = "jam_frequency"        # or amplitude, foundation_force, support_frequency_squared, total
-mode = 3                          # jam modes go by resonance: 2 r - 1 is the jam just below resonance r
+mode = 3                          # jam modes go by resonance: 2 r - 1 is the jam just below resonance r (1 of one platform)
 value = "570 rpm"                 # left out: what it is in the scene
 
 [[hold]]
@@ -193,7 +193,7 @@ quantity = "support_frequency_squared"   # the sum of k/M over the supports: how
 # statistic = "worst"             # the worst of them; "expected": the mean
 quantity = "force_per_amplitude"  # or amplitude, foundation_force, jam_frequency
 mode = 3
-of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); a number: that platform's own
+of = [1, 2]                       # amplitude of platform 1 (y1) relative to platform 2 (y2); 1 alone: that platform's own
 # maximize = true
 
 [search]
