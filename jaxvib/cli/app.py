@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["SPEED", "UNIT", "WITHOUT", "Output", "app", "loaded_scene", "run", "shared", "table"]
 
 
-def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None) -> Scene:
-    """The scene of a file, the effects of the kinds `without` left out, at a constant `speed` of the rotor where one is given.
-    **Raises** `InputError` for an effect that it has not, and for what is no speed."""
+def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = None, *, constant: bool = False) -> Scene:
+    """The scene of a file, the effects of the kinds `without` left out, at a constant `speed` of the rotor where one is given;
+    where it shall be `constant`, at the speed that a run-up ends at, which is then said. **Raises** `InputError` for an effect
+    that the scene has not, and for what is no speed."""
     from jaxvib.machine.drive import ConstantSpeed  # slow to import, as what follows, and --help needs none of it
     from jaxvib.machine.files import load_scene
     from jaxvib.machine.scene import Scene
@@ -32,6 +33,10 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     scene = load_scene(path)
     if speed is not None:
         scene = Scene(scene.machine, scene.loads, ConstantSpeed(speed), scene.effects)
+    elif constant and scene.drive.ideal and not scene.drive.constant:
+        end = float(scene.drive.speed)
+        click.echo(f"at a constant speed of {end:.6g} rad/s, at which the drive ({scene.drive.kind}) ends", err=True)
+        scene = Scene(scene.machine, scene.loads, ConstantSpeed(end), scene.effects)
     there = [effect.kind for effect in scene.effects]
     for kind in without:
         if kind not in there:

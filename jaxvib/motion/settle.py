@@ -15,7 +15,7 @@ from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import count
+from jaxvib.units import count, number
 
 __all__ = ["settle"]
 
@@ -65,7 +65,8 @@ def settle(
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
-    drift = (1e-6 if double else 1e-3) if drift is None else drift
+    usual = 1e-6 if double else 1e-3
+    drift = usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True))
     chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
     start = ("rest" if mode is None else "jam") if start is None else start
     if isinstance(start, State):

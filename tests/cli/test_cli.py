@@ -268,8 +268,10 @@ def test_what_a_command_refuses_of_a_scene_is_told_with_the_option_that_takes_it
         (["criterion"], "--without gravity"),
         (["envelope", "--until", "2s"], "--without static_imbalance"),
         (["modes", "--exact"], "--without static_imbalance"),
-        (["settle"], "--speed gives one"),
-        (["growth", "--until", "2s"], "--speed gives one"),
+        (
+            ["settle", "--drift", "-1"],
+            "at a constant speed of 460 rad/s, at which the drive (run_up) ends\njaxvib: drift is -1",
+        ),
         (["growth", "--until", "2s", "--speed", "0"], "drive.speed is 0 rad/s; it must be greater than 0"),
     ):
         code, out, err = typed(words[0], "rotor.toml", *words[1:])

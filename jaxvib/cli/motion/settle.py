@@ -42,7 +42,7 @@ def settle(
     output: Output,
 ) -> None:
     """Integrate the full equations of SCENE until amplitudes and speeds no longer change; --out keeps the last stretch."""
-    loaded = loaded_scene(scene, speed=speed)
+    loaded = loaded_scene(scene, speed=speed, constant=True)
     steps = chosen_steps(tolerance, None)
     run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
     output.picture("history.png", run.plot)
@@ -102,7 +102,7 @@ def growth(
     if start == "spin_up":
         raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
     begin = ("rest" if mode is None else "jam") if start is None else start
-    loaded = loaded_scene(scene, speed=speed)
+    loaded = loaded_scene(scene, speed=speed, constant=True)
     found = jv.growth(loaded, until, start=begin, mode=mode, stretches=stretches)
     output.picture("growth.png", found.plot)
     output.done(found.as_dict(), found.summary, "growth", found)
