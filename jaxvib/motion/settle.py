@@ -88,7 +88,7 @@ def settle(
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
-            "it may have no steady state here, otherwise allow more stretches",
+            "it may have no steady state here, otherwise allow more stretches or a larger drift",
         )
     if throw and mode is not None:
         _require_mode(scene, run, mode)
