@@ -173,7 +173,7 @@ def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
     loads, drive = scene.loads, scene.drive
     if not loads.circular:
         holds = "this holds for loads on a circle (property circular): ball, roller, pendulum"
-        raise InputError("loads.kind", f"is {loads.kind!r}; {holds}; simulate others")
+        raise InputError("loads.kind", f"is {loads.kind!r}, and {holds}; simulate others")
     if not drive.ideal:
         raise InputError(
             "drive.kind",
