@@ -44,7 +44,7 @@ def cost(
 ) -> None:
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
     found = jv.work_precision(
-        loaded_scene(scene, speed=speed, constant=True),
+        loaded_scene(scene, speed=speed),
         quantity,
         mode=mode,
         until=until,
