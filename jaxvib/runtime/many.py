@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
+from jaxvib.runtime.devices import shared_devices
 
 __all__ = ["cores", "in_chunks", "in_parallel"]
 
@@ -52,7 +53,7 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
     >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
     [(1, 1), (2, 4), (3, 9)]
     """
-    left, devices = iter(items), itertools.cycle(_devices())
+    left, devices = iter(items), itertools.cycle(shared_devices())
     alike = _same_options(function)
     for first in left:
         yield first, alike(first, next(devices))
@@ -75,16 +76,6 @@ def _finished(running: dict[Future[Found], Item]) -> Generator[tuple[Item, Found
     ended, _ = wait(running, return_when=FIRST_COMPLETED)
     for future in ended:
         yield running.pop(future), future.result()
-
-
-def _devices() -> list[object]:
-    """The accelerators that share the work; None where there is one device alone, or one that the caller chose.
-
-    Processors are one device, however many XLA was told to make of them: their cores are shared by the threads.
-    """
-    found = jax.local_devices()
-    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
 
 
 def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:

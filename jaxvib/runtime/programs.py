@@ -94,8 +94,9 @@ class _CachedFunction(Generic[P, T]):
 
     def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
-            if leaf.sharding.device_set != {jax.devices()[0]}:
-                raise Undescribable("an array is not on the first device")
+            device, *others = leaf.sharding.device_set
+            if others or device.platform != jax.devices()[0].platform:
+                raise Undescribable("an array is not on one device of the kind that is used first")
             return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
 
         asked = describe(jax.tree.unflatten(treedef, leaves), abstract)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.runtime.devices import take_a_device
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
 from jaxvib.sweeps.status import CASE_STATUSES
@@ -91,6 +92,7 @@ def _remote(study: Study, chunk: int, key: str, wanted: dict[str, str], precise:
         if wanted[name] != version:
             return f"has {name} {version}, and the store was begun with {wanted[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
+    take_a_device()
     if key not in _STUDIES:  # the first copy that came here is kept, whose functions the program was compiled for
         _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
     return compute(_STUDIES[key], chunk)
