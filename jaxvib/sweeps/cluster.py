@@ -55,7 +55,7 @@ def on_a_cluster(
         try:
             client = stack.enter_context(Client(address, timeout=seconds, set_as_default=False))
             client.wait_for_workers(1, timeout=seconds)
-        except (OSError, ValueError, TimeoutError) as error:
+        except Exception as error:  # what else than a scheduler answers there may send anything
             problem = f"is {scheduler!r}, and no scheduler with workers answers there within {seconds:g} s"
             advice = "start one with: dask scheduler; dask worker ADDRESS"
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
