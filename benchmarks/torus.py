@@ -18,7 +18,7 @@ from typing import Any
 
 import jaxvib as jv
 
-jv.prepare_cpu(devices=None)
+jv.prepare_cpu()
 
 import jax  # noqa: E402
 

@@ -14,12 +14,13 @@ from parts import native
 from parts.common import as_first_written, best, first, flat, published, reach, say, thrown
 
 import jaxvib as jv
+from jaxvib.runtime.many import cores
 
 
 def ensemble(quick: bool = False, error: float = 1e-5) -> None:
     runs, share, end = (256, 64, 50.0) if quick else (4096, 256, 200.0)
     group = f"ensemble of {runs}"
-    print(f"{group}, T = {end:g}, error {error:g}, {len(jax.devices())} devices")
+    print(f"{group}, T = {end:g}, error {error:g}, {cores()} cores")
     scene, start = published(), thrown()
     par, y0, speeds = native.numbers(scene), flat(start), np.linspace(3.0, 6.0, runs)
     simd, scalar = native.simd_ensemble(), native.scalar_ensemble()

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
+import jaxvib.sweeps.cluster
 from optimize import Quantity, amplitude, jam_frequency
 
 jv.prepare_cpu()
@@ -86,8 +87,8 @@ def many_chunks(store: pathlib.Path, **more) -> jv.Sweep:
 
 
 def clocks() -> tuple[float, float]:
-    spent = os.times()
-    return time.perf_counter(), spent.user + spent.system
+    spent = os.times()  # that of workers counts when they have ended
+    return time.perf_counter(), spent.user + spent.system + spent.children_user + spent.children_system
 
 
 def since(begun: tuple[float, float]) -> str:
@@ -171,34 +172,58 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
     print("files left of writing that was cut off:", len(list(broken.rglob("*.partial"))))
 
 
+def watched(told: str):
+    """What a worker does for a chunk, and a line in a file for each: the process, when it began and ended, processor time."""
+    real = jaxvib.sweeps.cluster._remote
+
+    def remote(*given):
+        begun, spent = time.time(), time.process_time()
+        found = real(*given)
+        with open(told, "a") as file:
+            file.write(f"{os.getpid()} {begun} {time.time()} {time.process_time() - spent}\n")
+        return found
+
+    return remote
+
+
 def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
+    """Workers beside this process, in turns. On a busy machine the clock tells little: so also how long workers have nothing
+    to do between two chunks, and what all processes take of the processor."""
     import threading
 
-    size, options = 128, dict(chunk=1024)
+    import psutil  # distributed has it
+
+    def busy() -> float:
+        each = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        return sum(one.cpu_times().user + one.cpu_times().system for one in each)
+
+    size, options, told = 128, dict(chunk=1024), folder / "told"
     here, there, hurt = folder / "here.zarr", folder / "there.zarr", folder / "hurt.zarr"
-    for name, store, more in (("in this process", here, {}), ("two workers", there, {"workers": 2})):
-        times: list[float] = []
-        begun = clocks()
-        capture(store, size, **options, **more, report=lambda now, t=times: t.append(time.perf_counter()))
-        steady = (times[-1] - times[3]) / (len(times) - 4)
-        print(f"{name}: {since(begun)} in all; {steady:.2f} s from chunk to chunk of {len(times)}", flush=True)
+    jaxvib.sweeps.cluster._remote, plain = watched(str(told)), jaxvib.sweeps.cluster._remote
+    for turn in range(3):
+        for name, store, more in (("in this process", here, {}), ("two workers", there, {"workers": 2})):
+            shutil.rmtree(store, ignore_errors=True)
+            told.write_text("")
+            times: list[tuple[float, float]] = []
+            begun = clocks()
+            capture(store, size, **options, **more, report=lambda now, t=times: t.append((time.perf_counter(), busy())))
+            clock, spent = np.subtract(times[-1], times[5]) / (len(times) - 6)  # by the sixth every worker has its program
+            each = f"from chunk to chunk {clock:.3f} s, {spent:.3f} s of the processor"
+            print(f"{turn} {name}: {since(begun)}; {each}; load {os.getloadavg()[0]:.1f}", flush=True)
+        rows = np.loadtxt(told)
+        for worker in np.unique(rows[:, 0]):
+            mine = rows[rows[:, 0] == worker][2:]  # the first is compiled
+            gap, computing = np.mean(mine[1:, 1] - mine[:-1, 2]), np.mean(mine[:, 2] - mine[:, 1])
+            share = f"{computing:.3f} s a chunk ({np.mean(mine[:, 3]):.3f} s of the processor), {1e3 * gap:.1f} ms between two"
+            print(f"  worker {worker:.0f}: {share}, {100.0 * gap / computing:.1f} %", flush=True)
+    jaxvib.sweeps.cluster._remote = plain
     print("two workers, bit for bit the same:", same(here, there), flush=True)
 
     def kill_one(now) -> None:
         if now.done >= 4096 and not victims:
-            found = subprocess.run(["ps", "-o", "pid,ppid,args", "-A"], capture_output=True, text=True).stdout
-            rows = [line.split(None, 2) for line in found.splitlines()[1:]]
-            below = {int(pid): int(ppid) for pid, ppid, _ in rows}
-            mine = [int(pid) for pid, _, args in rows if "spawn_main" in args and ancestor(int(pid), below)]
-            victims.append(mine[-1])
-            threading.Thread(target=os.kill, args=(mine[-1], signal.SIGKILL)).start()
-
-    def ancestor(pid: int, below: dict[int, int]) -> bool:
-        while pid in below:
-            pid = below[pid]
-            if pid == os.getpid():
-                return True
-        return False
+            workers = [one for one in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(one.cmdline())]
+            victims.append(workers[-1].pid)
+            threading.Thread(target=workers[-1].kill).start()
 
     victims: list[int] = []
     begun = clocks()

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State, vector_field
@@ -23,13 +22,14 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
-from jaxvib.motion.lanes import advance
+from jaxvib.motion.lanes import LANES, advance
 from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
@@ -47,9 +47,6 @@ _PARTS = 4
 """Into so many parts a run is cut; over the last one mean speeds are taken."""
 
 Equations = Callable[[Scene], Callable[[Array, State], State]]
-
-_LANES = 64
-"""Runs that advance together on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
 
 
 class EnsembleStatus(eqx.Enumeration):
@@ -120,17 +117,17 @@ def ensemble(
     *,
     stepsize_controller: EqualSteps | None = None,
     estimate: bool = True,
-    lanes: int = _LANES,
+    lanes: int = LANES,
     equations: Equations = vector_field,
 ) -> Ensemble:
     """Integrates many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
     Runs advance together, `lanes` at a time, every number of the state a contiguous array over them, and chunks are spread over
-    all devices that JAX has: graphics processors, or as many cores as `prepare_cpu(devices=None)` made devices of.
-    Equal steps keep runs together that would wait for each other otherwise; near the boundary between two outcomes they also
-    keep the choice of steps from deciding. Other values of the same shape need no new program where `make` is the same function
-    and the same numbers are shared by all runs; a function written in the call is another one each time. In single precision
-    angles are kept within a turn while time is integrated, so that long runs keep their phase.
+    all cores, or all graphics processors; under a JAX transformation they follow each other. Equal steps keep runs together
+    that would wait for each other otherwise; near the boundary between two outcomes they also keep the choice of steps from
+    deciding. Other values need no new program where `make` is the same function and the same numbers are shared by all runs,
+    nor does the integration of another number of runs above `lanes`; a function written in the call is another one each time.
+    In single precision angles are kept within a turn while time is integrated, so that long runs keep their phase.
 
     **Arguments**
 
@@ -172,7 +169,8 @@ def ensemble(
     shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]
     shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
     leaves, rest = jax.tree.flatten(made)
-    parts = [leaf[0] if same else leaf for leaf, same in zip(leaves, shared, strict=True)]
+    own = [leaf for leaf, same in zip(leaves, shared, strict=True) if not same]
+    common = [leaf[0] for leaf, same in zip(leaves, shared, strict=True) if same]
     require(stepsize_controller, EqualSteps)
     if stepsize_controller is not None:
         steps = stepsize_controller.number
@@ -184,8 +182,13 @@ def ensemble(
     coarse = -(-each // 2)
     # A run of one step in each part has no coarser one beside it.
     compared = estimate and coarse < each
-    counts = np.asarray([each, coarse] if compared else [each], end.dtype)
-    last, load_speed, apart, finite, detached, taken = _all(parts, end, counts, tuple(shared), rest, lanes, runs, equations)
+    counts = jnp.asarray([each, coarse] if compared else [each], end.dtype)
+
+    def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
+        return _together(own, common, end, counts, tuple(shared), rest, equations)
+
+    ends = in_chunks(lanes, together, own, shared=(common, end, counts))
+    last, load_speed, apart, finite, detached, taken = jax.tree.map(jnp.asarray, ends)
     # What a method of order 3 would leave of the difference; this one is of order 8.
     share = (coarse / each) ** 3
     unknown = np.inf if estimate else np.nan
@@ -221,45 +224,23 @@ def _fastest(scenes: Scene) -> Array:
 
 
 @cached
-def _all(
-    parts: list[Array],
+def _together(
+    own: list[Array],
+    common: list[Array],
     end: Array,
-    counts: np.ndarray,
-    shared: tuple[bool, ...],
+    counts: Array,
+    same: tuple[bool, ...],
     rest: Hashable,
-    lanes: int,
-    runs: int,
     equations: Equations,
 ) -> _Ends:
-    """All runs in chunks over all devices, (runs, ...); see `_run`."""
-    devices = jax.devices()
-    chunks = -(-runs // (lanes * len(devices)))
-    padded = chunks * lanes * len(devices)
+    """Runs side by side: those of their numbers that are their `own` with a leading axis, and what they have in `common`."""
 
-    def chunked(leaf: Array) -> Array:
-        # The last chunk is filled up with copies of the last run.
-        filled = jnp.concatenate([leaf, jnp.broadcast_to(leaf[-1:], (padded - runs, *leaf.shape[1:]))])
-        return filled.reshape(chunks * len(devices), lanes, *leaf.shape[1:])
-
-    own = [chunked(leaf) for leaf, same in zip(parts, shared, strict=True) if not same]
-    common = [leaf for leaf, same in zip(parts, shared, strict=True) if same]
-
-    def one(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
+    def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
-        scene, state = jax.tree.unflatten(rest, [next(ours) if same else next(mine) for same in shared])
+        scene, state = jax.tree.unflatten(rest, [next(ours) if shared else next(mine) for shared in same])
         return _run(scene, state, end, counts, equations)
 
-    def on_device(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
-        chunk = jax.vmap(one, in_axes=(0, None, None, None))
-        return jax.lax.map(lambda mine: chunk(mine, common, end, counts), own)
-
-    if len(devices) > 1:
-        split, whole = PartitionSpec("runs"), PartitionSpec()
-        mesh = Mesh(np.asarray(devices), ("runs",))
-        specs = (split, whole, whole, whole)
-        on_device = jax.shard_map(on_device, mesh=mesh, in_specs=specs, out_specs=split, check_vma=False)
-    found = on_device(own, common, end, jnp.asarray(counts))
-    return jax.tree.map(lambda leaf: leaf.reshape(padded, *leaf.shape[2:])[:runs], found)
+    return jax.vmap(one)(own)
 
 
 def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations) -> _Ends:

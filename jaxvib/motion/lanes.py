@@ -18,7 +18,10 @@ from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y as Held
 from jaxvib.runtime.compat import short_end
 
-__all__ = ["PARTS", "Plan", "WatchedRun", "advance", "watched_run"]
+__all__ = ["LANES", "PARTS", "Plan", "WatchedRun", "advance", "watched_run"]
+
+LANES = 64
+"""Cases side by side on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
 
 PARTS = 64
 """Into so many equal parts a watched run is cut before its window; over each the loads' mean speeds are taken."""

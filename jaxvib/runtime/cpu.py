@@ -32,9 +32,9 @@ def prepare_cpu(devices: int | None = 1) -> str:
         XLA_FLAGS="--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000 ..."
 
     which this does for you: it also asks for the code generator that compiles such programs in two thirds of the time, for
-    vectors of 512 bits where the processor has them, and for `devices` devices in one process, over which `ensemble` spreads
-    its runs. Flags that the environment holds already are left as they are, and those that the installed jaxlib does not know
-    are left out: XLA would end the process.
+    vectors of 512 bits where the processor has them, and for `devices` devices in one process, over which programs of your own
+    may be spread; what computes many cases here uses all cores without them. Flags that the environment holds already are left
+    as they are, and those that the installed jaxlib does not know are left out: XLA would end the process.
 
     **Arguments**: `devices`, default 1; None: as many as this process may use cores.
 

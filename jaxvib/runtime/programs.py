@@ -15,6 +15,7 @@ import itertools
 import json
 import os
 import tempfile
+import threading
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -59,6 +60,7 @@ class _CachedFunction(Generic[P, T]):
         self.function = no_host_checks()(function)
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
+        self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -74,7 +76,9 @@ class _CachedFunction(Generic[P, T]):
         except TypeError:  # an argument without a hash
             return self.jitted(*args, **kwargs)
         if not is_ready:
-            self.ready[asked] = self._program(folder, leaves, treedef)
+            with self.lock:
+                if asked not in self.ready:
+                    self.ready[asked] = self._program(folder, leaves, treedef)
         program = self.ready[asked]
         if program is None:
             return self.jitted(*args, **kwargs)
@@ -90,8 +94,9 @@ class _CachedFunction(Generic[P, T]):
 
     def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
-            if leaf.sharding.device_set != {jax.devices()[0]}:
-                raise Undescribable("an array is not on the first device")
+            device, *others = leaf.sharding.device_set
+            if others or device.platform != jax.devices()[0].platform:
+                raise Undescribable("an array is not on one device of the kind that is used first")
             return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
 
         asked = describe(jax.tree.unflatten(treedef, leaves), abstract)

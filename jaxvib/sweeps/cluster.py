@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.runtime.devices import take_a_device
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
 from jaxvib.sweeps.status import CASE_STATUSES
@@ -38,6 +39,7 @@ def on_a_cluster(
     versions.
     """
     try:
+        import dask.config
         from distributed import Client, LocalCluster, as_completed
         from distributed.scheduler import KilledWorker
     except ImportError as error:
@@ -47,6 +49,8 @@ def on_a_cluster(
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))
     with contextlib.ExitStack() as stack:
         if scheduler is None:
+            # Dask's profile of its workers, which nobody sees here, takes half of what a worker costs beside its chunks.
+            stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
             options = {"dashboard_address": None, "silence_logs": 50}
             address = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, **options))
         else:
@@ -54,7 +58,7 @@ def on_a_cluster(
         try:
             client = stack.enter_context(Client(address, timeout=seconds, set_as_default=False))
             client.wait_for_workers(1, timeout=seconds)
-        except (OSError, ValueError, TimeoutError) as error:
+        except Exception as error:  # what else than a scheduler answers there may send anything
             problem = f"is {scheduler!r}, and no scheduler with workers answers there within {seconds:g} s"
             advice = "start one with: dask scheduler; dask worker ADDRESS"
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
@@ -91,6 +95,7 @@ def _remote(study: Study, chunk: int, key: str, wanted: dict[str, str], precise:
         if wanted[name] != version:
             return f"has {name} {version}, and the store was begun with {wanted[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
+    take_a_device()
     if key not in _STUDIES:  # the first copy that came here is kept, whose functions the program was compiled for
         _STUDIES[key] = dataclasses.replace(study, scene=jax.tree.map(jnp.asarray, study.scene))
     return compute(_STUDIES[key], chunk)

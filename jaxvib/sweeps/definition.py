@@ -12,17 +12,14 @@ import numpy as np
 
 from jaxvib.machine.files import scene_to_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.lanes import Plan
+from jaxvib.motion.lanes import LANES, Plan
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.sweeps.axes import Grid, Spot
 from jaxvib.sweeps.measures import Measure, identity
 from optimize.wishes.quantity import Tier
 
-__all__ = ["LANES", "Study"]
-
-LANES = 64
-"""Cases that are computed side by side: vectors are full, and the numbers of a run stay in the processor's cache."""
+__all__ = ["Study"]
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from jax import Array
 
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
-from jaxvib.motion.lanes import PARTS, Plan, watched_run
+from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
-from jaxvib.sweeps.definition import LANES, Study
+from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
 from jaxvib.sweeps.status import CASE_STATUSES
 from optimize.wishes.answers import Answers

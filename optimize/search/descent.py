@@ -12,8 +12,9 @@ import optax
 from jax import Array
 
 from jaxvib.numerics.linalg import small_solve
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from optimize.search.problem import Point, Problem, chunked, derive
+from optimize.search.problem import Point, Problem, derive
 
 __all__ = ["STRETCH", "Descended", "descend"]
 
@@ -155,11 +156,11 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
     rates = np.asarray(schedule(jnp.arange(steps)))
     rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
-    lanes = chunked(problem.lanes, _begun, point, np.zeros((len(point.z), len(problem.demands))))
+    lanes = in_chunks(problem.lanes, _begun, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
         each = jnp.asarray(part)
-        lanes, values = chunked(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
+        lanes, values = in_chunks(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
         history.append(values)
         tell((k + 1) / len(rates), _point(lanes))
     values = np.concatenate(history, axis=1)[:, :steps]

@@ -6,9 +6,7 @@ cores.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -19,13 +17,14 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from optimize.space.space import DesignSpace, Held
 from optimize.wishes.answers import Answers, Key, Recorder, guesses
 from optimize.wishes.quantity import Asking, Demand, Quantity, walk
 
-__all__ = ["Known", "Point", "Problem", "chunked", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
+__all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
 
 _CHUNK = 64
 """Designs that are evaluated together on a core."""
@@ -230,27 +229,11 @@ def _lanes(count: int) -> int:
     return min(_CHUNK, 1 << max(count - 1, 0).bit_length())
 
 
-def chunked(size: int, function: Callable[..., Any], *arrays: Any) -> Any:
-    """A function of `size` designs, for many of them: chunks side by side on all cores, the last one filled up."""
-    count = jax.tree.leaves(arrays)[0].shape[0]
-    starts = range(0, count, size)
-
-    def part(start: int) -> Any:
-        index = np.minimum(np.arange(start, start + size), count - 1)
-        out = function(*jax.tree.map(lambda a: jnp.asarray(a[index]), arrays))
-        return jax.tree.map(np.asarray, out)
-
-    first = part(0)  # alone: a program is compiled once
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        rest = list(pool.map(part, starts[1:]))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], first, *rest)
-
-
 def evaluate(problem: Problem, z: np.ndarray, near: Known) -> Point:
     """Values and derivatives of many designs whose jams are near these speeds."""
     if len(z) == 0:
         raise ValueError("no designs")
-    values, slopes, found, reach = chunked(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
+    values, slopes, found, reach = in_chunks(problem.lanes, lambda x, w: _derived(problem, x, w), z, near)
     rows = 1 + problem.equalities + len(problem.demands)
     return Point(z, values[:, :rows], slopes[:, :rows], found, reach, values[:, rows:], slopes[:, rows:])
 
@@ -260,12 +243,12 @@ def looked_up(problem: Problem, z: np.ndarray) -> Known:
     if not problem.keys:
         return ()
     numbers = problem.space.numbers(np.asarray(z))
-    return chunked(problem.lanes, lambda scenes: _looked_up(problem.keys, scenes), made(problem, numbers))
+    return in_chunks(problem.lanes, lambda scenes: _looked_up(problem.keys, scenes), made(problem, numbers))
 
 
 def made(problem: Problem, numbers: np.ndarray) -> Scene:
     """The scenes with these free numbers (s, d), SI: arrays with a leading axis, NumPy's."""
-    return chunked(problem.lanes, lambda x: _made(problem.space, x), numbers)
+    return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
 
 
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
@@ -297,4 +280,4 @@ def reported(quantities: Sequence[Quantity], scenes: Scene, problem: Problem | N
         near = dict(zip(known, _looked_up(known, batch), strict=True)) if known else {}
         return _reported(quantities, keys, batch, tuple(near[key] for key in keys))
 
-    return chunked(_lanes(leaves[0].shape[0]) if problem is None else problem.lanes, part, scenes)
+    return in_chunks(_lanes(leaves[0].shape[0]) if problem is None else problem.lanes, part, scenes)

@@ -16,6 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.many import in_parallel
 from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
 
@@ -112,14 +113,18 @@ def criterion_map(
     boundary = np.stack([np.sort([*r.speeds.damped_resonances, *r.speeds.damped_additional]) for r in results])
     growth = np.zeros((drag_factor.size, mass_factor.size, grid.size))
     shift = np.full((drag_factor.size, *boundary.shape), np.nan)
-    for d, drag_times in enumerate(drag_factor):
-        for m, mass_times in enumerate(mass_factor):
-            one = loaded(jnp.asarray(mass_times), drag_times)
-            growth[d, m] = balanced_growth(one, grid, steps=steps)
-            stable = growth[d, m] < 0.0
-            changes = stability_changes(one, grid, stable, close=1e-5, steps=steps)
-            ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
-            shift[d, m] = _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
+
+    def exact(cell: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        d, m = cell
+        one = loaded(jnp.asarray(mass_factor[m]), drag_factor[d])
+        growth = balanced_growth(one, grid, steps=steps)
+        stable = growth < 0.0
+        changes = stability_changes(one, grid, stable, close=1e-5, steps=steps)
+        ends = [*([np.nan] if stable[0] else []), *changes, *([np.nan] if stable[-1] else [])]
+        return growth, _shifts(np.reshape(ends, (-1, 2)), grid, boundary[m])
+
+    for cell, found in in_parallel(exact, np.ndindex(shift.shape[:2])):
+        growth[cell], shift[cell] = found
     right = np.mean((growth < 0.0) == predicted[None], axis=-1)
     return CriterionMap(grid, mass_factor, drag_factor, predicted, growth, right, boundary, shift)
 

@@ -15,7 +15,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.regime import REGIMES, Regime, RegimeName
+from jaxvib.motion.analysis.regime import REGIMES, Regime
 from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state, require_start
@@ -23,6 +23,7 @@ from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, numbers
 
@@ -119,7 +120,7 @@ def run_ups(
     - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
       rad. Without either all loads start together at the bottom
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
-    - `batch`: so many runs go side by side
+    - `batch`: so many runs go side by side on each core
     - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
 
     **Returns** `RunUps`, whose `fraction` says how many of the starts came to a kind of motion. From few starts a share is
@@ -168,7 +169,6 @@ def run_ups(
     count(batch, "batch")
     require_start(scene, (jnp.asarray(sets),))
 
-    grid = (jnp.repeat(drags, len(sets)), jnp.tile(jnp.asarray(sets, drags.dtype), (len(drags), 1)))
     shape = (len(drags), len(sets))
     size = min(batch, shape[0] * shape[1])
     end = number(until, "s", "until", low=0.0, open_low=True)
@@ -176,33 +176,39 @@ def run_ups(
         stepsize_controller = _TOLERANCE
     if max_steps is None:
         max_steps = max(_FEWEST, enough_steps(scene, end))
-    named, omega, finished = _all(scene, end, grid, size, stepsize_controller, max_steps)
-    code = jax.vmap(lambda name: jnp.stack([name == getattr(RegimeName, kind) for kind in REGIMES]))(named.name)
-    kind = np.where(np.asarray(finished), np.asarray(REGIMES)[np.argmax(np.asarray(code), axis=1)], _FAILED)
 
-    def folded(leaf: Array) -> Array:
+    def together(drags: Array, angles: Array) -> tuple[Regime, Array, Array]:
+        return _together(scene, end, drags, angles, stepsize_controller, max_steps)
+
+    cases = np.repeat(drags, len(sets)), np.tile(np.asarray(sets, drags.dtype), (len(drags), 1))
+    named, omega, finished = in_chunks(size, together, *cases)
+    (code,) = jax.tree.leaves(named.name)
+    kind = np.where(finished, np.asarray(REGIMES)[code], _FAILED)
+
+    def folded(leaf: np.ndarray) -> np.ndarray:
         return leaf.reshape(shape + leaf.shape[1:])
 
     return RunUps(
         drag=np.asarray(drags),
         angle=sets,
-        regime=jax.tree.map(folded, named),
+        regime=jax.tree.map(lambda leaf: jnp.asarray(folded(leaf)), named),
         kind=kind.reshape(shape),
-        omega=np.asarray(folded(omega)),
-        finished=np.asarray(folded(finished)),
+        omega=folded(omega),
+        finished=folded(finished),
     )
 
 
 @cached
-def _all(
-    scene: Scene, until: Array, lanes: tuple[Array, Array], batch: int, chosen: StepChoice | None, max_steps: int
+def _together(
+    scene: Scene, until: Array, drags: Array, angles: Array, chosen: StepChoice | None, max_steps: int
 ) -> tuple[Regime, Array, Array]:
-    def one(lane: tuple[Array, Array]) -> tuple[Regime, Array, Array]:
-        drag, angle = lane
+    """Run-ups side by side: the regime of each, the loads' mean speed, whether it reached its end."""
+
+    def one(drag: Array, angle: Array) -> tuple[Regime, Array, Array]:
         this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
         start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
         run = simulate(this, until, start=start, save="window", stepsize_controller=chosen, max_steps=max_steps, throw=False)
         finished = run.status == RunStatus.done
         return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
 
-    return jax.lax.map(one, lanes, batch_size=batch)
+    return jax.vmap(one)(drags, angles)

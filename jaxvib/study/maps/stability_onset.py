@@ -13,8 +13,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
+from jaxvib.runtime.many import in_parallel
 from jaxvib.steady.jams.picture import MARKS
-from jaxvib.steady.orbits.diagram import SpecialPoint, exact_branches
+from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,7 +83,13 @@ def stability_map(
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
         raise InputError("values", f"are {values!r}; give numbers in ascending order")
-    diagrams = [exact_branches(make(float(v)), points=points, least=omega[0], most=omega[1]) for v in x]
+    scenes = [make(float(v)) for v in x]
+
+    def diagram(k: int) -> ExactBranches:
+        return exact_branches(scenes[k], points=points, least=omega[0], most=omega[1])
+
+    found = dict(in_parallel(diagram, range(x.size)))
+    diagrams = [found[k] for k in range(x.size)]
     return StabilityMap(
         x,
         np.stack([np.asarray(d.omega) for d in diagrams]),

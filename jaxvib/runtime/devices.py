@@ -1,0 +1,61 @@
+"""Which accelerators share the work of this process, and which one is a worker's own."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import os
+import tempfile
+import threading
+
+import jax
+
+__all__ = ["shared_devices", "take_a_device"]
+
+_VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
+"""What restricts a process to some of its machine's accelerators."""
+
+_TAKING = threading.Lock()
+
+
+def shared_devices() -> list[object]:
+    """The accelerators that share this process's work; [None] where there is one device, or one that the caller chose.
+
+    Processors are one device, however many XLA was told to make of them: their cores are shared by threads.
+    """
+    found = jax.local_devices()
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
+
+
+def take_a_device() -> None:
+    """Lets this process compute on an accelerator of its own, where its machine has several and other workers."""
+    # Before the first array: a worker would else take most of the memory of every accelerator, its neighbours' too.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    devices = jax.local_devices()
+    if len(devices) > 1:
+        with _TAKING:
+            place = _place()
+        jax.config.update("jax_default_device", devices[place % len(devices)])
+
+
+@functools.cache
+def _place() -> int:
+    """This process's number, from 0, among the workers on this machine that see the same accelerators.
+
+    The number is a locked file, which the system gives free when the process ends, however it ends: the worker that comes in
+    place of a dead one has its accelerator.
+    """
+    import fcntl  # not on Windows, where JAX has no accelerators
+
+    seen = hashlib.sha256(repr([os.environ.get(name) for name in _VISIBLE]).encode()).hexdigest()[:16]
+    for place in itertools.count():
+        path = os.path.join(tempfile.gettempdir(), f"jaxvib-worker-{os.getuid()}-{seen}-{place}")
+        file = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)  # open as long as the process lives
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return place
+        except BlockingIOError:
+            os.close(file)
+    raise AssertionError

@@ -1,0 +1,128 @@
+"""The one way to compute many cases: chunks of one width, one compiled program for all, side by side on what this machine has.
+
+Sweeps, ensembles, run-ups, maps and searches rest on it. A map whose cases are questions of their own (a diagram, a criterion)
+takes `in_parallel`; cases that are entries of arrays take `in_chunks`, which fills the last chunk up, so that another number of
+cases needs no other program.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxvib.runtime.compat import traced
+from jaxvib.runtime.devices import shared_devices
+
+__all__ = ["cores", "in_chunks", "in_parallel"]
+
+Item = TypeVar("Item")
+Found = TypeVar("Found")
+
+_OPTIONS = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_numpy_rank_promotion": jax.numpy_rank_promotion,
+    "jax_numpy_dtype_promotion": jax.numpy_dtype_promotion,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_default_device": jax.default_device,
+}
+"""JAX's options on which results depend, and what sets them in one thread alone."""
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
+    """A function of many items: threads compute them on all cores and accelerators; gives each with its item as it is finished.
+
+    The first item is computed alone, so that a program is compiled once. Items are taken as there is room for them: one more
+    than threads is held at most, so that memory does not grow with their number. JAX's options are those of the caller, with
+    those that a context manager set for the caller's thread alone. When an error is raised, here or by who takes the results,
+    items that have not begun are not computed.
+
+    >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
+    [(1, 1), (2, 4), (3, 9)]
+    """
+    left, devices = iter(items), itertools.cycle(shared_devices())
+    alike = _same_options(function)
+    for first in left:
+        yield first, alike(first, next(devices))
+        break
+    threads = cores()
+    pool = ThreadPoolExecutor(threads)
+    running: dict[Future[Found], Item] = {}
+    try:
+        for item in left:
+            running[pool.submit(alike, item, next(devices))] = item
+            if len(running) > threads:
+                yield from _finished(running)
+        while running:
+            yield from _finished(running)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _finished(running: dict[Future[Found], Item]) -> Generator[tuple[Item, Found], None, None]:
+    ended, _ = wait(running, return_when=FIRST_COMPLETED)
+    for future in ended:
+        yield running.pop(future), future.result()
+
+
+def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:
+    """The function, in any thread under JAX's options as they are now, on a device."""
+    wanted = {name: getattr(jax.config, name) for name in _OPTIONS}
+
+    def alike(item: Item, device: object) -> Found:
+        with contextlib.ExitStack() as stack:
+            for name, value in (wanted if device is None else wanted | {"jax_default_device": device}).items():
+                if getattr(jax.config, name) != value:  # set again it would make JAX trace programs again
+                    stack.enter_context(_OPTIONS[name](value))
+            return function(item)
+
+    return alike
+
+
+def in_chunks(
+    size: int, function: Callable[..., PyTree], *cases: PyTree, shared: tuple[PyTree, ...] = ()
+) -> PyTree[np.ndarray]:
+    """A function of `size` cases at a time, for any number of them, put together in their order.
+
+    The last chunk is filled up with copies of the last case. Under a JAX transformation the chunks are computed one after
+    another within the program.
+
+    **Arguments**: `size` of a chunk; `function` of trees of arrays (size, ...) and of what all cases have in common, `shared`;
+    `cases` trees of arrays (n, ...).
+
+    **Returns** the function's tree with NumPy arrays (n, ...); under a transformation with JAX's.
+
+    >>> in_chunks(4, lambda x, y: {"sum": x + y}, np.arange(6.0), shared=(1.0,))
+    {'sum': array([1., 2., 3., 4., 5., 6.])}
+    """
+    count = jax.tree.leaves(cases)[0].shape[0]
+    chunks = -(-count // size)
+    index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
+    if any(traced(leaf) for leaf in jax.tree.leaves((cases, shared))):
+
+        def within(which: jax.Array) -> PyTree[jax.Array]:
+            return function(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], cases), *shared)
+
+        found = jax.lax.map(within, jnp.asarray(index))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
+    plain = jax.tree.map(np.asarray, cases)
+
+    def computed(chunk: int) -> PyTree[np.ndarray]:
+        out = function(*jax.tree.map(lambda leaf: jnp.asarray(leaf[index[chunk]]), plain), *shared)
+        return jax.tree.map(np.asarray, out)
+
+    parts = dict(in_parallel(computed, range(chunks)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *(parts[k] for k in range(chunks)))

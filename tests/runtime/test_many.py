@@ -1,0 +1,139 @@
+"""Many cases by one way: what is held, what stops, what the threads know, which devices they use."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvib.runtime import many
+
+
+def test_items_are_taken_as_there_is_room_and_the_first_one_alone(monkeypatch):
+    monkeypatch.setattr(many, "cores", lambda: 3)
+    taken, threads = [], {}
+
+    def items():
+        for k in range(20):
+            taken.append(k)
+            yield k
+
+    def computed(k):
+        threads[k] = threading.current_thread()
+        return k * k
+
+    finished = 0
+    for k, found in many.in_parallel(computed, items()):
+        finished += 1
+        assert found == k * k and len(taken) - finished <= 4 and (finished > 1 or len(taken) == 1)
+    assert (
+        finished == 20 and threads[0] is threading.main_thread() and threading.main_thread() not in list(threads.values())[1:]
+    )
+    assert list(many.in_parallel(computed, [])) == []
+
+
+def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
+    monkeypatch.setattr(many, "cores", lambda: 2)
+    begun = []
+
+    def computed(k):
+        begun.append(k)
+        if k == 3:
+            raise KeyError("three")
+
+    with pytest.raises(KeyError, match="three"):
+        list(many.in_parallel(computed, range(1000)))
+    assert len(begun) < 20
+    with pytest.raises(KeyboardInterrupt):
+        for _ in many.in_parallel(lambda k: begun.append(k), range(1000, 2000)):
+            raise KeyboardInterrupt
+    assert len(begun) < 30
+
+
+def test_threads_have_the_options_of_the_caller():
+    def kind(_):
+        return jnp.zeros(1).dtype.name, jnp.result_type(float).name
+
+    with jax.enable_x64(False):
+        assert {found for _, found in many.in_parallel(kind, range(5))} == {("float32", "float32")}
+    assert {found for _, found in many.in_parallel(kind, range(5))} == {("float64", "float64")}
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 13])
+def test_chunks_are_put_together_in_their_order(count):
+    sizes = []
+
+    def function(x, y, common):
+        sizes.append(x["a"].shape)
+        return {"sum": x["a"] + y[:, 0] + common, "pair": jnp.stack([x["a"], x["a"]], axis=1)}
+
+    x, y = {"a": np.arange(count, dtype=float)}, jnp.arange(2.0 * count).reshape(count, 2)
+    found = many.in_chunks(4, function, x, y, shared=(1.0,))
+    np.testing.assert_array_equal(found["sum"], 3.0 * np.arange(count) + 1.0)
+    assert found["pair"].shape == (count, 2) and set(sizes) == {(4,)}
+
+
+def test_chunks_within_a_transformation():
+    def total(scale):
+        return many.in_chunks(4, lambda x, scale: jnp.sin(scale * x), np.arange(10.0), shared=(scale,))
+
+    value, slope = jax.jvp(total, (2.0,), (1.0,))
+    np.testing.assert_allclose(value, np.sin(2.0 * np.arange(10.0)), rtol=1e-14)
+    np.testing.assert_allclose(slope, np.arange(10.0) * np.cos(2.0 * np.arange(10.0)), rtol=1e-14)
+
+
+def test_all_accelerators_are_used_and_their_programs_stored(tmp_path):
+    """Three devices that XLA makes of the processor stand for them."""
+    code = f"""
+import jaxvib as jv
+jv.prepare_cpu(3)
+jv.use_cache({str(tmp_path)!r})
+import jax, jax.numpy as jnp
+from jaxvib.runtime import many, programs
+assert many.shared_devices() == [None]  # processors are one, however they are divided
+many.shared_devices = jax.local_devices
+
+def doubled(x):
+    return 2.0 * x
+
+function = programs.cached(doubled)
+doubled.__module__ = "jaxvib.doubled"
+for k, found in many.in_parallel(lambda k: function(jnp.full(2, float(k))), range(7)):
+    assert found.devices() == {{jax.devices()[k % 3]}} and found.tolist() == [2.0 * k] * 2, (k, found.devices())
+assert None not in function.ready.values() and len(list(programs.program_folder().glob("*.program"))) == 1
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+WORKER = """
+import sys
+import jax, jax.numpy as jnp
+from jaxvib.runtime.devices import take_a_device
+take_a_device()
+print(jnp.zeros(1).devices().pop().id, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_workers_of_a_machine_have_a_device_each(tmp_path):
+    """Two devices that XLA makes of the processor stand for accelerators; who comes in place of a dead worker has its own."""
+    more = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "TMPDIR": str(tmp_path)}
+
+    def worker():
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        return subprocess.Popen([sys.executable, "-c", WORKER], env=os.environ | more, **pipes)
+
+    workers = [worker(), worker()]
+    devices = [int(one.stdout.readline()) for one in workers]
+    assert sorted(devices) == [0, 1]
+    workers[0].kill()
+    workers[0].communicate()
+    workers += [worker(), worker()]  # more workers than devices share them
+    assert sorted(int(one.stdout.readline()) for one in workers[2:]) == sorted([devices[0], 0])
+    for one in workers[1:]:
+        one.communicate("")
+        assert one.returncode == 0
