@@ -26,7 +26,7 @@ def test_what_float32_cannot_deliver_is_refused():
 
 def test_single_precision_keeps_its_phase():
     """A load that turns with its rotor for 1e5 turns: an angle of 6e5 rad would be good to 0.06 only, and each step would round
-    it anew; so the only error is that of the time itself."""
+    it anew; so the only error, but for 1e-3 of an angle within a turn, is that of the time itself."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
     with jax.enable_x64(False):
         free = jv.Scene(machine32(machine), jv.pendulums(count=1, mass=1e-6, radius=0.1, drag=1e-4), jv.ConstantSpeed(100.0))
@@ -38,7 +38,7 @@ def test_single_precision_keeps_its_phase():
         times = np.asarray(run.window.time)
         bound = 2.0 * float(np.spacing(times[-1])) / float(times[-1] - times[0])
         np.testing.assert_allclose(float(run.omega), 100.0, rtol=bound)
-    assert np.max(np.abs((phase + np.pi) % (2.0 * np.pi) - np.pi)) < 100.0 * float(np.spacing(times[-1]))
+    assert np.max(np.abs((phase + np.pi) % (2.0 * np.pi) - np.pi)) < 100.0 * float(np.spacing(times[-1])) + 1e-3
 
 
 def test_an_imbalance_sets_the_unit_where_loads_hardly_shake():

@@ -63,13 +63,15 @@ def test_derivatives_are_finite_differences():
 
 
 def test_batches_inside_and_outside():
+    """The controller follows an error of 1e-6, a difference of numbers of the order of 1 that is good to 2e-10 of itself; its
+    derivative, by which steps move with the point, to some 1e-9, however the same operations are put together."""
     points = jnp.stack([POINT + move for move in (0.0, 0.05, 0.1)])
     alone = jax.jit(jax.jacfwd(motion))
     single = jnp.stack([alone(p) for p in points])
     of_each = jax.jit(jax.vmap(jax.jacfwd(motion)))(points)
-    np.testing.assert_allclose(of_each, single, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(of_each, single, rtol=1e-8, atol=1e-9)
     of_all = jax.jit(jax.jacfwd(jax.vmap(motion)))(points)
-    np.testing.assert_allclose(jnp.stack([of_all[i, :, i] for i in range(3)]), single, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(jnp.stack([of_all[i, :, i] for i in range(3)]), single, rtol=1e-8, atol=1e-9)
     assert np.all(np.asarray(of_all[0, :, 1]) == 0.0)
 
 
