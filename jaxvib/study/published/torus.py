@@ -38,7 +38,7 @@ _SLOW = {(0.145, 2e-5, 0.5), (0.145, 2e-5, 1.1)}
 """Damping, friction, gap of table entries whose small balls are not captured from the printed speed in 6000 turns either."""
 
 _CHAOTIC = {(0.1, 4e-5, 5.1)}
-"""An entry that comes out 0.045 to 0.09 lower, with the sharpness of the friction's sign and the steps."""
+"""An entry that comes out 0.045 to 0.1 lower, with the sharpness of the friction's sign and the steps."""
 
 _row = partial(compared, _PAPER, kind="formula")
 
@@ -67,7 +67,7 @@ def _speeds(tables: TorusTables) -> list[PublishedRow]:
             )
         entry = (float(n), float(tables.friction[k]), float(gap))
         if entry in _CHAOTIC:
-            note += "; chaotic: 0.045 to 0.09 lower than printed, with the sharpness of the friction's sign and the steps"
+            note += "; chaotic: 0.045 to 0.1 lower than printed, with the sharpness of the friction's sign and the steps"
         printed = float(tables.paper[k])
         rows.append(
             compared(
