@@ -16,6 +16,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -202,6 +203,8 @@ class _Instead:
 _ULPS = 100
 """So many units in the last place before its end a time loop of diffrax makes its last step end there."""
 
+_SHORTENING = threading.RLock()
+
 _ULPS_ONE_BY_ONE = re.compile(rf"for _ in range\({_ULPS}\):\s+t1_clip_floor = eqxi\.prevbefore\(t1_clip_floor\)\n")
 
 
@@ -219,18 +222,21 @@ def short_end() -> Iterator[None]:
         return
 
     def shorter(**arguments: object) -> object:
-        left = _ULPS
+        left, thread = _ULPS, threading.get_ident()
 
         def prevbefore(x: Array) -> Array:
             nonlocal left
+            if left == 0 or threading.get_ident() != thread:
+                return internals.prevbefore(x)
             left -= 1
             return x if left else ulps_below(x, _ULPS)
 
-        setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
-        try:
-            return loop(**arguments)
-        finally:
-            setattr(integrate, "eqxi", internals)  # noqa: B010
+        with _SHORTENING:  # another thread may trace a loop of its own
+            setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
+            try:
+                return loop(**arguments)
+            finally:
+                setattr(integrate, "eqxi", internals)  # noqa: B010
 
     setattr(integrate, "loop", shorter)  # noqa: B010
     try:

@@ -5,6 +5,7 @@ import json
 import pathlib
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import diffrax
 import equinox.internal
@@ -151,6 +152,13 @@ def test_time_loops_find_their_end_at_once(dtype):
         assert plain - operations(run(101), end) > 290
         assert run(101)(end) == expected
     assert operations(run(102), end) == plain
+    with ThreadPoolExecutor(4) as pool:  # sweeps trace in threads
+        assert set(pool.map(short_in_a_thread, [run(k) for k in range(103, 111)], [end] * 8)) == {float(expected)}
+
+
+def short_in_a_thread(run, end):
+    with compat.short_end():
+        return float(run(end))
 
 
 def test_time_loops_that_are_written_otherwise_stay(monkeypatch):
