@@ -52,9 +52,20 @@ class Front(Result):
         return scene_from_toml(self.machines[k])
 
     def summary(self) -> str:
-        """A line a machine."""
-        head = " against ".join(f"{n}, {u}".rstrip(", ") for n, u in zip(self.names, self.units, strict=True))
-        return "\n".join([head, *(f"  {a:.5g}  {b:.5g}" for a, b in self.values)])
+        """A line a machine, in the units of `plot`."""
+        labels, columns = self._shown()
+        return "\n".join(
+            [" against ".join(labels), *("  " + "  ".join(f"{x:.5g}" for x in row) for row in zip(*columns, strict=True))]
+        )
+
+    def _shown(self) -> tuple[list[str], list[np.ndarray]]:
+        """The quantities with the units in which a designer reads them, and their values in these."""
+        labels, columns = [], []
+        for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
+            shown, factor = shown_unit(unit, float(np.max(np.abs(column), initial=0.0)))
+            labels.append(f"{name}, {shown}".rstrip(", "))
+            columns.append(factor * column)
+        return labels, columns
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The front, each point with the number by which `scene` gives its machine.
@@ -63,11 +74,7 @@ class Front(Result):
         """
         from jaxvib.draw.charts import front_chart  # slow to import: only who draws pays
 
-        labels, values = [], []
-        for name, unit, column in zip(self.names, self.units, self.values.T, strict=True):
-            shown, factor = shown_unit(unit, float(np.max(np.abs(column), initial=0.0)))
-            labels.append(f"{name}, {shown}".rstrip(", "))
-            values.append(factor * column)
+        labels, values = self._shown()
         return front_chart(values[1], values[0], across=labels[1], up=labels[0], ax=ax)
 
 

@@ -57,8 +57,22 @@ def _(machine, mo, pictures):
 
 
 @app.cell
-def _(machine, mo, pictures):
-    mo.Html(pictures.image(lambda: pictures.picture_of_sketch(machine.value), machine))
+def _(mo, pictures, scene):
+    # No other mode than those there are, and of a machine without jam modes no choice.
+    modes = {str(k): k for k in sorted(pictures.modes_of(scene))}
+    mode = mo.ui.dropdown(
+        modes or {"none": None},
+        value=next(iter(map(str, pictures.modes_of(scene))), "none"),
+        allow_select_none=False,
+        label="jam mode in which the machine moves",
+    )
+    mo.vstack([mode] if modes else [])
+    return (mode,)
+
+
+@app.cell
+def _(machine, mo, mode, pictures):
+    mo.Html(pictures.image(lambda: pictures.machine(machine.value, mode.value), machine))
     return
 
 

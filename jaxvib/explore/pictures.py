@@ -1,4 +1,4 @@
-"""What the page shows of a scene: diagram, sketch, numbers, file."""
+"""What the page shows of a scene: diagram, moving machine, numbers, file."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ __all__ = [
     "has_branches",
     "heading",
     "image",
-    "picture_of_sketch",
-    "png",
+    "machine",
+    "modes_of",
     "prepare",
     "readings",
     "text",
     "toml",
     "tried",
+    "vector",
 ]
 
 ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
@@ -50,9 +51,6 @@ _SPEEDS = 81
 
 _TICKS = 5
 """So many ticks, at most, an axis has."""
-
-_DOTS = 100
-"""Dots an inch of pictures."""
 
 
 class Tried(NamedTuple):
@@ -70,11 +68,16 @@ def tried(ask: Callable[[], Scene]) -> Tried:
         return Tried(None, str(error))
 
 
-def image(draw: Callable[[], Figure], scene: Tried) -> str:
-    """A figure as an HTML image that holds its own data, or the sentence that says why there is none."""
-    return _shown(
-        lambda: f'<img style="max-width:100%" src="data:image/png;base64,{base64.b64encode(png(draw())).decode()}">', scene
-    )
+def image(draw: Callable[[], Figure | str], scene: Tried) -> str:
+    """A figure, or the text of an SVG file, as an HTML image that holds its own data, or the sentence that says why there is
+    none."""
+
+    def made() -> str:
+        drawn = draw()
+        data = base64.b64encode((drawn if isinstance(drawn, str) else vector(drawn)).encode()).decode()
+        return f'<img style="max-width:100%" src="data:image/svg+xml;base64,{data}">'
+
+    return _shown(made, scene)
 
 
 def text(read: Callable[[], str], scene: Tried) -> str:
@@ -104,7 +107,7 @@ def prepare(scene: Scene) -> None:
     for _ in range(2):
         image(lambda: diagram(scene, most), given)
         text(lambda: readings(scene), given)
-        image(lambda: picture_of_sketch(scene), given)
+        image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)
     gc.collect()
     gc.freeze()  # programs and modules stay: to look through them all again takes longer than a picture
 
@@ -170,22 +173,34 @@ def readings(scene: Scene) -> str:
     return jax.device_get(jam_modes(scene) if has_branches(scene) else critical_speeds(scene)).summary()
 
 
-def picture_of_sketch(scene: Scene) -> Figure:
-    """`jaxvib.sketch`, without the search for its margins."""
-    from jaxvib.show.sketch import sketch  # slow to import: only who draws pays
+def modes_of(scene: Scene) -> list[int]:
+    """The jam modes that `machine` can show moving, stable by slope. First come those that exist at the scene's rotor speed, of
+    these the one at the highest resonance, last the one beyond all resonances. None of a machine that moves both ways.
+    """
+    if not has_branches(scene):
+        return []
+    modes = range(1, 2 * len(scene.machine.structure().coordinates) + 2, 2)
+    try:
+        there = jax.device_get(jam_modes(scene)).mode_numbers()
+    except (InputError, ComputationError):
+        there = []
+    return sorted(modes, key=lambda mode: (mode not in there, mode == modes[-1], -mode))
 
-    figure = sketch(scene)
-    figure.set_layout_engine(None)
-    lines = figure.axes[0].get_title(loc="left").count("\n") + 1
-    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.0, top=1.0 - (0.1 + 0.18 * lines) / figure.get_figheight())
-    return figure
+
+def machine(scene: Scene, mode: int | None) -> str:
+    """The machine as an SVG picture, moving in the jam mode of that number; at rest where there is none."""
+    from jaxvib.show.moving import moving, still  # slow to import: only who draws pays
+
+    return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))
 
 
-def png(figure: Figure) -> bytes:
-    """A figure as a PNG file, drawn once: `savefig` draws twice."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def vector(figure: Figure) -> str:
+    """A figure as the text of an SVG file, drawn once (`savefig` draws twice) and in two thirds of the time of a PNG file:
+    letters are left to the browser."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    figure.set_dpi(_DOTS)
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": 1})
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "none"}):
+        FigureCanvasSVG(figure).print_svg(buffer)
     return buffer.getvalue()

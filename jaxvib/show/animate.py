@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -20,7 +19,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.show.motion import Stretch, of_orbit, of_run
 from jaxvib.show.sketch import checked_scene, fit
-from jaxvib.show.views import View, view_of
+from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose
 from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import Number, number
@@ -150,13 +149,9 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     grid.set_height_ratios([0.8 * tall + 0.3, 1.3, 1.3])
     figure.set_dpi(100.0)
     fit(stage, view)
-    length = [k for k, unit in enumerate(scene.machine.structure().units) if unit == "m"]
-    largest = float(np.max(np.abs(shown.displacement[:, length]), initial=1e-300))
-    per_metre = _circle_scale(view)
-    chosen = 0.3 / largest / per_metre if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
-    if magnify is None:
-        chosen = float(f"{chosen:.1g}")
-    reach = chosen * per_metre
+    given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
+    chosen = view.magnified(shown.displacement) if given is None else given
+    reach = chosen * view.wheel.scale
     poses = [
         Pose(shown.displacement[k], shown.velocity[k], tuple(u[k] for u in shown.angle), float(shown.turn[k]))
         for k in range(shown.time.size)
@@ -171,7 +166,7 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     artists = [put(stage, part) for part in parts(0)]
     clock = stage.set_title("t", loc="left", family="monospace", fontsize="medium")
     slower = (shown.time.size / fps) / (shown.time[-1] - shown.time[0])
-    note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x larger"
+    note = f"slowed down {slower:.3g} x, displacements drawn {chosen:.3g} x as large"
     stage.text(1.0, 0.0, note, transform=stage.transAxes, ha="right", va="top", fontsize="x-small", color="#555555")
     # Texts that are longer than the picture is wide shall not make it smaller.
     for text in stage.texts:
@@ -189,12 +184,6 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     update(0)
     moving: list[Artist] = [*artists, clock, *cursors]
     return Film(figure, update, moving, shown.time.size, fps)
-
-
-def _circle_scale(view: View) -> float:
-    """Drawn units for a metre of the loads' circle."""
-    wheel: Any = getattr(view, "wheel", None)
-    return float(wheel.scale)
 
 
 def _move(artist: Line2D | Polygon, points: np.ndarray) -> None:

@@ -40,9 +40,10 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
     left, right, bottom, top = view.limits
     figure, (axis,) = panels(1, size=(_INCH * (right - left), _INCH * (top - bottom) + 0.6), ax=ax)
     fit(axis, view)
-    for part in view.parts(at_rest(scene), 0.0):
+    pose = at_rest(scene)
+    for part in view.parts(pose, 0.0):
         put(axis, part)
-    for text in view.texts():
+    for text in view.texts(pose, 0.0):
         axis.text(text.x, text.y, text.text, zorder=6, **text.look)
     axis.set_title(caption(scene), loc="left", fontsize="small", y=1.0)  # a place given, none is looked for at each drawing
     return figure if ax is None else ax

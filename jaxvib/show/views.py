@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxvib.draw.machine.parts import Part, arrow, box, circle, damper, ground, spring
+from jaxvib.draw.machine.parts import Part, Text, arrow, box, circle, damper, ground, spring
 from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.layout import Tie, lanes
-from jaxvib.show.wheel import Pose, Text, Wheel, places_of, shown
+from jaxvib.show.wheel import Pose, Wheel, places_of, shown
 
 __all__ = ["View", "view_of"]
 
@@ -44,9 +44,10 @@ def _said(stiffness: float, damping: float) -> str:
 
 
 class View(abc.ABC):
-    """A scene as a drawing in units of its own. `limits` (left, right, bottom, top)."""
+    """A scene as a drawing in units of its own. `limits` (left, right, bottom, top); its `wheel`, the rotor with the loads."""
 
     limits: tuple[float, float, float, float]
+    wheel: Wheel
 
     def __init__(self, scene: Scene):
         carrier = scene.machine.carrier()
@@ -60,9 +61,17 @@ class View(abc.ABC):
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """What is drawn, the same parts in the same order for every pose; `reach` drawn units for a metre of displacement."""
 
+    def magnified(self, displacement: np.ndarray) -> float:
+        """How many times larger than the loads' circle displacements (nt, nd) are drawn so that the largest is well seen; one
+        digit. `parts` takes it times `wheel.scale`.
+        """
+        length = [k for k, unit in enumerate(self.scene.machine.structure().units) if unit == "m"]
+        largest = float(np.max(np.abs(displacement[:, length]), initial=1e-300))
+        return float(f"{0.3 / largest / self.wheel.scale:.1g}")
+
     @abc.abstractmethod
-    def texts(self) -> list[Text]:
-        """Names and numbers of the parts, at rest."""
+    def texts(self, pose: Pose, reach: float) -> list[Text]:
+        """Names and numbers of the parts, as `parts`."""
 
     @abc.abstractmethod
     def supports(self) -> list[tuple[float, float]]:
@@ -131,7 +140,7 @@ class PlatformView(View):
             found.append(Part(box(left, right, y - 0.5 * self.thick, y + 0.5 * self.thick), _BODY, True))
         return found + self.wheel.parts((self.x[len(self.ties) - 1], self._height(self.exciter, pose, reach)), pose)
 
-    def texts(self) -> list[Text]:
+    def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Masses on the platforms, numbers beside the springs."""
         found = []
         for k, tie in enumerate(self.ties):
@@ -145,7 +154,8 @@ class PlatformView(View):
             edges = [(left, x - self.wheel.rim), (x + self.wheel.rim, right)] if level == self.exciter else [(left, right)]
             a, b = max(edges, key=lambda edge: edge[1] - edge[0])
             text = f"M{level} = {shown(float(self.mass[level - 1, level - 1]), 'kg')}"
-            found.append(Text(0.5 * (a + b), level * self.pitch, text, {"ha": "center", "va": "center", "fontsize": "small"}))
+            place = (0.5 * (a + b), self._height(level, pose, reach))
+            found.append(Text(*place, text, {"ha": "center", "va": "center", "fontsize": "small"}))
         return found
 
     def supports(self) -> list[tuple[float, float]]:
@@ -206,7 +216,7 @@ class FrontView(View):
             found.append(Part(circle(tuple(place), max(scale * own, 0.08), 31), look, True))
         return found
 
-    def texts(self) -> list[Text]:
+    def texts(self, pose: Pose, reach: float) -> list[Text]:
         """The mass, and the support's numbers, which hold both ways."""
         told = _said(float(np.max(self.bed_stiffness[1])), float(np.max(self.bed_damping[1])))
         small: dict[str, Any] = {"fontsize": "small"}
@@ -279,7 +289,7 @@ class ShaftView(View):
         centre = (self.front + self._y(self.cg, pose, reach, 0), self._y(self.cg, pose, reach))
         return found + self.wheel.parts(centre, pose)
 
-    def texts(self) -> list[Text]:
+    def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Mass and inertias, supports and stations with their places from the mass centre."""
         small: dict[str, Any] = {"fontsize": "small"}
         whole, turning = np.asarray(self.carrier.mass), self.carrier.gyroscopic

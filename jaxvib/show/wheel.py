@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ from jaxvib.draw.style import COLORS, GUIDE
 from jaxvib.machine.loads import Loads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Pose", "Text", "Wheel", "at_rest", "caption", "places_of", "shown"]
+__all__ = ["Pose", "Wheel", "at_rest", "caption", "places_of", "shown"]
 
 
 class Pose(NamedTuple):
@@ -24,15 +24,6 @@ class Pose(NamedTuple):
     velocity: np.ndarray
     angle: tuple[np.ndarray, ...]
     turn: float
-
-
-class Text(NamedTuple):
-    """A text at a place of the drawing; `look` matplotlib's options."""
-
-    x: float
-    y: float
-    text: str
-    look: dict[str, Any]
 
 
 _UNITS = {
@@ -121,11 +112,9 @@ class Wheel:
         for turn in (pose.turn, pose.turn + 0.5 * np.pi):
             e = np.array([np.cos(turn), np.sin(turn)])
             look = {"color": "#9a9a9a", "lw": 1.0, "zorder": 3.2}
-            found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look))
-        mark = np.array([np.cos(pose.turn), np.sin(pose.turn)])
-        found.append(
-            Part(circle(tuple(centre + 0.82 * self.rim * mark), 0.05), {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True)
-        )
+            found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
+        mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
+        found.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
         across, up, *_ = self.places(pose.angle)
         for j in range(self.loads.count):
             color = COLORS[j % len(COLORS)]

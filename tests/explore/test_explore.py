@@ -1,14 +1,13 @@
 """The explorer: sliders, pictures, file, and the page that wires them, without a browser."""
 
 import base64
-import io
 import re
 import socket
+from xml.etree import ElementTree
 
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 from scenes import TWO_MASS
 
 import jaxvib as jv
@@ -16,11 +15,19 @@ from jaxvib.cli.app import run
 from jaxvib.explore import pictures, serve
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
 from jaxvib.machine.files import TEMPLATES
+from jaxvib.show.moving import moving
+
+SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.fixture(scope="module")
 def one_mass():
     return jv.scene_from_toml(TEMPLATES["one_mass"])
+
+
+@pytest.fixture(scope="module")
+def two_platforms():
+    return jv.scene_from_toml(TEMPLATES["two_mass"])
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)
@@ -101,6 +108,13 @@ def test_what_cannot_be_shown_is_said(one_mass):
     assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
 
 
+def _drawn_lines(picture: str) -> list[list[str]]:
+    """The outlines in an SVG file, each the list of its points."""
+    return [
+        re.findall(r"[ML] [-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(picture).iter(f"{SVG}path")
+    ]
+
+
 def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     """The page is run as marimo runs it; then what it does with its sliders' values is done again at others."""
     path = jv.save_scene(one_mass, tmp_path / "ma<chine.toml")
@@ -109,20 +123,55 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
 
     outputs, found = app.run()
     shown = "".join(str(getattr(output, "text", "")) for output in outputs)
-    images = re.findall(r'src="data:image/png;base64,([^"]+)"', shown)
-    assert len(images) == 2 and "mode 3: Omega" in shown
+    images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', shown)
+    diagram, machine = (base64.b64decode(image).decode() for image in images)
+    assert "mode 3: Omega" in shown and "foundation force, N" in diagram
+    assert found["mode"].value == 1 and "jam mode 1, stable by slope" in machine
     assert found["controls"].value == {each.name: each.start for each in sliders_of(one_mass)}
     assert jv.scene_to_toml(found["machine"].value) == jv.scene_to_toml(one_mass)
-    assert all(Image.open(io.BytesIO(base64.b64decode(image))).size[0] > 300 for image in images)
 
     moved = scene_at(one_mass, {**found["controls"].value, "machine.stiffness[0]": 200.0})
     before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
     assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
     assert f"{float(after.resonances[0]):.6g}" in pictures.text(lambda: pictures.readings(moved), pictures.Tried(moved, ""))
-    drawn = base64.b64encode(pictures.png(pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed)))).decode()
-    assert drawn != images[0]
+    drawn = pictures.vector(pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed)))
+    assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
     again = jv.scene_from_toml(pictures.toml(pictures.Tried(moved, "")))
     assert float(again.machine.stiffness[0]) == 2e5
+
+
+def test_the_machine_moves_as_its_jam_says(two_platforms):
+    """The picture's motion, read from its file, is the jam's: stroke and phase of platforms, loads and force arrows."""
+    jam = jax.device_get(jv.jam_modes(two_platforms)).select(3)
+    drawn = ElementTree.fromstring(moving(two_platforms, jam))
+
+    def shifts(texts: str) -> np.ndarray:
+        (group,) = [g for g in drawn.iter(f"{SVG}g") if texts in "".join(g.itertext())]
+        (motion,) = group.findall(f"{SVG}animateTransform")
+        return np.array([[float(x) for x in pair.split()] for pair in motion.get("values", "").split(";")])
+
+    platforms = [-shifts(f"M{k}")[:, 1] for k in (1, 2)]
+    assert all(shift[0] == shift[-1] == 0.0 for shift in platforms)
+    waves = [np.fft.rfft(shift[:-1])[1] / (0.5 * (len(shift) - 1)) for shift in platforms]
+    ratio = complex(jam.displacement[0] / jam.displacement[1])
+    assert complex(waves[0] / waves[1]) == pytest.approx(ratio, rel=0.01)
+    assert np.angle(waves[0]) == pytest.approx(np.angle(complex(jam.displacement[0])), abs=0.02)
+    turns = {e.get("dur") for e in drawn.iter(f"{SVG}animateTransform") if e.get("type") == "rotate"}
+    (seconds,) = {e.get("dur") for e in drawn.iter(f"{SVG}animateTransform") if e.get("type") == "translate"}
+    (once,) = turns
+    assert float(seconds[:-1]) / float(once[:-1]) == pytest.approx(float(jam.rotor_speed / jam.omega), rel=1e-3)
+    with pytest.raises(jv.ComputationError, match="jam mode 1 is no motion to be shown"):
+        moving(two_platforms, jv.jam_modes(two_platforms).select(1, throw=False))
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_every_template_has_a_picture_and_modes_to_choose(kind):
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    modes = pictures.modes_of(scene)
+    assert modes == [] if not pictures.has_branches(scene) else modes[0] in jv.jam_modes(scene).mode_numbers()
+    shown = pictures.image(lambda: pictures.machine(scene, next(iter(modes), None)), pictures.Tried(scene, ""))
+    data = shown.split("base64,")[1].split('"')[0]
+    assert ElementTree.fromstring(base64.b64decode(data)).tag.endswith("svg")
 
 
 def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Springs, dampers, slabs, discs and arrows as outlines: arrays of points (n, 2), NaN where the pen is lifted."""
+"""Springs, dampers, slabs, discs and arrows as outlines, arrays of points (n, 2), NaN where the pen is lifted; and texts."""
 
 from __future__ import annotations
 
@@ -9,17 +9,28 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
-__all__ = ["Part", "arrow", "box", "circle", "damper", "ground", "put", "spring"]
+__all__ = ["Part", "Text", "arrow", "box", "circle", "damper", "ground", "put", "spring"]
 
 Point = tuple[float, float]
 
 
 class Part(NamedTuple):
-    """An outline to be drawn: its `points` (n, 2), how it looks (matplotlib's options), and whether it is `filled`."""
+    """An outline to be drawn: its `points` (n, 2), how it looks (matplotlib's options), and whether it is `filled`; the
+    point of the rotor's `axis`, where it turns with the rotor."""
 
     points: np.ndarray
     look: dict[str, Any]
     filled: bool = False
+    axis: Point | None = None
+
+
+class Text(NamedTuple):
+    """A text at a place of the drawing; `look` matplotlib's options."""
+
+    x: float
+    y: float
+    text: str
+    look: dict[str, Any]
 
 
 def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:

@@ -1,0 +1,135 @@
+"""Drawings of a machine as SVG pictures that move in every browser, without a script."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.colors import to_hex
+
+from jaxvib.draw.machine.parts import Part, Text
+
+__all__ = ["svg"]
+
+_DOTS = 62.0
+"""Dots a unit of the drawing has."""
+
+_POINT = 100.0 / 72.0
+"""Dots a typographic point has."""
+
+_SIZES = {"small": 8.3, "x-small": 7.0}
+_ANCHORS = {"left": "start", "center": "middle", "right": "end"}
+_DASHES = {":": "1 2", "--": "4 2"}
+
+
+def svg(
+    limits: tuple[float, float, float, float],
+    frames: Sequence[Sequence[Part]],
+    texts: Sequence[Sequence[Text]],
+    head: str,
+    seconds: float,
+    turns: float,
+) -> str:
+    """A moving picture that repeats itself; of one frame, a still one.
+
+    **Arguments**
+
+    - `limits` (left, right, bottom, top) of the drawing
+    - `frames`: the parts at equal distances in time over one period, the same parts in each; the rotor's angle in all of them
+      is that of the first
+    - `texts` at the same times; `head` lines above the drawing
+    - `seconds` that a period lasts; `turns` of the rotor in it, which need not be whole
+
+    **Returns** the text of an SVG file.
+
+    >>> ball = [[Part(np.array([[x, 0.0], [x, 1.0]]), {"color": "red"})] for x in (0.0, 0.5)]
+    >>> "<animateTransform" in svg((0.0, 1.0, 0.0, 1.0), ball, [[], []], "", 1.0, 1.5)
+    True
+    """
+    left, right, bottom, top = limits
+    lines = head.split("\n") if head else []
+    above = 1.35 * _SIZES["small"] * _POINT * len(lines)
+
+    def place(points: np.ndarray) -> np.ndarray:
+        return np.asarray(points, float) * (_DOTS, -_DOTS) + (-left * _DOTS, top * _DOTS + above)
+
+    wide, tall = (right - left) * _DOTS, (top - bottom) * _DOTS + above
+    found = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {tall:.0f}" width="{wide:.0f}" height="{tall:.0f}">'
+    ]
+    order = sorted(range(len(frames[0])), key=lambda k: frames[0][k].look.get("zorder", 1.0 if frames[0][k].filled else 2.0))
+    found += [_part([frame[k] for frame in frames], place, seconds, turns) for k in order]
+    for k, text in enumerate(texts[0]):
+        places = place(np.array([(frame[k].x, frame[k].y) for frame in texts]))
+        found.append(_shifted(_text(*places[0], text.text, text.look), places - places[0], seconds))
+    found += [_text(0.0, 1.35 * _SIZES["small"] * _POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
+    return "".join([*found, "</svg>"])
+
+
+def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], seconds: float, turns: float) -> str:
+    """A part with its motion: a shift of the whole where it keeps its shape, else from outline to outline."""
+    first = frames[0]
+    outlines = np.array([place(frame.points) for frame in frames])
+    shift = np.array([outline[0] for outline in outlines]) - outlines[0, 0]
+    draw = f'<path d="{_path(outlines[0], first.filled)}"{_style(first)}'
+    if len(frames) == 1:
+        return f"{draw}/>"
+    if first.axis is not None:
+        x, y = place(np.asarray(first.axis))
+        angles = f'from="0 {x:.1f} {y:.1f}" to="-360 {x:.1f} {y:.1f}"'
+        turning = f'<animateTransform attributeName="transform" type="rotate" {angles} {_for_ever(seconds / turns)}'
+        draw = f"{draw}>{turning}</path>"
+        moved = np.array([place(np.asarray(frame.axis)) for frame in frames]) - (x, y)
+    elif np.nanmax(np.abs(outlines - outlines[0] - shift[:, None])) < 0.05:
+        draw, moved = f"{draw}/>", shift
+    else:
+        shapes = ";".join(_path(outline, first.filled) for outline in [*outlines, outlines[0]])
+        return f'{draw}><animate attributeName="d" values="{shapes}" {_for_ever(seconds)}</path>'
+    return _shifted(draw, moved, seconds)
+
+
+def _shifted(drawn: str, moved: np.ndarray, seconds: float) -> str:
+    """Something drawn that is shifted by `moved` (n, 2), one place after the other and back to the first."""
+    if np.max(np.abs(moved)) < 0.05:
+        return drawn
+    values = ";".join(f"{x:.1f} {y:.1f}" for x, y in [*moved.tolist(), moved[0].tolist()])
+    motion = f'<animateTransform attributeName="transform" type="translate" values="{values}" {_for_ever(seconds)}'
+    return f"<g>{drawn}{motion}</g>"
+
+
+def _for_ever(seconds: float) -> str:
+    return f'dur="{seconds:.4g}s" repeatCount="indefinite"/>'
+
+
+def _path(points: np.ndarray, closed: bool) -> str:
+    pen, found = "M", []
+    for x, y in points.tolist():
+        if x != x:  # the pen is lifted
+            pen = "M"
+        else:
+            found.append(f"{pen}{x:.1f} {y:.1f}")
+            pen = "L"
+    return "".join([*found, "Z" if closed else ""])
+
+
+def _style(part: Part) -> str:
+    look = part.look
+    fill, stroke = (look.get("fc", "none"), look.get("ec", "none")) if part.filled else ("none", look.get("color", "black"))
+    fill, stroke = (color if color == "none" else to_hex(color) for color in (fill, stroke))
+    dash = look.get("ls", "-")
+    dashed = f' stroke-dasharray="{_DASHES[dash]}"' if dash in _DASHES else ""
+    alpha = f' opacity="{look["alpha"]:g}"' if "alpha" in look else ""
+    return f' fill="{fill}" stroke="{stroke}" stroke-width="{look.get("lw", 1.0) * _POINT:.2f}"{dashed}{alpha}'
+
+
+def _text(x: float, y: float, text: str, look: dict[str, object]) -> str:
+    size = _SIZES[str(look.get("fontsize", "small"))] * _POINT
+    lines = text.split("\n")
+    step = 1.25 * size
+    # Where the first line's base stands, by where the whole of the lines is held.
+    first = {"center": 0.35 * size - 0.5 * step * (len(lines) - 1), "bottom": -step * (len(lines) - 1), "top": 0.8 * size}
+    base = y + first[str(look.get("va", "center"))]
+    anchor = _ANCHORS[str(look.get("ha", "left"))]
+    spans = "".join(f'<tspan x="{x:.1f}" y="{base + k * step:.1f}">{html.escape(line)}</tspan>' for k, line in enumerate(lines))
+    return f'<text font-family="sans-serif" font-size="{size:.1f}" text-anchor="{anchor}">{spans}</text>'

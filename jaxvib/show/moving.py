@@ -1,0 +1,75 @@
+"""A machine as an SVG picture: at rest, or moving as a jam of light loads says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxvib.draw.machine.svg import svg
+from jaxvib.errors import ComputationError
+from jaxvib.machine.scene import Scene
+from jaxvib.show.sketch import checked_scene
+from jaxvib.show.views import view_of
+from jaxvib.show.wheel import Pose, at_rest, caption
+from jaxvib.steady.jams.jam import Jam
+
+__all__ = ["moving", "still"]
+
+_FRAMES = 20
+"""Poses of a period, between which browsers draw straight lines: circles are true to 1 %."""
+
+_SECONDS = 1.6
+"""What a period lasts in the picture."""
+
+
+def moving(scene: Scene, jam: Jam) -> str:
+    """The sketch of a scene, moving as a jam mode says, with the forces on the bed as arrows; the rotor runs ahead of the loads
+    at its own speed. Loads stand where they stay together, upon each other.
+
+    **Arguments**: `scene` of platforms, and a `jam` of it, from `jam_modes`.
+
+    **Returns** the text of an SVG file, which repeats one period for ever. **Raises** `ComputationError` for a jam mode that
+    does not exist or has no bound; it says which.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
+    >>> moving(scene, jv.jam_modes(scene).select(1)).count("<animate") > 10
+    True
+    """
+    view = view_of(checked_scene(scene))
+    omega, amplitude = float(jam.omega), np.asarray(jam.displacement)
+    if not np.isfinite(omega) or not np.isfinite(amplitude).all():
+        raise ComputationError("absent", f"jam mode {int(jam.mode)} is no motion to be shown: {jam.message}")
+    theta = 2.0 * np.pi * np.arange(_FRAMES) / _FRAMES
+    first, *others = (np.asarray(u, float) for u in scene.loads.rest())
+    wave = np.exp(1j * theta)[:, None] * amplitude
+    displacement, velocity = np.real(wave), np.real(1j * omega * wave)
+    poses = [
+        Pose(q, v, (np.full_like(first, angle), *others), 0.0)
+        for q, v, angle in zip(displacement, velocity, theta, strict=True)
+    ]
+    forces = [view.support_forces(pose) for pose in poses]
+    totals = [np.array([force[:, 1].sum()]) for force in forces]
+    most = max(float(np.max(np.abs(np.concatenate([np.ravel(x) for x in (*forces, *totals)])))), 1e-300)
+    magnified = view.magnified(displacement)
+    reach = magnified * view.wheel.scale
+    frames = [[*view.parts(p, reach), *view.arrows(p, total, 0.7 / most)] for p, total in zip(poses, totals, strict=True)]
+    slower = _SECONDS * omega / (2.0 * np.pi)
+    head = (
+        f"{caption(scene)}\njam mode {int(jam.mode)}, {jam.judgement}: slowed down {slower:.3g} x, displacements drawn "
+        f"{magnified:.3g} x as large, longest arrow {most:.3g} N"
+    )
+    return svg(view.limits, frames, [view.texts(pose, reach) for pose in poses], head, _SECONDS, float(jam.rotor_speed) / omega)
+
+
+def still(scene: Scene) -> str:
+    """The sketch of a scene at rest as the text of an SVG file, made in a fraction of the time of `jaxvib.sketch`.
+
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> "M = " in still(jv.scene_from_toml(TEMPLATES["planar_rotor"]))
+    True
+    """
+    view, pose = view_of(checked_scene(scene)), at_rest(scene)
+    return svg(view.limits, [view.parts(pose, 0.0)], [view.texts(pose, 0.0)], caption(scene), _SECONDS, 0.0)
