@@ -9,7 +9,7 @@ the mass of a platform. It is judged without and with damping in one `vmap`. The
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 
 import equinox as eqx
@@ -65,5 +65,8 @@ def main(count: int) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    asked = sys.argv[1] if len(sys.argv) > 1 else "100000"
-    main(1000 if asked == "--quick" else int(float(asked)))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", nargs="?", type=float, default=1e5)
+    parser.add_argument("--quick", action="store_true")
+    given = parser.parse_args()
+    main(1000 if given.quick else int(given.count))

@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
+from jaxvib.runtime.many import in_chunks
 from optimize import DesignSpace, Quantity, force_per_amplitude
 from optimize.search import descent, find, model, polish
-from optimize.search.problem import Point, Problem, chunked, looked_up, problem_of
+from optimize.search.problem import Point, Problem, looked_up, problem_of
 
 __all__ = ["SIZES", "chain", "gradient_cost", "race"]
 
@@ -154,7 +155,7 @@ class Values:
         return found
 
     def _at(self, z: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found, (omega,) = chunked(self.problem.lanes, lambda x, w: _one_by_one(self.problem, x, (w,)), z, near)
+        found, (omega,) = in_chunks(self.problem.lanes, lambda x, w: _one_by_one(self.problem, x, (w,)), z, near)
         return np.array(found[:, 0]), np.array(omega)
 
     def _note(self, found: np.ndarray) -> None:

@@ -6,6 +6,7 @@ cores.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -85,18 +86,9 @@ class Problem(eqx.Module):
             return None
         kept = [k for k, d in enumerate(demands) if not (_hard(d.quantity) or _hard(d.limit))]
         space = eqx.tree_at(lambda s: s.held, self.space, held)
-        keys = report_keys(
-            [objective, *(h.quantity for h in held), *(q for k in kept for q in _sides(demands[k]))], space.scene
-        )
-        index = np.asarray(kept, int)
-        forms = tuple(demands[k] for k in kept)
-        easy = Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes)
-        return easy.in_parts()
-
-    def in_parts(self) -> Problem:
-        """The same search, told of how many pieces its objective is the largest."""
-        pieces = jax.eval_shape(lambda scene: self.objective.pieces(Answers(scene, Recorder())), self.space.scene)
-        return replace(self, parts=pieces.shape[0])
+        forms, index = tuple(demands[k] for k in kept), np.asarray(kept, int)
+        keys, parts = _followed(space, objective, forms)
+        return Problem(space, objective, forms, keys, self.constants[index], self.scales[index], self.lanes, parts)
 
     @property
     def forward_only(self) -> bool:
@@ -105,8 +97,10 @@ class Problem(eqx.Module):
         return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
 
 
-def _sides(demand: Demand) -> tuple[Quantity, Quantity]:
-    return demand.quantity, demand.limit
+def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
+    """What a search follows, and of how many smooth pieces its objective is the largest."""
+    sides = (q for demand in demands for q in (demand.quantity, demand.limit))
+    return _asked((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
 
 def _hard(quantity: Quantity) -> bool:
@@ -161,17 +155,15 @@ class Point(NamedTuple):
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
     """The search, with what it follows and the scale of each demand: that of its limit, or of its value at the beginning."""
-    forms, ones = tuple(demand.form() for demand in demands), np.ones(len(demands))
-    blank = Problem(space, objective, forms, (), ones, ones)
-    recorder = Recorder()
-    jax.eval_shape(lambda scene: blank.read(Answers(scene, recorder)), space.scene)
+    forms = tuple(demand.form() for demand in demands)
+    keys, parts = _followed(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
         sides = tuple(q for d in demands for q in (d.quantity, d.limit))
         found = np.abs(reported(sides, jax.tree.map(lambda leaf: leaf[None], space.scene))[0]).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
-    return Problem(space, objective, forms, tuple(recorder.keys), constants, scales, _lanes(starts)).in_parts()
+    return Problem(space, objective, forms, keys, constants, scales, _lanes(starts), parts)
 
 
 def derive(
@@ -251,11 +243,35 @@ def made(problem: Problem, numbers: np.ndarray) -> Scene:
     return in_chunks(problem.lanes, lambda x: _made(problem.space, x), numbers)
 
 
+class _Shapes(NamedTuple):
+    """What a scene is but for its numbers."""
+
+    tree: Any
+    leaves: tuple[tuple[tuple[int, ...], Any], ...]
+
+    @classmethod
+    def of(cls, scene: Scene) -> _Shapes:
+        leaves, tree = jax.tree.flatten(scene)
+        return cls(tree, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+
+
+@functools.lru_cache(maxsize=256)
+def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
+    """What these quantities of a scene follow, and of how many smooth pieces the first one is the largest."""
+    recorder = Recorder()
+
+    def ask(scene: Scene) -> tuple[Array, list[Array]]:
+        answers = Answers(scene, recorder)
+        return quantities[0].pieces(answers), [q.read(answers) for q in quantities]
+
+    scene = jax.tree.unflatten(shapes.tree, [jax.ShapeDtypeStruct(*leaf) for leaf in shapes.leaves])
+    pieces, _ = jax.eval_shape(ask, scene)
+    return tuple(recorder.keys), pieces.shape[0]
+
+
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
     """What these quantities follow."""
-    recorder = Recorder()
-    jax.eval_shape(lambda scene: [q.read(Answers(scene, recorder)) for q in quantities], scene)
-    return tuple(recorder.keys)
+    return _asked(tuple(quantities), _Shapes.of(scene))[0]
 
 
 @cached

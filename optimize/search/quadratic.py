@@ -21,6 +21,11 @@ class Solved(NamedTuple):
     bounds: np.ndarray
 
 
+def times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Matrices (s, m, n) times vectors (s, n)."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
 def elastic(
     bend: np.ndarray,
     slope: np.ndarray,
@@ -80,12 +85,10 @@ def elastic(
     # Begin in the middle of the box, where all products of slacks and duals are alike and the prices are about paid.
     x = np.zeros((s, n))
     x[:, :d] = (low + high) / 2.0
-    broken = np.concatenate(
-        [np.einsum("smd,sd->sm", a_rows, x[:, :d]) + a, np.einsum("smd,sd->sm", c_rows, x[:, :d]) + c], axis=1
-    )
+    broken = np.concatenate([times(a_rows, x[:, :d]) + a, times(c_rows, x[:, :d]) + c], axis=1)
     wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
     x[:, d:] = wide[:, None]
-    slack = np.maximum(right - np.einsum("smn,sn->sm", rows, x), 1e-12)
+    slack = np.maximum(right - times(rows, x), 1e-12)
     dual = (price * wide / 3.0)[:, None] / slack
     turned = np.swapaxes(rows, 1, 2)
     scale = 1.0 + np.abs(linear).max(axis=1)
@@ -93,8 +96,8 @@ def elastic(
 
     best, least = (x, dual), np.full(s, np.inf)
     for _ in range(_STEPS):
-        stationary = np.einsum("sij,sj->si", quadratic, x) + linear + np.einsum("snm,sm->sn", turned, dual)
-        primal = np.einsum("smn,sn->sm", rows, x) + slack - right
+        stationary = times(quadratic, x) + linear + times(turned, dual)
+        primal = times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
         # Rounding may spoil a point that was good already: the best one counts.
         off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
@@ -105,7 +108,7 @@ def elastic(
         if np.all(done):
             break
         weight = dual / slack
-        matrix = quadratic + np.einsum("snm,sm,smk->snk", turned, weight, rows)
+        matrix = quadratic + (turned * weight[:, None, :]) @ rows
         matrix = matrix + ridge * np.trace(matrix, axis1=1, axis2=2)[:, None, None] / n + 1e-300 * np.eye(n)
 
         def solved(
@@ -117,9 +120,9 @@ def elastic(
             slack: np.ndarray = slack,
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """The step that brings the products of slacks and duals to `target` more."""
-            rest = -stationary - np.einsum("snm,sm->sn", turned, weight * primal + target / slack)
+            rest = -stationary - times(turned, weight * primal + target / slack)
             dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
-            ds = -primal - np.einsum("smn,sn->sm", rows, dx)
+            ds = -primal - times(rows, dx)
             return dx, ds, target / slack - weight * ds
 
         def longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
