@@ -19,6 +19,8 @@ import numpy as np
 
 import jaxvib as jv
 
+jv.prepare_cpu()
+
 NAMES = ("mass", "stiffness", "damping", "link_stiffness", "link_damping")
 
 

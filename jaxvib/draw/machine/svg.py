@@ -62,7 +62,8 @@ def svg(
     found += [_part([frame[k] for frame in frames], place, seconds, turns) for k in order]
     for k, text in enumerate(texts[0]):
         places = place(np.array([(frame[k].x, frame[k].y) for frame in texts]))
-        found.append(_shifted(_text(*places[0], text.text, text.look), places - places[0], seconds))
+        x, y = places[0].tolist()
+        found.append(_shifted(_text(x, y, text.text, text.look), places - places[0], seconds))
     found += [_text(0.0, 1.35 * _SIZES["small"] * _POINT * (k + 0.5), line, {}) for k, line in enumerate(lines)]
     return "".join([*found, "</svg>"])
 
