@@ -13,6 +13,7 @@ from jaxvib.units import count, number
 from optimize import quantities
 from optimize.quantities import Quantity
 from optimize.result import Synthesis
+from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
 from optimize.wishes.quantity import Demand
@@ -66,7 +67,7 @@ def load_design(path: str | Path) -> Design:
     it is, its value; every `[[demand]]` a quantity that is `at_most` or `at_least` a value; `[objective]` the quantity to make
     small, or large with `maximize = true`. A quantity with `tolerances` is taken over machines that are off by these,
     `statistic = "expected"` or `"worst"`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`,
-    `polishing`.
+    `polishing`, `searcher`.
 
     **Arguments**: `path` of a TOML file.
 
@@ -110,10 +111,13 @@ def load_design(path: str | Path) -> Design:
     if more.get("maximize", False):
         objective = -objective
     search = dict(tables.get("search", {}))
-    allowed = ["starts", "seed", "iterations", "rate", "polishing"]
+    allowed = ["starts", "seed", "iterations", "rate", "polishing", "searcher"]
     for name, value in search.items():
         if name not in allowed:
             raise InputError(f"search.{name}", f"is no field here; {closest(name, allowed)}")
+        if name == "searcher":
+            require_searcher(value)
+            continue
         if name == "rate":
             search[name] = float(number(value, "", "search.rate", low=0.0, open_low=True))
             if not search[name] < 1.0:

@@ -20,7 +20,7 @@ from jaxvib.results.status import failure
 from jaxvib.units import count
 from optimize.quantities import amplitude, force_per_amplitude, foundation_force, jam_frequency
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
-from optimize.search.find import Found, Options, choose
+from optimize.search.find import Found, Options, Searcher, choose, require_searcher
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem, made, problem_of, reported
 from optimize.search.sense import influences_of, limits_of, machines_of, neighbours
@@ -50,6 +50,7 @@ def synthesize(
     iterations: int = 100,
     polishing: int = 12,
     rate: float = 0.05,
+    searcher: Searcher = "gradients",
     begin: Synthesis | None = None,
     verify: bool = True,
     throw: bool = True,
@@ -69,6 +70,9 @@ def synthesize(
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
     - `starts`, `seed`: how many random starts, and which; `iterations` of the descent with first step `rate` (in parts of a
       free number's range), then `polishing` steps of sequential quadratic programming
+    - `searcher`: what comes before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which asks for values
+      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `jaxvib[cma]`); its few best designs
+      are polished
     - `begin`: go on from where another search of this space ended, in place of random starts
     - `verify`: compute the exact motion of the best design, integrate its full equations from the jam until they have settled,
       and measure
@@ -93,7 +97,7 @@ def synthesize(
 
     Source: the antiphase paper, section 5.1, found there by algebra.
     """
-    options = _options(starts, seed, iterations, polishing, rate)
+    options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _checked(space, objective, subject_to)
     tell = progress or (lambda _what, _share: None)
     if begin is not None:
@@ -159,14 +163,15 @@ def synthesize(
     )
 
 
-def _options(starts: int, seed: int, iterations: int, polishing: int, rate: float) -> Options:
+def _options(starts: int, seed: int, iterations: int, polishing: int, rate: float, searcher: Searcher) -> Options:
     count(starts, "starts")
     count(iterations, "iterations")
     count(polishing, "polishing", low=0)
     if not 0.0 < rate < 1.0:
         raise InputError("rate", f"is {rate!r}; it must be greater than 0 and less than 1")
     count(seed, "seed", low=0)
-    return Options(starts, seed, iterations, float(rate), polishing)
+    require_searcher(searcher)
+    return Options(starts, seed, iterations, float(rate), polishing, searcher)
 
 
 def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Demand]) -> tuple[Demand, ...]:

@@ -14,15 +14,14 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.runtime.many import in_chunks
 from optimize import DesignSpace, Quantity, force_per_amplitude
 from optimize.search import descent, find, model, polish
+from optimize.search.evolve import Followed, evolve
 from optimize.search.problem import Point, Problem, looked_up, problem_of
 
 __all__ = ["SIZES", "chain", "gradient_cost", "race"]
@@ -92,9 +91,9 @@ def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
     return timed(jax.jit(value)), timed(jax.jit(jax.value_and_grad(value)))
 
 
-def by_gradients(problem: Problem, starts: int, iterations: int, polishing: int, seed: int = 0) -> Course:
-    """The search of `synthesize`, watched."""
-    course, counted = Course([], [], []), [0]
+def by_gradients(problem: Problem, polishing: int, seconds: float) -> Course:
+    """The search of `synthesize`, watched: from 16 starts, and anew from four times as many while there is time."""
+    course, counted, descending = Course([], [], []), [0], [0]
     inner = model.evaluate
 
     def watched(problem: Problem, z: np.ndarray, near: tuple[np.ndarray, ...]) -> Point:
@@ -102,7 +101,7 @@ def by_gradients(problem: Problem, starts: int, iterations: int, polishing: int,
         return inner(problem, z, near)
 
     def told(_share: float, point: Point) -> None:
-        counted[0] += descending[0] * starts * descent.STRETCH
+        counted[0] += descending[0] * descent.STRETCH
         values = point.values[np.isfinite(point.values[:, 0]), 0]
         for row, new in zip(course, (time.perf_counter() - begun, counted[0], float(np.min(values))), strict=True):
             row.append(new)
@@ -110,105 +109,73 @@ def by_gradients(problem: Problem, starts: int, iterations: int, polishing: int,
     kept = [(module, module.evaluate) for module in (model, polish, find)]
     for module, _ in kept:
         module.evaluate = watched
+    starts, begun = 16, time.perf_counter()
     try:
-        begun = time.perf_counter()
-        drawn = polish.draw_starts(problem, starts, seed, looked_up)
-        assert drawn.point is not None
-        descending = [1]
-        point = descent.descend(problem, drawn.point, iterations, 0.05, told).point
-        descending[0] = 0
-        best = np.argsort(point.values[:, 0])[: max(1, starts // 4)]
-        polish.polish(problem, point.take(best), polishing, told)
+        while not course.seconds or course.seconds[-1] < seconds / 5.0:  # the next round takes four times as long
+            drawn = polish.draw_starts(problem, starts, starts, looked_up)
+            assert drawn.point is not None
+            descending[0] = len(drawn.point.z)
+            point = descent.descend(problem, drawn.point, 200, 0.05, told).point
+            descending[0] = 0
+            best = np.argsort(point.values[:, 0])[: starts // 4]
+            polish.polish(problem, point.take(best), polishing, told)
+            starts *= 4
     finally:
         for module, old in kept:
             module.evaluate = old
     return course
 
 
-@eqx.filter_jit
-def _one_by_one(problem: Problem, z: jax.Array, near: tuple[jax.Array, ...]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    return jax.vmap(lambda x, w: problem.values(x, w))(z, near)
-
-
-class Values:
-    """Values of populations, their jams followed from the nearest of the last designs; looked up where that leads nowhere."""
-
-    def __init__(self, problem: Problem):
-        self.problem, self.begun, self.course = problem, time.perf_counter(), Course([], [], [])
-        self.z, self.near = np.zeros((0, problem.space.size)), np.zeros(0)
-
-    def of(self, z: np.ndarray) -> np.ndarray:
-        """Those of the designs z (s, d), noted in the course."""
-        z = np.clip(z, 0.0, 1.0)
-        near = np.full(len(z), np.nan)
-        if len(self.z):
-            nearest = np.argmin(np.sum((z[:, None] - self.z[None, -200:]) ** 2, axis=2), axis=1)
-            near = self.near[-200:][nearest]
-        found, omega = self._at(z, near)
-        lost = np.flatnonzero(~np.isfinite(found))
-        if len(lost):
-            found[lost], omega[lost] = self._at(z[lost], looked_up(self.problem, z[lost])[0])
-        good = np.isfinite(found)
-        self.z, self.near = np.concatenate([self.z, z[good]])[-200:], np.concatenate([self.near, omega[good]])[-200:]
-        found = np.where(good, found, 1e12)
-        self._note(found)
-        return found
-
-    def _at(self, z: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found, (omega,) = in_chunks(self.problem.lanes, lambda x, w: _one_by_one(self.problem, x, (w,)), z, near)
-        return np.array(found[:, 0]), np.array(omega)
-
-    def _note(self, found: np.ndarray) -> None:
-        evaluations, values = self.course.evaluations, self.course.values
-        evaluations.append(sum(evaluations[-1:]) + len(found))
-        self.course.seconds.append(time.perf_counter() - self.begun)
-        values.append(min([float(found.min()), *values[-1:]]))
-
-
 def by_differential_evolution(problem: Problem, seconds: float, seed: int = 0) -> Course:
     """SciPy's differential evolution, its population of 8 d evaluated at once."""
     from scipy.optimize import differential_evolution
 
-    values = Values(problem)
+    followed, course, begun = Followed(problem), Course([], [], []), time.perf_counter()
+
+    def values(z: np.ndarray) -> np.ndarray:
+        found = followed.of(np.clip(z.T, 0.0, 1.0))[:, 0]
+        found = np.where(np.isfinite(found), found, 1e12)
+        course.seconds.append(time.perf_counter() - begun)
+        course.evaluations.append(sum(course.evaluations[-1:]) + len(found))
+        course.values.append(min([float(found.min()), *course.values[-1:]]))
+        return found
+
     differential_evolution(
-        lambda z: values.of(np.asarray(z.T)), [(0.0, 1.0)] * problem.space.size, vectorized=True,
+        values, [(0.0, 1.0)] * problem.space.size, vectorized=True,
         updating="deferred", maxiter=100_000, popsize=8, seed=seed, polish=False, tol=0.0,
-        callback=lambda *_args, **_more: time.perf_counter() - values.begun > seconds,
+        callback=lambda *_args, **_more: course.seconds[-1] > seconds,
     )  # fmt: skip
-    return values.course
+    return course
 
 
-def by_evolution_strategy(problem: Problem, seconds: float, seed: int = 1) -> Course:
-    """CMA-ES (package cma), begun anew with twice the population where it has settled."""
-    import cma
+def by_evolution_strategy(problem: Problem, seconds: float, seed: int = 0) -> Course:
+    """The search of `synthesize` by CMA-ES, without its polishing, until its time is over."""
+    course, begun, most = Course([], [], []), time.perf_counter(), 10**9
 
-    values, population = Values(problem), 4 + int(3 * np.log(problem.space.size))
-    while time.perf_counter() - values.begun < seconds:
-        random = np.random.default_rng(seed)
-        es = cma.CMAEvolutionStrategy(
-            random.uniform(size=problem.space.size), 0.3,
-            {"bounds": [0, 1], "seed": seed, "verbose": -9, "popsize": population},
-        )  # fmt: skip
-        while not es.stop() and time.perf_counter() - values.begun < seconds:
-            z = es.ask()
-            es.tell(z, list(values.of(np.asarray(z))))
-        seed, population = seed + 1, 2 * population
-    return values.course
+    def told(share: float, least: float) -> None:
+        now = time.perf_counter() - begun
+        for row, new in zip(course, (now, round(share * most), least), strict=True):
+            row.append(new)
+        if now > seconds:
+            raise KeyboardInterrupt
+
+    evolve(problem, most, seed, told)
+    return course
 
 
 def race(free: int, seconds: float) -> None:
     """Prints when each search came within 1 % of the least value found."""
     space, wish = chain(free)
     problem = problem_of(space, wish, ())
-    settings = (16, 200, 10 if free <= 30 else 3)
-    by_gradients(problem, *settings)
-    Values(problem).of(np.full((1, free), 0.5))
+    polishing = 10 if free <= 30 else 3
+    by_gradients(problem, polishing, 0.0)
+    Followed(problem).of(np.full((1, free), 0.5))
     courses = {
-        "gradients, 16 starts": by_gradients(problem, *settings),
+        "gradients": by_gradients(problem, polishing, seconds),
         "CMA-ES": by_evolution_strategy(problem, seconds),
         "differential evolution": by_differential_evolution(problem, seconds),
     }
-    least = min(course.values[-1] for course in courses.values())
+    least = min(min(course.values) for course in courses.values())
     print(f"{free} free numbers, {SIZES[free]} platforms; least value {least:.6g}")
     for name, course in courses.items():
         print(f"  {name}: best {min(course.values):.6g}; within 1 %: {course.reached(1.01 * least)}", flush=True)

@@ -115,7 +115,7 @@ def true_error(scene: jv.Scene, run: jv.Run, best: jv.Run) -> float:
 def measured(kind: str, seed: int, dtype: type) -> dict[str, float | str | int]:
     scene, double = drawn(kind, seed), dtype is np.float64
     rng = np.random.default_rng([seed, 1])
-    low, high = (-9.0, -5.0) if double else (-6.0, -3.0)
+    low, high = (-9.0, -5.0) if double else (-5.9, -3.0)
     tolerance, accuracy = 10.0 ** rng.uniform(low, high), 10.0 ** rng.uniform(-5.0 if double else -3.5, -2.0)
     asked = dict(save="window", max_steps=MAX_STEPS, throw=False)
     best, other = (jv.simulate(scene, UNTIL, stepsize_controller=jv.Tolerance(t), estimate=False, **asked) for t in BEST)

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import argparse
 import collections
+import dataclasses
+import functools
 import json
 import pathlib
 import tempfile
@@ -27,6 +29,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import numba
 import numpy as np
 
 import jaxvib as jv
@@ -35,7 +38,7 @@ from jaxvib.results.status import status_name
 from jaxvib.study.stress.asked import away, end_of_run, light_force_slope, state_of
 from jaxvib.study.stress.asked import compared_state as compared
 from jaxvib.study.stress.motions import run_out
-from jaxvib.study.stress.plain import light_modes, light_speed, plain
+from jaxvib.study.stress.plain import Plain, figure, light_modes, light_speed, plain
 
 jv.prepare_cpu()
 
@@ -153,6 +156,44 @@ def drawn(rng: np.random.Generator) -> jv.Scene:
     return jv.Scene(machine, loads, jv.ConstantSpeed(speed))
 
 
+@numba.njit(cache=True)
+def _rates(
+    y: np.ndarray, whole: np.ndarray, damping: np.ndarray, stiffness: np.ndarray, at: int, own: np.ndarray, turned: np.ndarray,
+    drag: np.ndarray, speed: float,
+) -> np.ndarray:  # fmt: skip
+    nd, n = whole.shape[0], own.size
+    q, v, phi, rate = y[:nd], y[nd : 2 * nd], y[2 * nd : 2 * nd + n], y[2 * nd + n :]
+    matrix, right = np.zeros((nd + n, nd + n)), np.zeros(nd + n)
+    matrix[:nd, :nd] = whole
+    right[:nd] = -(damping @ v) - stiffness @ q
+    for j in range(n):
+        matrix[at, nd + j] = matrix[nd + j, at] = own[j] * np.cos(phi[j])
+        matrix[nd + j, nd + j] = turned[j]
+        right[at] += own[j] * np.sin(phi[j]) * rate[j] ** 2
+        right[nd + j] = drag[j] * (speed - rate[j])
+    change = np.linalg.solve(matrix, right)
+    return np.concatenate((v, change[:nd], rate, change[nd:]))
+
+
+class Fast(Plain):
+    """The same dense equations without effects at constant speed, compiled: SciPy asks for them a thousand times a scene."""
+
+    @functools.cached_property
+    def numbers(self) -> tuple:
+        own = self.m * self.radius
+        matrices = (np.ascontiguousarray(x) for x in (self.whole_mass, self.damping, self.stiffness))
+        drag = self.drag * self.radius**2
+        return *matrices, self.at, own, self.kappa * own * self.radius, drag, figure(self.drive, "speed")
+
+    def field(self, t: float, y: np.ndarray, press: float = 0.0) -> np.ndarray:
+        return _rates(y, *self.numbers)
+
+
+def fast(scene: jv.Scene) -> Fast:
+    p = plain(scene)
+    return Fast(**{field.name: getattr(p, field.name) for field in dataclasses.fields(p)})
+
+
 def relative(found: np.ndarray, right: np.ndarray) -> float:
     return float(np.max(np.abs(np.asarray(found) - right)) / np.max(np.abs(right)))
 
@@ -184,7 +225,7 @@ def ask_orbit(scene: jv.Scene, rng: np.random.Generator) -> str:
         return f"named: {status_name(orbit.status)}"
     q, v, (phi,), (rate,) = orbit.at(0.0)
     y = np.concatenate([np.asarray(x, float) for x in (q, v, phi, rate)])
-    out = run_out(plain(scene), y, 2.0 * np.pi / float(orbit.omega))
+    out = run_out(fast(scene), y, 2.0 * np.pi / float(orbit.omega))
     nd, n = len(orbit.units), scene.loads.count
     end = out.state.copy()
     end[2 * nd : 2 * nd + n] -= 2.0 * np.pi
@@ -194,7 +235,7 @@ def ask_orbit(scene: jv.Scene, rng: np.random.Generator) -> str:
 
 
 def ask_run(scene: jv.Scene, rng: np.random.Generator) -> str:
-    p = plain(scene)
+    p = fast(scene)
     fastest = max(float(scene.drive.speed), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
     until, y = 40.0 / fastest, away(scene, displacement=1.0, rate=0.3)
     run = jv.simulate(scene, until, start=state_of(scene, y), save="window", throw=False)

@@ -20,11 +20,22 @@ if TYPE_CHECKING:
 @click.option("--starts", type=int, help="Random starts, in place of the design file's.")
 @click.option("--seed", type=int, help="Which random starts, in place of the design file's.")
 @click.option(
+    "--searcher", type=click.Choice(["gradients", "cma"]), help="Adam from starts, or CMA-ES, in place of the design file's."
+)
+@click.option(
     "--resume", type=click.Path(path_type=Path), help="Go on from the search.npz of an earlier search of this design."
 )
 @click.option("--no-verify", is_flag=True, help="Do not check the best machine by its exact motion and by time integration.")
 @shared
-def optimize(design: Path, starts: int | None, seed: int | None, resume: Path | None, no_verify: bool, output: Output) -> None:
+def optimize(
+    design: Path,
+    starts: int | None,
+    seed: int | None,
+    searcher: str | None,
+    resume: Path | None,
+    no_verify: bool,
+    output: Output,
+) -> None:
     """Search the machine that DESIGN asks for; --out keeps its scene file, the search, the pictures and the motion it was
     checked by. Ctrl-C ends the search with the best machine so far; --resume goes on from there."""
     from rich.console import Console
@@ -33,7 +44,7 @@ def optimize(design: Path, starts: int | None, seed: int | None, resume: Path | 
     from optimize import Synthesis, load_design, synthesize
 
     loaded = load_design(design)
-    given = {"starts": starts, "seed": seed}
+    given = {"starts": starts, "seed": seed, "searcher": searcher}
     options = {**loaded.search, **{name: value for name, value in given.items() if value is not None}}
     with Progress(
         TextColumn("{task.description}"),

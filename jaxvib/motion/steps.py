@@ -78,9 +78,10 @@ def small_number(value: float, name: str, time: Array, least: float) -> float:
     precision = float(jnp.finfo(time.dtype).eps)
     plain = isinstance(value, (int, float)) and not isinstance(value, bool)
     if not (plain and least * precision <= value < 1.0):
+        # 5 % more, so that what is said, two digits, is not below what is allowed.
         raise InputError(
             name,
-            f"is {value!r}; in {time.dtype} it must be at least {least * precision:.1g} and less than 1"
+            f"is {value!r}; in {time.dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
             + ("" if plain else ", a number of Python's own such as 1e-6")
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )

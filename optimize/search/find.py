@@ -6,18 +6,20 @@ import heapq
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from jaxvib.errors import InputError
 from optimize.search.descent import descend
+from optimize.search.evolve import evolve, require_cma
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, polish
 from optimize.search.problem import Point, Problem, evaluate, looked_up
 from optimize.space.space import DesignSpace
 from optimize.wishes.cases import Robust
 from optimize.wishes.quantity import walk
 
-__all__ = ["Found", "Options", "choose", "find"]
+__all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
 
 _NODES = 400
 """Bounds that are looked at before a catalogue is given up on."""
@@ -26,6 +28,9 @@ _FEW = 8
 """Designs that each bound of a catalogue is searched from."""
 
 Tell = Callable[[str, float], None]
+
+Searcher = Literal["gradients", "cma"]
+"""What leads from the bounds to where polishing begins: Adam from many starts, or CMA-ES."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,7 @@ class Options:
     iterations: int
     rate: float
     polishing: int
+    searcher: Searcher = "gradients"
     begin: np.ndarray | None = None
 
 
@@ -62,6 +68,14 @@ class Found(NamedTuple):
         if np.any(kept):
             return int(np.argmin(np.where(kept, self.point.values[:, 0], np.inf)))
         return int(np.argmin(self.violation))
+
+
+def require_searcher(searcher: object) -> None:
+    """**Raises** `InputError` for what is no `Searcher`, or one that is not installed."""
+    if searcher not in get_args(Searcher):
+        raise InputError("searcher", f"is {searcher!r}; it must be one of: {', '.join(map(repr, get_args(Searcher)))}")
+    if searcher == "cma":
+        require_cma()
 
 
 def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
@@ -101,8 +115,19 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     """Searches from random starts, or from the designs `begin`; None where no design has the objective. An interrupt
     (KeyboardInterrupt) ends the search with what it has."""
     tell("drawing starts", 0.0)
-    begin = options.begin
-    if begin is not None:
+    begin, history, interrupted = options.begin, [], False
+    if begin is None and options.searcher == "cma":
+        evolved = evolve(
+            problem,
+            options.starts * options.iterations,
+            options.seed,
+            lambda share, least: tell(f"evolving, best {least:.4g}", 0.05 + 0.45 * share),
+        )
+        point, drawn, existing, interrupted = evolved.point, evolved.drawn, evolved.existing, evolved.interrupted
+        history.append(evolved.history)
+        # What it found is polished, not descended from.
+        options = replace(options, iterations=0, polishing=0 if interrupted else options.polishing)
+    elif begin is not None:
         point = evaluate(problem, begin, looked_up(problem, begin))
         point = point.take(np.flatnonzero(point.exists()))
         drawn = existing = len(begin)
@@ -112,8 +137,8 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         drawn, existing = starts.drawn, starts.existing
     if point is None or len(point.z) == 0:
         return None
-    history = [point.values[None, :, 0]]
-    last, interrupted = point, False
+    history.append(point.values[None, :, 0])
+    last = point
 
     def said(what: str, low: float, high: float) -> Callable[[float, Point], None]:
         def tell_of(share: float, now: Point) -> None:
@@ -138,7 +163,9 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     point = _of_their_mode(problem, ended.point)
     violation = np.where(point.exists(), ended.violation, np.inf)
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
-    whole = np.concatenate(history)
+    # Of an evolution there is one value a generation; starts begin behind it.
+    wide = max(part.shape[1] for part in history)
+    whole = np.concatenate([np.broadcast_to(part, (len(part), wide)) for part in history])
     return Found(point, whole, ended.left, violation, ended.optimality, drawn, existing, interrupted, bounds)
 
 

@@ -1,0 +1,144 @@
+"""CMA-ES: designs sought by the values of the objective alone, for those with many valleys."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError
+from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.programs import cached
+from optimize.search.problem import Known, Point, Problem, evaluate, looked_up
+
+__all__ = ["Evolved", "Followed", "evolve", "require_cma"]
+
+_PRICE = 10.0
+"""What breaking a demand by its own size costs, in typical values of the objective."""
+
+_LANES = 8
+"""Designs that are computed together: populations are small, and few of them are lost at a time."""
+
+_REMEMBERED = 200
+"""So many last designs' jams are known."""
+
+_KEPT = 8
+"""Designs that go on to be polished."""
+
+_APART = 1e-2
+"""How far these are apart in one free number at least, in parts of its range."""
+
+_NOWHERE = 1e12
+"""The merit of a design whose objective does not exist."""
+
+
+class Evolved(NamedTuple):
+    """The best designs that differ (no point where none had the objective), the objective of the best one by generation (g, 1),
+    how many designs were drawn, how many of these had the objective, and whether the search was interrupted."""
+
+    point: Point | None
+    history: np.ndarray
+    drawn: int
+    existing: int
+    interrupted: bool
+
+
+def require_cma() -> None:
+    """**Raises** `InputError` where the package cma is not installed."""
+    if importlib.util.find_spec("cma") is None:
+        raise InputError("searcher", "is 'cma', which needs the package cma; install it with: pip install 'jaxvib[cma]'")
+
+
+@cached
+def _valued(problem: Problem, z: Array, near: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+    return jax.vmap(lambda x, w: problem.values(x, w))(z, near)
+
+
+class Followed:
+    """Values of populations (s, 1 + me + mi), without derivatives: each design's jams are followed from the nearest of the last
+    designs, and looked up on the whole branch where that leads nowhere."""
+
+    def __init__(self, problem: Problem):
+        self.problem = replace(problem, lanes=_LANES)
+        self.seen: tuple[np.ndarray, ...] | None = None
+        """The last designs, and the speeds that were followed there."""
+
+    def of(self, z: np.ndarray) -> np.ndarray:
+        """Those of the designs z (s, d), NaN where something does not exist."""
+        if self.seen is None:
+            values, known = self._at(z, looked_up(self.problem, z))
+        else:
+            designs, *there = self.seen
+            nearest = np.argmin(np.sum((z[:, None] - designs[None]) ** 2, axis=2), axis=1)
+            values, known = self._at(z, tuple(each[nearest] for each in there))
+            lost = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+            if len(lost):
+                values[lost], again = self._at(z[lost], looked_up(self.problem, z[lost]))
+                for every, some in zip(known, again, strict=True):
+                    every[lost] = some
+        good = np.all(np.isfinite(values), axis=1)
+        if np.any(good):
+            new = (z[good], *(each[good] for each in known))
+            old = (each[:0] for each in new) if self.seen is None else self.seen
+            self.seen = tuple(np.concatenate(pair)[-_REMEMBERED:] for pair in zip(old, new, strict=True))
+        return values
+
+    def _at(self, z: np.ndarray, near: Known) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+        values, found = in_chunks(self.problem.lanes, lambda x, w: _valued(self.problem, x, w), z, near)
+        return np.array(values), tuple(np.array(each) for each in found)
+
+
+def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float, float], None]) -> Evolved:
+    """CMA-ES (Hansen and Ostermeier, Evolutionary Computation 9, 2001; package cma), begun anew with twice the population where
+    it has settled (Auger and Hansen, IEEE CEC 2005), until so many `evaluations` are spent.
+
+    Sought is the least of the objective in parts of its size plus what breaking demands costs. `tell` hears how much is done
+    (0 to 1) and the least objective so far. An interrupt (KeyboardInterrupt) ends the search with what it has.
+    """
+    import cma  # an extra
+
+    followed, m = Followed(problem), problem.equalities
+    merits, designs, history = np.zeros(0), np.zeros((0, problem.space.size)), []
+    size, drawn, existing, run, interrupted = np.nan, 0, 0, 0, False
+    population = 4 + int(3 * np.log(problem.space.size))
+    random = np.random.default_rng(seed)
+    try:
+        while drawn < evaluations:
+            begin = random.uniform(size=problem.space.size)
+            options = {"bounds": [0, 1], "seed": 1 + seed + run, "verbose": -9, "popsize": population << run}
+            strategy = cma.CMAEvolutionStrategy(begin, 0.3, options)
+            while not strategy.stop() and drawn < evaluations:
+                z = np.clip(np.asarray(strategy.ask()), 0.0, 1.0)
+                values = followed.of(z)
+                there = np.all(np.isfinite(values), axis=1)
+                drawn, existing = drawn + len(z), existing + int(np.sum(there))
+                if np.isnan(size) and np.any(there):
+                    size = max(float(np.median(np.abs(values[there, 0]))), 1e-300)
+                broken = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(np.maximum(values[:, 1 + m :], 0.0), axis=1)
+                merit = np.where(there, np.nan_to_num(values[:, 0] / size + _PRICE * broken), _NOWHERE)
+                strategy.tell(list(z), list(merit))
+                merits, designs = _best(np.concatenate([merits, merit]), np.concatenate([designs, z]))
+                history.append(float(values[np.argmin(merit), 0]))
+                tell(drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _NOWHERE else np.nan)
+            run += 1
+    except KeyboardInterrupt:
+        interrupted = True
+    designs = designs[merits < _NOWHERE]
+    point = evaluate(problem, designs, looked_up(problem, designs)) if len(designs) else None
+    return Evolved(point, np.asarray(history).reshape(-1, 1), drawn, existing, interrupted)
+
+
+def _best(merits: np.ndarray, designs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The best of some designs that differ."""
+    kept: list[int] = []
+    for k in np.argsort(merits, kind="stable"):
+        if all(np.max(np.abs(designs[k] - designs[j])) > _APART for j in kept):
+            kept.append(int(k))
+        if len(kept) == _KEPT:
+            break
+    return merits[kept], designs[kept]
