@@ -1,5 +1,6 @@
 """Float64, strict promotion of ranks: what a test relies on is said here, never by importing jaxvib."""
 
+import gc
 import os
 import pathlib
 
@@ -31,6 +32,8 @@ def pytest_configure(config):
     if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", "") and config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     prepare_cpu()
+    # Tracing makes millions of objects that stay: looking through all of them again and again took a sixth of the suite's time.
+    gc.set_threshold(100_000, 50, 100)
 
 
 @pytest.fixture(autouse=True, scope="module")

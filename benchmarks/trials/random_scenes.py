@@ -7,7 +7,7 @@ Scenes are drawn from a few kinds, so that few programs are compiled, with numbe
 - `jam_modes`: torques balance by the dense complex algebra of `jaxvib.study.stress.plain`, to 1e-8
 - `jam_orbit` of the first mode there is: its state is carried over one turn by SciPy and comes back, to 1e-6
 - `simulate`: the state at the end agrees with SciPy's, to the claimed error and 1e-6
-- the gradient of the foundation force by the stiffnesses agrees with differences, to 1e-4
+- the gradient of the foundation force by the stiffnesses agrees with differences to one of two steps, to 1e-4
 
 A mutated file is a template or a record whose characters, numbers, lines or words are changed; reading it ends in a scene or
 in an `InputError`. Everything else, warnings and more than 60 s included, is a failure, printed with the seed that repeats it.
@@ -263,12 +263,12 @@ def ask_gradient(scene: jv.Scene, rng: np.random.Generator) -> str:
     machine = scene.machine
     found = np.concatenate([slopes.stiffness * machine.stiffness, slopes.link_stiffness * machine.link_stiffness])
     jam = modes.select(k)
-    right = light_force_slope(scene, float(jam.omega), 1e-6)
-    return (
-        "right"
-        if relative(found, right) < 1e-4
-        else f"wrong: gradient {found}, differences {right}, slope {float(jam.slope):.1e}"
-    )
+    # Steps of 1e-6 are near enough to folds; where a spring hardly counts, rounding spoils them and those of 1e-4 hold.
+    for step in (1e-6, 1e-4):
+        right = light_force_slope(scene, float(jam.omega), step)
+        if relative(found, right) < 1e-4:
+            return "right"
+    return f"wrong: gradient {found}, differences {right}, slope {float(jam.slope):.1e}"
 
 
 QUESTIONS: dict[str, Callable[[jv.Scene, np.random.Generator], str]] = {

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import initial_state
+from jaxvib.motion.start import initial_state, with_spin
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
@@ -94,7 +96,7 @@ class JamQuestion(NamedTuple):
         orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
         spread = _APART * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1))
-        return State(displacement, velocity, (angle + spread,), rate)
+        return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> Values:
         """By the full equations, from near the exact jam, until nothing changes."""
@@ -110,9 +112,11 @@ class RunQuestion(NamedTuple):
     start: Literal["rest", "turning"] | State
 
     def state(self, scene: Scene) -> State:
-        """The state that `scene` starts from."""
+        """The state that `scene` starts from, the loads' own rotation as far as its effects make it free."""
         if isinstance(self.start, State):
-            return self.start
+            with contextlib.suppress(InputError):  # the state is of a scene with another effect
+                return with_spin(scene, self.start)
+            return with_spin(scene, replace(self.start, spin=None))
         if self.start == "turning":
             return turning_state(scene)
         return initial_state(scene, "rest", apart=_APART if scene.loads.count > 1 else 0.0)
@@ -155,7 +159,8 @@ def turning_state(scene: Scene) -> State:
     zero = jnp.zeros((n,))
     rotor = None if scene.drive.ideal else (jnp.zeros(()), scene.drive.speed)
     spread = first + 2.0 * jnp.pi / n * jnp.arange(n)
-    return State(still, still, (spread, *others), (zero + scene.drive.speed, *(zero for _ in others)), rotor)
+    rate = (zero + scene.drive.speed, *(zero for _ in others))
+    return with_spin(scene, State(still, still, (spread, *others), rate, rotor))
 
 
 def mean_torque(scene: Scene, omega: float) -> float:

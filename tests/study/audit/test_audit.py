@@ -12,7 +12,7 @@ from plugin_effect import SealFriction
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
-from jaxvib.machine.files import DRIVES, EFFECTS
+from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
 from jaxvib.study.audit.audit import _as_computed
 from jaxvib.study.audit.compared import Asked, EffectRow, effect_row
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
@@ -312,3 +312,17 @@ def test_a_run_is_asked_for_where_there_is_no_jam():
 def test_what_cannot_be_asked_is_refused(asked, says):
     with pytest.raises(jv.InputError, match=says):
         jv.audit(SCENE, **asked)
+
+
+@pytest.mark.parametrize("kind", ["torus", "planar_rotor"])
+def test_every_variant_starts_from_a_state_that_it_takes(kind):
+    """Among the effects that a scene could have are those that make the spin of its balls free."""
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    variants = list(possible_variants(scene, np.zeros(2), None))
+    spinning = [v.scene for v in variants if "spin" in v.name or "sliding" in v.name]
+    assert spinning if kind == "torus" else not spinning
+    given = jv.initial_state(spinning[0] if spinning else scene)
+    for start in ("turning", "rest", given):
+        for each in (scene, *(variant.scene for variant in variants)):
+            state = RunQuestion(1.0, start).state(each)
+            jax.eval_shape(jv.vector_field(each), jnp.zeros(()), state)
