@@ -1,5 +1,7 @@
 """Derivatives of every quantity by every route: forward, reverse, as a search follows jams, and finite differences."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,6 +34,7 @@ from optimize import (
     worst,
 )
 from optimize.search.problem import report_keys
+from optimize.wishes import answers
 from optimize.wishes.answers import Answers, guesses
 
 OFF = {"machine.stiffness": 0.05}
@@ -118,7 +121,9 @@ class Routes:
             scale = np.maximum(_scale(difference), 1e-3 * abs(value[q]))
             for name, slopes in found.items():
                 off, allowed = np.abs(slopes[q] - difference), tolerance * scale + _SAFETY * np.nan_to_num(noise, nan=np.inf)
-                assert np.all(off <= allowed), (name, self.quantities[q].words, slopes[q], difference, noise)
+                # A peak of a run-up changes its course within the larger steps: a difference that noisy says nothing.
+                tells = noise < 1e-2 * scale
+                assert np.all(off[tells] <= allowed[tells]), (name, self.quantities[q].words, slopes[q], difference, noise)
                 np.testing.assert_allclose(slopes[q], next(iter(found.values()))[q], atol=tolerance * scale.max())
             judged += int(np.sum(_SAFETY * noise < tolerance * scale))
         return judged
@@ -130,9 +135,12 @@ def test_routes_agree_on_a_machine():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("quantities", "least"), [(LEADING, 0.95), (ROBUST, 0.95), (EXACT, 0.9), (TIME, 0.3)])
-def test_every_route_agrees_on_ten_random_machines(quantities, least):
-    """To 1e-5, wherever finite differences can tell; in time these are noisy, and derivatives are in forward mode alone."""
+@pytest.mark.parametrize(("quantities", "least"), [(LEADING, 0.95), (ROBUST, 0.95), (EXACT, 0.9), (TIME, 0.8)])
+def test_every_route_agrees_on_ten_random_machines(quantities, least, monkeypatch):
+    """To 1e-5, wherever finite differences can tell; in time these are noisy, and derivatives are in forward mode alone. Runs
+    are to a tolerance at which what they compute has the derivatives of what they integrate: to 1e-8 the two differ by up to
+    6e-5 after 60 periods."""
+    monkeypatch.setattr(answers, "simulate", functools.partial(jv.simulate, stepsize_controller=jv.Tolerance(1e-12)))
     routes = Routes(quantities, ("forward",) if quantities is TIME else ("forward", "reverse"))
     machines = seed = judged = 0
     while machines < 10:
