@@ -25,7 +25,7 @@ __all__ = [
 
 
 _WRITTEN = 16
-"""Up to so many equations elimination is as fast as a library call each."""
+"""Up to so many equations elimination is fast enough to do without the library, see `eliminate`."""
 
 _Entry: TypeAlias = Array | float
 """Of a matrix: a number, or an array of those of many matrices."""
@@ -169,7 +169,7 @@ def magnitude(value: Array) -> Array:
 
 def small_solve(a: Array, b: Array) -> Array:
     """x of a x = b; written out for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by `eliminate`
-    up to 16."""
+    up to 16, by LAPACK beyond."""
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -183,18 +183,6 @@ def small_solve(a: Array, b: Array) -> Array:
         return jnp.stack([sum(minors[i][k] * b[i] for i in range(3)) for k in range(3)]) / det
     if n <= _WRITTEN:
         return eliminate(a, b)
-    # Derivatives come of the equation, so that those too have no library call for a batch.
-    matrix = jax.lax.stop_gradient(a)
-    return jax.lax.custom_linear_solve(
-        lambda x: a @ x, b.astype(a.dtype), lambda _, y: _one_by_one(matrix, y), lambda _, y: _one_by_one(matrix.T, y)
-    )
-
-
-@jax.custom_batching.sequential_vmap
-def _one_by_one(a: Array, b: Array) -> Array:
-    """A library's x of a x = b; under `vmap` one system after the other. For a batch in one call jaxlib's LAPACK (before 0.11)
-    spreads it over XLA's threads and waits for them in one of these: as many such calls at once as there are threads wait for
-    ever."""
     return jnp.linalg.solve(a, b)
 
 

@@ -29,7 +29,7 @@ def _called(jaxpr, found):
     return found
 
 
-@pytest.mark.parametrize("n", [4, 17])
+@pytest.mark.parametrize("n", [4, 16])
 def test_solves_of_a_batch_and_their_derivatives_call_no_library_for_the_batch(n):
     """Such calls, as many at once as XLA has threads, wait for each other for ever (jaxlib before 0.11)."""
     rng = np.random.default_rng(n)
@@ -42,4 +42,4 @@ def test_solves_of_a_batch_and_their_derivatives_call_no_library_for_the_batch(n
     assert {ndim for _, ndim in _called(jax.make_jaxpr(right)(1.1).jaxpr, [])} == {3}
     for derived in (lambda f: f, jax.jacfwd, jax.grad, lambda f: jax.jacfwd(jax.grad(f))):
         np.testing.assert_allclose(derived(ours)(1.1), derived(right)(1.1), rtol=1e-12)
-        assert all(ndim == 2 for _, ndim in _called(jax.make_jaxpr(derived(ours))(1.1).jaxpr, []))
+        assert not _called(jax.make_jaxpr(derived(ours))(1.1).jaxpr, [])
