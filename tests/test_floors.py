@@ -17,8 +17,9 @@ FLOORS = (
     ("jaxvib.equations",),
     ("jaxvib.machine",),
     ("jaxvib.ode", "jaxvib.draw", "jaxvib.results", "jaxvib.units"),
+    ("jaxvib.numerics",),
     ("jaxvib.runtime",),
-    ("jaxvib.numerics", "jaxvib.errors"),
+    ("jaxvib.errors",),
 )
 """From the top down; a module may import from its own package and from floors below its own."""
 

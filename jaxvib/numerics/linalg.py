@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.runtime.compat import custom_vmap
+
 __all__ = [
     "damped_newton",
     "eliminate",
@@ -24,8 +26,8 @@ __all__ = [
 ]
 
 
-_WRITTEN = 16
-"""Up to so many equations elimination is fast enough to do without the library, see `eliminate`."""
+_WRITTEN = 8
+"""Up to so many equations `eliminate` is as fast as a library call for each system of a batch."""
 
 _Entry: TypeAlias = Array | float
 """Of a matrix: a number, or an array of those of many matrices."""
@@ -169,7 +171,7 @@ def magnitude(value: Array) -> Array:
 
 def small_solve(a: Array, b: Array) -> Array:
     """x of a x = b; written out for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by `eliminate`
-    up to 16, by LAPACK beyond."""
+    up to 8, by the library beyond: for a batch one system after the other, see `_in_turn`."""
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -183,7 +185,33 @@ def small_solve(a: Array, b: Array) -> Array:
         return jnp.stack([sum(minors[i][k] * b[i] for i in range(3)) for k in range(3)]) / det
     if n <= _WRITTEN:
         return eliminate(a, b)
+    return jax.lax.custom_linear_solve(
+        lambda x: a @ x, b, lambda _, right: _in_turn(a, right), lambda _, right: _in_turn(a.T, right)
+    )
+
+
+@custom_vmap
+def _in_turn(a: Array, b: Array) -> Array:
+    """x of a x = b by the library. On a processor it is called for one system of a batch after the other.
+
+    A call for a batch may wait for itself for ever there: it hands its systems to the threads that run such calls, and when each
+    of them runs one, none is left (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
+    """
     return jnp.linalg.solve(a, b)
+
+
+@_in_turn.def_vmap
+def _solve_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tuple[Array, bool]:
+    if not is_mapped[0]:  # one system, many right-hand sides
+        columns = jnp.moveaxis(b, 0, -1)
+        x = _in_turn(a, columns.reshape(a.shape[0], -1))
+        return jnp.moveaxis(x.reshape(columns.shape), -1, 0), True
+
+    def each(a: Array, b: Array) -> Array:
+        return jax.lax.map(lambda one: _in_turn(*one), (a, b))
+
+    right = b if is_mapped[1] else jnp.broadcast_to(b, (size, *b.shape))
+    return jax.lax.platform_dependent(a, right, cpu=each, default=jax.vmap(jnp.linalg.solve)), True
 
 
 def _cross(x: list[Array], y: list[Array]) -> list[Array]:
