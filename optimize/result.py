@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Influence", "Limit", "Machine", "Outcome", "Row", "Synthesis", "SynthesisStatus", "amplitude_names", "wanted"]
 
+_TELLING = 1000.0
+"""Changes of more per cent are told by what they lead to."""
+
 
 class SynthesisStatus(eqx.Enumeration):
     """How a search ended; the members are the sentences a user reads."""
@@ -175,18 +178,27 @@ class Synthesis(Result):
     def said(self) -> list[str]:
         """Lines on demands, on what is held and bounds, on influences, and on the machines found."""
         lines = []
+        best = self.machines[0].value if self.machines else math.nan
+
+        def changed(percent: float) -> str:
+            if not abs(percent) > _TELLING:
+                return f"{percent:+.3g} %"
+            moved = best * (1.0 + percent / 100.0)  # of almost nothing, a share tells nothing
+            unit, factor = shown_unit(self.unit, abs(moved))
+            return f"to {moved * factor:.3g} {unit}".rstrip()
+
         for limit in self.limits:
             unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
             values = f"{limit.value * factor:.5g} {unit}".rstrip()
             if limit.broken > 0.0:
                 lines.append(f"  not met: {limit.what}; at best {values}, {100.0 * limit.broken:.3g} % off")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {limit.gain:+.3g} % of the objective")
+                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {changed(limit.gain)} of the objective")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for each in ranked[:5]:
-            lines.append(f"  1 % less / more {each.what}: {each.less:+.3g} % / {each.more:+.3g} % of the objective")
+            lines.append(f"  1 % less / more {each.what}: {changed(each.less)} / {changed(each.more)} of the objective")
         if len(self.machines) > 1:
             seen = ", ".join(f"{m.often} x {m.value:.4g}" for m in self.machines[:6])
             lines.append(f"  {len(self.machines)} different machines: {seen} {self.unit}".rstrip())

@@ -59,10 +59,11 @@ def _(machine, mo, pictures):
 @app.cell
 def _(mo, pictures, scene):
     # No other mode than those there are, and of a machine without jam modes no choice.
-    modes = {str(k): k for k in sorted(pictures.modes_of(scene))}
+    found = pictures.modes_of(scene)
+    modes = {str(k): k for k in sorted(found)}
     mode = mo.ui.dropdown(
         modes or {"none": None},
-        value=next(iter(map(str, pictures.modes_of(scene))), "none"),
+        value=next(iter(map(str, found)), "none"),
         allow_select_none=False,
         label="jam mode in which the machine moves",
     )

@@ -194,8 +194,8 @@ def small_solve(a: Array, b: Array) -> Array:
 def _in_turn(a: Array, b: Array) -> Array:
     """x of a x = b by the library. On a processor it is called for one system of a batch after the other.
 
-    A call for a batch may wait for itself for ever there: it hands its systems to the threads that run such calls, and when each
-    of them runs one, none is left (jaxlib before 0.11.2). From about 20 equations on, one after the other is also faster.
+    A call for a batch may wait for itself for ever there: it hands its systems to the threads that run such calls, and when all
+    of them wait so, none is left to work (jaxlib before 0.11.2). From about 20 equations on, one after the other is faster too.
     """
     return jnp.linalg.solve(a, b)
 

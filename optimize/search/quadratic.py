@@ -21,7 +21,7 @@ class Solved(NamedTuple):
     bounds: np.ndarray
 
 
-def times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def _times(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Matrices (s, m, n) times vectors (s, n)."""
     return (matrix @ vector[..., None])[..., 0]
 
@@ -85,10 +85,10 @@ def elastic(
     # Begin in the middle of the box, where all products of slacks and duals are alike and the prices are about paid.
     x = np.zeros((s, n))
     x[:, :d] = (low + high) / 2.0
-    broken = np.concatenate([times(a_rows, x[:, :d]) + a, times(c_rows, x[:, :d]) + c], axis=1)
+    broken = np.concatenate([_times(a_rows, x[:, :d]) + a, _times(c_rows, x[:, :d]) + c], axis=1)
     wide = 1.0 + 2.0 * np.max(np.abs(broken), axis=1, initial=0.0)
     x[:, d:] = wide[:, None]
-    slack = np.maximum(right - times(rows, x), 1e-12)
+    slack = np.maximum(right - _times(rows, x), 1e-12)
     dual = (price * wide / 3.0)[:, None] / slack
     turned = np.swapaxes(rows, 1, 2)
     scale = 1.0 + np.abs(linear).max(axis=1)
@@ -96,8 +96,8 @@ def elastic(
 
     best, least = (x, dual), np.full(s, np.inf)
     for _ in range(_STEPS):
-        stationary = times(quadratic, x) + linear + times(turned, dual)
-        primal = times(rows, x) + slack - right
+        stationary = _times(quadratic, x) + linear + _times(turned, dual)
+        primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
         # Rounding may spoil a point that was good already: the best one counts.
         off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
@@ -120,9 +120,9 @@ def elastic(
             slack: np.ndarray = slack,
         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             """The step that brings the products of slacks and duals to `target` more."""
-            rest = -stationary - times(turned, weight * primal + target / slack)
+            rest = -stationary - _times(turned, weight * primal + target / slack)
             dx = np.linalg.solve(matrix, rest[..., None])[..., 0]
-            ds = -primal - times(rows, dx)
+            ds = -primal - _times(rows, dx)
             return dx, ds, target / slack - weight * ds
 
         def longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -25,7 +25,6 @@ def _called(function):
     return {len(shape.split("x")) - 1 for shape in first}
 
 
-
 @pytest.mark.parametrize("n", [4, 8, 9, 20])
 def test_solves_of_a_batch_and_their_derivatives_call_no_library_for_the_batch(n):
     """Such calls, as many at once as XLA has threads, wait for each other for ever (jaxlib before 0.11.2)."""

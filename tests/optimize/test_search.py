@@ -5,7 +5,8 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import published, scene
+from scenes import published
+from two_springs import FIRST, FREE, NEAREST, SCENE, SUM
 
 import jaxvib as jv
 from optimize import (
@@ -23,18 +24,9 @@ from optimize import (
     product,
     support_frequency_squared,
     synthesize,
-    total,
     worst,
 )
 from optimize.search.quadratic import elastic
-
-SCENE = scene("two_mass", speed=120.0)
-"""Stiffness (5e4, 3e4) N/m of the supports, 2e5 N/m of the link."""
-
-FREE = {"machine.stiffness": (1e4, 9e4, "even")}
-NEAREST = Quantity("distance", "N^2/m^2", lambda s: jnp.sum((s.machine.stiffness - jnp.array([6e4, 5e4])) ** 2))
-FIRST = Quantity("first", "N/m", lambda s: s.machine.stiffness[0])
-SUM = total("machine.stiffness")
 
 
 def found(space, objective, **more):
@@ -261,3 +253,11 @@ def test_a_robust_design_is_better_on_machines_it_has_not_seen():
     unseen = expected(force, off, samples=4000, seed=1)
     assert float(unseen(robust.scene)) <= float(unseen(nominal.scene)) * (1.0 + 1e-6)
     assert worst(force, off).words.startswith("worst")
+
+
+def test_influences_on_almost_nothing_are_told_by_what_they_lead_to():
+    """At the best machine next to nothing is left, and per cent of that tell nothing."""
+    result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
+    lines = [line for line in result.said() if "1 % less / more" in line]
+    assert len(lines) == 2
+    assert "to 3.6e+05 N^2/m^2 / to 3.6e+05 N^2/m^2 of the objective" in lines[0] and "%" not in lines[0].split(":")[1]

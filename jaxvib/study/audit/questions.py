@@ -140,6 +140,8 @@ class RunQuestion(NamedTuple):
         """The run that is asked for; where its end is not named, `SLOW_PERIODS` slow periods after the drive's last jump."""
         if start is None:
             start = "turning" if scene.drive.constant else "rest"
+        elif isinstance(start, State):
+            start = with_spin(scene, start)  # raises now what `state` would take for the spin of another scene
         if until is None:
             jumps = [float(t) for t in scene.drive.jump_ts()]
             until = 2.0 * max(jumps, default=0.0) + 5.0 * SLOW_PERIODS * slow_period(scene)

@@ -1,5 +1,6 @@
 """Audits: what effects change, what they cost, and what a scene may lack."""
 
+import dataclasses
 import json
 import math
 
@@ -312,6 +313,13 @@ def test_a_run_is_asked_for_where_there_is_no_jam():
 def test_what_cannot_be_asked_is_refused(asked, says):
     with pytest.raises(jv.InputError, match=says):
         jv.audit(SCENE, **asked)
+
+
+def test_a_spin_that_the_scene_does_not_make_free_is_refused():
+    state = jv.initial_state(SCENE)
+    spin = jv.Spin(jnp.zeros(SCENE.loads.count), None)
+    with pytest.raises(jv.InputError, match="start.spin is given, but no effect of the scene makes it free"):
+        jv.audit(SCENE, start=dataclasses.replace(state, spin=spin))
 
 
 @pytest.mark.parametrize("kind", ["torus", "planar_rotor"])
