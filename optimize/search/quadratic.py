@@ -10,6 +10,9 @@ __all__ = ["Solved", "elastic"]
 
 _STEPS = 60
 
+_STILL, _NEAR = 8, 1e-5
+"""A point this near to optimal that has not come to half as much in so many steps comes no nearer: that is rounding."""
+
 
 class Solved(NamedTuple):
     """The steps `p` (s, d) and the multipliers of the equalities (s, me), of the demands (s, mi), not negative, and of the
@@ -94,17 +97,18 @@ def elastic(
     scale = 1.0 + np.abs(linear).max(axis=1)
     ridge = 1e-13 * np.eye(n)
 
-    best, least = (x, dual), np.full(s, np.inf)
-    for _ in range(_STEPS):
+    best, least, improved = (x, dual), np.full(s, np.inf), np.zeros(s, int)
+    for k in range(_STEPS):
         stationary = _times(quadratic, x) + linear + _times(turned, dual)
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m
         # Rounding may spoil a point that was good already: the best one counts.
         off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
         better = off < least
+        improved = np.where(off < 0.5 * least, k, improved)
         least = np.where(better, off, least)
         best = tuple(np.where(better[:, None], new, old) for new, old in zip((x, dual), best, strict=True))
-        done = least < 1e-11
+        done = (least < 1e-11) | ((least < _NEAR) & (k - improved >= _STILL))
         if np.all(done):
             break
         weight = dual / slack
