@@ -21,8 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
-from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
 
 jv.prepare_cpu()
 

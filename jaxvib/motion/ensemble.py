@@ -20,8 +20,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
-from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error
-from jaxvib.motion.integrate import fastest_and_slowest, is_finite, natural_units, wrap_angles
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
+from jaxvib.motion.integrate import fastest_and_slowest, is_finite, wrap_angles
 from jaxvib.motion.lanes import LANES, advance
 from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require

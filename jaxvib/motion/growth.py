@@ -14,8 +14,8 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, turned
-from jaxvib.motion.integrate import natural_units, wrap_angles
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
+from jaxvib.motion.integrate import wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state

@@ -15,13 +15,14 @@ from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite", "natural_units"]
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite"]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -42,31 +43,6 @@ class StepControl(eqx.Module):
 
 
 @cached
-def natural_units(scene: Scene) -> State:
-    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
-    the rotor's speed at the loads' distance from its axis.
-
-    S is the loads' unbalance, or the rotor's own where that is larger.
-    """
-    carrier, loads = scene.machine.carrier(), scene.loads
-    across, up, *_ = loads.position(*loads.rest())
-    unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
-    unbalances = [loads.count * unbalance]
-    for effect in scene.effects:
-        own = effect.imbalance(jnp.zeros_like(unbalance))
-        if own is not None:
-            unbalances.append(jnp.sqrt(sum(x**2 for x in own.static)))
-    length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
-    speed = scene.drive.speed
-    one = jnp.ones_like(speed)
-    rotor = None if scene.drive.ideal else (one, speed)
-    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
-    twist = speed if any(effect.frees_twist for effect in scene.effects) else None
-    slip = (speed * arm,) if any(effect.slip_limit is not None for effect in scene.effects) else None
-    spin = None if twist is None and slip is None else Spin(twist, slip)
-    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
-
-
 def each_coordinate(unit: State, number: int) -> State:
     """Natural units with one for each of so many coordinates of a load."""
     spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.twist, unit.spin.slip * number)

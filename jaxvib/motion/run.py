@@ -48,6 +48,7 @@ class RunStatus(eqx.Enumeration):
     """How a run ended; the members are the sentences a user reads."""
 
     done = "the run reached its end"
+    beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
@@ -88,6 +89,7 @@ class Run(AbstractMeasured, Result):
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
+        state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
         glued = "  all loads ran at one angle, as they started: whether they would stay so was not tested; give apart='3 deg'"
         return "\n".join(
             [

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
@@ -14,6 +16,7 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
+from jaxvib.results.status import member
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import count, number
 
@@ -21,6 +24,12 @@ __all__ = ["settle"]
 
 _APART = 0.05
 """How far from their middle the outermost loads start in a jam, rad."""
+
+_REMEMBERED = 32
+"""Stretches by which a motion that does not repeat itself is judged."""
+
+_SCATTER = 2.0
+"""Means over half of these that differ by less than so many of their standard errors count as the same."""
 
 
 @refuse_former(tolerance=FORMER["tolerance"])
@@ -35,12 +44,17 @@ def settle(
     stepsize_controller: StepChoice | None = None,
     throw: bool = True,
 ) -> Run:
-    """Simulates a stretch after a stretch until amplitudes and speed no longer change.
+    """Simulates a stretch after a stretch until amplitudes and speed no longer change, or change without a trend.
+
+    Jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged by its last
+    32 stretches: it is steady in the mean where the means of amplitudes, force and speed over the first half and over the
+    second one differ by less than twice their standard error, and its `drift` falls no more. Its status is then `beating`.
 
     **Arguments**
 
     - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
-    - `drift`: the change that counts as none, see `Measured`; 1e-6 unless said otherwise, in single precision 1e-3
+    - `drift`: the change that counts as none, see `Measured`; where it is given the motion must come to less. Unless said
+      otherwise it is 1e-6, in single precision 1e-3, and a motion that is steady in the mean has settled too
     - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
     - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
@@ -65,7 +79,7 @@ def settle(
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
-    usual = 1e-6 if double else 1e-3
+    usual, in_the_mean = 1e-6 if double else 1e-3, drift is None
     drift = usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True))
     chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
     start = ("rest" if mode is None else "jam") if start is None else start
@@ -77,14 +91,19 @@ def settle(
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
     run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
+    seen: list[list[float]] = []
     for _ in range(count(stretches, "stretches") - 1):
         if float(run.drift) < drift or not bool(run.status == RunStatus.done):
+            break
+        seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *map(float, run.amplitude)])
+        if in_the_mean and _steady_in_the_mean(np.array(seen[-_REMEMBERED:])):
+            run = dataclasses.replace(run, status=member(RunStatus, "beating"))
             break
         state = last_state(scene, run)
         together = run.together
         run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
         run = dataclasses.replace(run, together=run.together & together)
-    if throw and not float(run.drift) < drift:
+    if throw and not (float(run.drift) < drift or bool(run.status == RunStatus.beating)):
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
@@ -93,6 +112,17 @@ def settle(
     if throw and mode is not None:
         _require_mode(scene, run, mode)
     return run
+
+
+def _steady_in_the_mean(seen: np.ndarray) -> bool:
+    """Whether stretches (n, 3 + nd), each with its drift first, scatter about means that do not move."""
+    if len(seen) < _REMEMBERED:
+        return False
+    early, late = np.split(seen, 2)
+    if np.median(late[:, 0]) < 0.5 * np.median(early[:, 0]):
+        return False
+    error = np.sqrt((early.var(axis=0, ddof=1) + late.var(axis=0, ddof=1)) / len(early))
+    return bool(np.all(np.abs(late.mean(axis=0) - early.mean(axis=0))[1:] <= _SCATTER * error[1:]))
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

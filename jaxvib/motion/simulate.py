@@ -19,8 +19,8 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, scaled_error, turned
-from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, natural_units, wrap_angles
+from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
+from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number

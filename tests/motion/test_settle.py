@@ -8,6 +8,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.motion.settle import _steady_in_the_mean
 from jaxvib.motion.simulate import last_state, whole_turns
 
 
@@ -64,6 +65,44 @@ def test_settle_starts_from_rest_where_no_mode_is_named():
         single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), s)
         run = jv.settle(single)
         assert run.omega.dtype == jnp.float32 and float(run.drift) < 1e-3
+
+
+def two_pendulums(mass, drag, imbalance):
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+    loads = jv.pendulums(count=2, mass=mass, radius=0.08, drag=drag)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance(imbalance),))
+    return s, jv.initial_state(s, apart="3 deg")
+
+
+def test_a_motion_that_beats_has_settled_in_the_mean():
+    """Jammed loads and an imbalance beat for ever; asked for a motion that repeats itself, there is none."""
+    s, start = two_pendulums(mass=0.2, drag=0.5, imbalance="4 g m")
+    run = jv.settle(s, start=start, stretches=100)
+    assert run.status_name == "beating" and run.regime.label == "jammed" and 1e-4 < float(run.drift) < 1e-2
+    assert "steady in the mean" in run.summary()
+    with pytest.raises(jv.ComputationError, match="after 40 stretches of 100 slow periods the motion still changes") as caught:
+        jv.settle(s, start=start, drift=1e-6, stretches=40)
+    assert caught.value.status == "not_settled"
+
+
+def test_a_balanced_rotor_settles_although_its_rounding_does_not():
+    """Nothing is left of its amplitude but what changes from turn to turn."""
+    s, start = two_pendulums(mass=0.2, drag=1.94, imbalance="8 g m")
+    run = jv.settle(s, start=start, stretches=40)
+    assert run.status_name == "done" and run.regime.label == "balanced" and float(run.drift) < 1e-6
+    assert float(run.amplitude.max()) < 1e-12
+
+
+def test_what_is_steady_in_the_mean():
+    """Scatter and beats are, trends and what dies away are not, and few stretches tell nothing."""
+    k, noise = np.arange(32), np.random.default_rng(0).normal(size=(32, 3))
+    drift = np.full(32, 1e-3)
+    steady = np.column_stack([drift, 5.0 + 0.01 * noise])
+    assert _steady_in_the_mean(steady) and not _steady_in_the_mean(steady[:31])
+    assert _steady_in_the_mean(np.column_stack([drift, 5.0 + 0.01 * np.sin(2.3 * k)]))
+    assert not _steady_in_the_mean(np.column_stack([drift, 5.0 + 0.01 * noise + 1e-3 * k[:, None]]))
+    assert not _steady_in_the_mean(np.column_stack([drift * 0.9**k, 5.0 + 0.01 * noise]))
+    assert not _steady_in_the_mean(np.column_stack([drift * 0.98**k, 5.0 + 0.01 * 0.98**k]))
 
 
 def test_settle_stops_where_a_stretch_fails():

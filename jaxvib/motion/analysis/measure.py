@@ -12,6 +12,7 @@ from jax import Array
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.scaled_error import LEAST, natural_units
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
@@ -51,7 +52,9 @@ class AbstractMeasured(eqx.Module):
     **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
     `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
     directions the root of the sum of both squares; `drift` the largest change of an amplitude from the first to the second half
-    of those turns, relative to the largest amplitude, or of `omega` where that is more; `settled` whether it is below 1e-3.
+    of those turns, relative to the largest amplitude or to 1 % of the loads' unbalance radius S/M where that is more (a
+    balanced rotor has no amplitude of its own), or the relative change of `omega` where that is more; `settled` whether it is
+    below 1e-3.
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -96,8 +99,8 @@ def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
     speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
-    top = jnp.max(whole[:nd])
-    drift = jnp.max(jnp.abs(late - early)[:nd]) / jnp.where(top > 0.0, top, 1.0)
+    top = jnp.maximum(jnp.max(whole[:nd]), LEAST * natural_units(scene).displacement)
+    drift = jnp.max(jnp.abs(late - early)[:nd]) / top
     omega = jnp.mean(speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(

@@ -1,7 +1,8 @@
-"""The scaled difference of two states."""
+"""The natural units of a state, and the scaled difference of two."""
 
 from __future__ import annotations
 
+import functools
 from types import ModuleType
 
 import jax
@@ -14,7 +15,36 @@ from jaxvib.equations.dynamics import Spin, State
 from jaxvib.machine.scene import Scene
 from jaxvib.units import traced
 
-__all__ = ["error_scale", "estimated_error", "scaled_error", "turned"]
+__all__ = ["LEAST", "error_scale", "estimated_error", "natural_units", "scaled_error", "turned"]
+
+LEAST = 0.01
+"""Changes of amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to
+that."""
+
+
+def natural_units(scene: Scene) -> State:
+    """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
+    the rotor's speed at the loads' distance from its axis.
+
+    S is the loads' unbalance, or the rotor's own where that is larger.
+    """
+    carrier, loads = scene.machine.carrier(), scene.loads
+    across, up, *_ = loads.position(*loads.rest())
+    unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    unbalances = [loads.count * unbalance]
+    for effect in scene.effects:
+        own = effect.imbalance(jnp.zeros_like(unbalance))
+        if own is not None:
+            unbalances.append(jnp.sqrt(sum(x**2 for x in own.static)))
+    length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
+    speed = scene.drive.speed
+    one = jnp.ones_like(speed)
+    rotor = None if scene.drive.ideal else (one, speed)
+    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    twist = speed if any(effect.frees_twist for effect in scene.effects) else None
+    slip = (speed * arm,) if any(effect.slip_limit is not None for effect in scene.effects) else None
+    spin = None if twist is None and slip is None else Spin(twist, slip)
+    return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
 
 
 def error_scale(state: State, unit: State) -> State:

@@ -20,6 +20,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured
+from jaxvib.motion.analysis.scaled_error import LEAST, natural_units
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
@@ -251,7 +252,7 @@ def _run(
     status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
     status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
-    seen = (_measure(kept), jnp.max(kept.ripple, axis=0), whole, kept)
+    seen = (_measure(scene, kept), jnp.max(kept.ripple, axis=0), whole, kept)
     measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     return Envelope(
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
@@ -304,14 +305,14 @@ def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes
     )
 
 
-def _measure(window: Envelopes) -> Measured:
+def _measure(scene: Scene, window: Envelopes) -> Measured:
     """The window in the numbers of `Measured`: means of speeds, the greatest of each amplitude."""
     half = window.time.shape[0] // 2
     amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
-    top, omega = jnp.max(amplitude), jnp.mean(speeds)
-    drift = jnp.max(change) / jnp.where(top > 0.0, top, 1.0)
+    top, omega = jnp.maximum(jnp.max(amplitude), LEAST * natural_units(scene).displacement), jnp.mean(speeds)
+    drift = jnp.max(change) / top
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,

@@ -16,9 +16,8 @@ from jax import Array
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error, turned
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
-from jaxvib.motion.integrate import natural_units
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state

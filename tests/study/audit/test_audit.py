@@ -318,7 +318,7 @@ def test_what_cannot_be_asked_is_refused(asked, says):
 def test_a_spin_that_the_scene_does_not_make_free_is_refused():
     state = jv.initial_state(SCENE)
     spin = jv.Spin(jnp.zeros(SCENE.loads.count), None)
-    with pytest.raises(jv.InputError, match="start.spin is given, but no effect of the scene makes it free"):
+    with pytest.raises(jv.InputError, match=r"start\.spin is given, but no effect of the scene makes it free"):
         jv.audit(SCENE, start=dataclasses.replace(state, spin=spin))
 
 
