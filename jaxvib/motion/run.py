@@ -48,12 +48,12 @@ class RunStatus(eqx.Enumeration):
     """How a run ended; the members are the sentences a user reads."""
 
     done = "the run reached its end"
-    beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
     not_finite = "the motion grew beyond all bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
     no_start = "the state to start from does not exist or is not finite"
+    beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
 
 
 class Run(AbstractMeasured, Result):
