@@ -16,6 +16,7 @@ import json
 import os
 import tempfile
 import threading
+import weakref
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -44,12 +45,22 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promo
 """JAX's options that a traced program depends on."""
 
 
+_MOST = 512
+"""So many programs are held in memory, those that were used last. XLA maps each into some dozens of areas of memory: a process
+with some thousand programs has no areas left (65530 on Linux), and ends within the compiler without a word."""
+
+_clock = itertools.count()
+_functions: weakref.WeakSet[_CachedFunction] = weakref.WeakSet()
+
+
 def cached(function: Callable[P, T]) -> Callable[P, T]:
     """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `use_cache`.
 
     Under a JAX transformation it is just the compiled function. The key of a program on disk holds all that it depends on: the
     shapes and types of arrays, the static parts of the arguments, JAX's options, the versions, when the sources were changed,
-    and the processor. Some programs are not stored, but traced in each process: those with arguments of a class from outside
+    and the processor. The 512 programs that were used last are held in memory, others are read again.
+
+    Some programs are not stored, but traced in each process: those with arguments of a class from outside
     (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
     """
     return _CachedFunction(function)
@@ -61,6 +72,7 @@ class _CachedFunction(Generic[P, T]):
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
+        _functions.add(self)
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -72,16 +84,18 @@ class _CachedFunction(Generic[P, T]):
             return self.jitted(*args, **kwargs)
         asked = (folder, treedef, tuple(map(_leaf_key, leaves)), _options())
         try:
-            is_ready = asked in self.ready
+            program = self.ready.get(asked, _UNKNOWN)
         except TypeError:  # an argument without a hash
             return self.jitted(*args, **kwargs)
-        if not is_ready:
+        if program is _UNKNOWN:
             with self.lock:
-                if asked not in self.ready:
-                    self.ready[asked] = self._program(folder, leaves, treedef)
-        program = self.ready[asked]
+                program = self.ready.get(asked, _UNKNOWN)
+                if program is _UNKNOWN:
+                    program = self.ready[asked] = self._program(folder, leaves, treedef)
+            _forget_oldest()
         if program is None:
             return self.jitted(*args, **kwargs)
+        program.used = next(_clock)
         return program(leaf for leaf in leaves if eqx.is_array(leaf))
 
     def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable) -> _Program | None:
@@ -137,13 +151,14 @@ class _Slot:
     place: int
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class _Program:
-    """A function of all arrays of the arguments, and what its arrays are put into."""
+    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used."""
 
     run: Callable[..., list[Array]]
     leaves: Sequence[object]
     treedef: Hashable
+    used: int = dataclasses.field(default_factory=lambda: next(_clock))
 
     @classmethod
     def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
@@ -156,6 +171,18 @@ class _Program:
     def __call__(self, arrays: Iterable[Array]) -> Any:
         found = self.run(*arrays)
         return jax.tree.unflatten(self.treedef, [found[x.place] if isinstance(x, _Slot) else x for x in self.leaves])
+
+
+_UNKNOWN = _Program(lambda *_: [], (), None)
+
+
+def _forget_oldest() -> None:
+    """Frees the programs beyond `_MOST` that were not used for longest."""
+    held = [(p.used, function, asked) for function in _functions for asked, p in list(function.ready.items()) if p is not None]
+    for _, function, asked in sorted(held, key=lambda each: each[0])[: max(len(held) - _MOST, 0)]:
+        program = function.ready.pop(asked, None)
+        if program is not None:
+            program.run.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -6,6 +6,7 @@ import pathlib
 import resource
 import subprocess
 import sys
+import weakref
 
 import equinox as eqx
 import jax
@@ -96,6 +97,51 @@ def test_a_scalar_without_a_type_of_its_own_is_another_program(folder):
 
 def with_sign(x, sign):
     return jnp.copysign(x, sign)
+
+
+def test_programs_that_were_not_used_for_longest_are_freed(folder, monkeypatch):
+    monkeypatch.setattr(programs, "_functions", weakref.WeakSet())
+    monkeypatch.setattr(programs, "_MOST", 3)
+    function = programs.cached(doubled)
+
+    def ask(name):
+        found = function(Pair(jnp.arange(3.0), name), 2.0)
+        assert found[0].name == name + "!" and found[0].first.tolist() == [0.0, 2.0, 4.0]
+        return {program.leaves[-2].removesuffix("!") for program in function.ready.values()}
+
+    for name in "abca":
+        ask(name)
+    freed = list(function.ready.values())[1]
+    assert freed.run._cache_size() == 1
+    assert ask("d") == {"a", "c", "d"} and freed.run._cache_size() == 0
+    assert ask("b") == {"a", "d", "b"} and traces == list("abcd")  # read again, not traced
+
+
+@pytest.mark.slow
+def test_three_thousand_different_scenes_in_one_process(tmp_path):
+    """XLA maps each program into dozens of areas of memory, and a process may have 65530 of them."""
+    code = """
+import pathlib, sys
+import jaxvib as jv
+
+jv.use_cache(sys.argv[1])
+maps = pathlib.Path("/proc/self/maps")
+for count in range(1, 3001):
+    scene = jv.Scene(
+        jv.one_mass(mass=49.0, stiffness=4e4, damping=10.0),
+        jv.balls(count=count, mass=1.0 / count, radius=0.1, drag=0.1),
+        jv.ConstantSpeed(100.0),
+    )
+    shapes = jv.mode_shapes(scene)
+    if count % 100 == 0:
+        areas = len(maps.read_text().splitlines()) if maps.exists() else 0
+        print(count, float(shapes.frequency[0]), areas, flush=True)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
+    rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
+    assert done.returncode == 0 and len(rows) == 30, (done.returncode, rows[-1:], done.stderr[-500:])
+    np.testing.assert_allclose([row[1] for row in rows], np.sqrt(4e4 / 50.0), rtol=1e-5)
+    assert max(row[2] for row in rows) < 10000, rows
 
 
 def test_the_key_holds_the_sources_of_the_whole_package_and_the_versions():
