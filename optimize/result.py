@@ -180,12 +180,12 @@ class Synthesis(Result):
         lines = []
         best = self.machines[0].value if self.machines else math.nan
 
-        def changed(percent: float) -> str:
-            if not abs(percent) > _TELLING:
-                return f"{percent:+.3g} %"
-            moved = best * (1.0 + percent / 100.0)  # of almost nothing, a share tells nothing
-            unit, factor = shown_unit(self.unit, abs(moved))
-            return f"to {moved * factor:.3g} {unit}".rstrip()
+        def changed(*percent: float) -> str:
+            if not max(map(abs, percent)) > _TELLING:
+                return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
+            moved = [best * (1.0 + each / 100.0) for each in percent]  # of almost nothing, a share tells nothing
+            unit, factor = shown_unit(self.unit, max(map(abs, moved)))
+            return f"the objective comes to {' / '.join(f'{each * factor:.3g}' for each in moved)} {unit}".rstrip()
 
         for limit in self.limits:
             unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
@@ -193,12 +193,12 @@ class Synthesis(Result):
             if limit.broken > 0.0:
                 lines.append(f"  not met: {limit.what}; at best {values}, {100.0 * limit.broken:.3g} % off")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {changed(limit.gain)} of the objective")
+                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {changed(limit.gain)}")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
         for each in ranked[:5]:
-            lines.append(f"  1 % less / more {each.what}: {changed(each.less)} / {changed(each.more)} of the objective")
+            lines.append(f"  1 % less / more {each.what}: {changed(each.less, each.more)}")
         if len(self.machines) > 1:
             seen = ", ".join(f"{m.often} x {m.value:.4g}" for m in self.machines[:6])
             lines.append(f"  {len(self.machines)} different machines: {seen} {self.unit}".rstrip())

@@ -179,7 +179,7 @@ class DesignSpace(eqx.Module):
 
     def scene_of(self, values: Array) -> Scene:
         """The scene with these free numbers (d,), SI."""
-        scene, start = self.scene, 0
+        scene, start, values = self.scene, 0, jnp.asarray(values)
         for place in self.places:
             scene = changed(scene, place, values[start : start + place.size])
             start += place.size

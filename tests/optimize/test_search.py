@@ -260,4 +260,4 @@ def test_influences_on_almost_nothing_are_told_by_what_they_lead_to():
     result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
     lines = [line for line in result.said() if "1 % less / more" in line]
     assert len(lines) == 2
-    assert "to 3.6e+05 N^2/m^2 / to 3.6e+05 N^2/m^2 of the objective" in lines[0] and "%" not in lines[0].split(":")[1]
+    assert "the objective comes to 3.6e+05 / 3.6e+05 N^2/m^2" in lines[0] and "%" not in lines[0].split(":")[1]
