@@ -26,7 +26,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @click.argument("scene", type=click.Path(path_type=Path))
 @_START
 @_MODE
-@click.option("--drift", type=float, help="Relative change that counts as none [1e-6].")
+@click.option("--drift", type=float, help="Relative change that counts as none [1e-6, or steady in the mean].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
 @SPEED
@@ -41,7 +41,10 @@ def settle(
     speed: str | None,
     output: Output,
 ) -> None:
-    """Integrate the full equations of SCENE until amplitudes and speeds no longer change; --out keeps the last stretch."""
+    """Integrate the full equations of SCENE until amplitudes and speeds no longer change, or change without a trend.
+
+    --out keeps the last stretch. With --drift the motion has to repeat itself that well.
+    """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     steps = chosen_steps(tolerance, None)
     run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
