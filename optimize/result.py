@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Influence", "Limit", "Machine", "Outcome", "Row", "Synthesis", "SynthesisStatus", "amplitude_names", "wanted"]
 
 _TELLING = 1000.0
-"""Changes of more per cent are told by what they lead to."""
+"""Changes of more per cent are told in the objective's unit."""
 
 
 class SynthesisStatus(eqx.Enumeration):
@@ -181,11 +181,11 @@ class Synthesis(Result):
         best = self.machines[0].value if self.machines else math.nan
 
         def changed(*percent: float) -> str:
-            if not max(map(abs, percent)) > _TELLING:
+            if math.isnan(best) or not max(map(abs, percent)) > _TELLING:
                 return " / ".join(f"{each:+.3g} %" for each in percent) + " of the objective"
-            moved = [best * (1.0 + each / 100.0) for each in percent]  # of almost nothing, a share tells nothing
+            moved = [max(abs(best), 1e-300) * each / 100.0 for each in percent]  # of almost nothing, a share tells nothing
             unit, factor = shown_unit(self.unit, max(map(abs, moved)))
-            return f"the objective comes to {' / '.join(f'{each * factor:.3g}' for each in moved)} {unit}".rstrip()
+            return " / ".join(f"{each * factor:+.3g} {unit}".rstrip() for each in moved)
 
         for limit in self.limits:
             unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))

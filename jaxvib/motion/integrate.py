@@ -42,7 +42,6 @@ class StepControl(eqx.Module):
     max_steps: Array | None = None
 
 
-@cached
 def each_coordinate(unit: State, number: int) -> State:
     """Natural units with one for each of so many coordinates of a load."""
     spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.twist, unit.spin.slip * number)

@@ -26,10 +26,13 @@ _APART = 0.05
 """How far from their middle the outermost loads start in a jam, rad."""
 
 _REMEMBERED = 32
-"""Stretches by which a motion that does not repeat itself is judged."""
+"""Stretches, of 100 slow periods, by which a motion that does not repeat itself is judged."""
 
-_SCATTER = 2.0
-"""Means over half of these that differ by less than so many of their standard errors count as the same."""
+_SCATTER = 3.6
+"""The means over the four quarters of these lie within so many of their standard errors where they are the same (95 %)."""
+
+_FALLS = -3.0
+"""A drift whose logarithm falls by so many standard errors of its slope is not there to stay."""
 
 
 @refuse_former(tolerance=FORMER["tolerance"])
@@ -47,8 +50,9 @@ def settle(
     """Simulates a stretch after a stretch until amplitudes and speed no longer change, or change without a trend.
 
     Jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged by its last
-    32 stretches: it is steady in the mean where the means of amplitudes, force and speed over the first half and over the
-    second one differ by less than twice their standard error, and its `drift` falls no more. Its status is then `beating`.
+    32 stretches (of 100 slow periods; more where they are shorter): it is steady in the mean where the means of amplitudes,
+    force and speed over each quarter of them differ by no more than their scatter explains, or by half the `drift` that is
+    told, and the drift shows no fall. Its status is then `beating`.
 
     **Arguments**
 
@@ -90,19 +94,21 @@ def settle(
     _, slowest = fastest_and_slowest(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
-    run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
+    remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
     seen: list[list[float]] = []
-    for _ in range(count(stretches, "stretches") - 1):
+    run, together = None, True
+    for _ in range(count(stretches, "stretches")):
+        run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
+        together = run.together & together
+        run = dataclasses.replace(run, together=together)
         if float(run.drift) < drift or not bool(run.status == RunStatus.done):
             break
         seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *map(float, run.amplitude)])
-        if in_the_mean and _steady_in_the_mean(np.array(seen[-_REMEMBERED:])):
+        if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
             run = dataclasses.replace(run, status=member(RunStatus, "beating"))
             break
         state = last_state(scene, run)
-        together = run.together
-        run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
-        run = dataclasses.replace(run, together=run.together & together)
+    assert run is not None
     if throw and not (float(run.drift) < drift or bool(run.status == RunStatus.beating)):
         raise ComputationError(
             "not_settled",
@@ -115,14 +121,23 @@ def settle(
 
 
 def _steady_in_the_mean(seen: np.ndarray) -> bool:
-    """Whether stretches (n, 3 + nd), each with its drift first, scatter about means that do not move."""
-    if len(seen) < _REMEMBERED:
+    """Whether stretches (4 n, 3 + nd), each with its drift first, scatter about means that do not move, and go on to do so.
+
+    What moves by less than half the drift, which is told, is not seen in it.
+    """
+    drift, values = seen[:, 0], seen[:, 1:]
+    place = np.arange(len(seen)) - (len(seen) - 1) / 2.0
+    fall = place @ np.log(drift) / (place @ place)
+    rest = np.log(drift) - np.mean(np.log(drift)) - fall * place
+    if fall < _FALLS * np.sqrt(rest @ rest / (len(seen) - 2) / (place @ place)):
         return False
-    early, late = np.split(seen, 2)
-    if np.median(late[:, 0]) < 0.5 * np.median(early[:, 0]):
-        return False
-    error = np.sqrt((early.var(axis=0, ddof=1) + late.var(axis=0, ddof=1)) / len(early))
-    return bool(np.all(np.abs(late.mean(axis=0) - early.mean(axis=0))[1:] <= _SCATTER * error[1:]))
+    quarters = values.reshape(4, -1, values.shape[1])
+    means = quarters.mean(axis=1)
+    apart = means.max(axis=0) - means.min(axis=0)
+    error = np.sqrt(quarters.var(axis=1, ddof=1).mean(axis=0) / quarters.shape[1])
+    size = np.abs(means).mean(axis=0)
+    size[2:] = size[2:].max()  # a drift is relative to the largest amplitude
+    return bool(np.all(apart <= np.maximum(_SCATTER * error, 0.5 * np.median(drift) * size)))
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

@@ -1,4 +1,4 @@
-"""Small linear algebra, written out: no library call stands in a time loop or waits in a large batch."""
+"""Small linear algebra, written out where it is small enough: no library call stands in a time loop."""
 
 from __future__ import annotations
 
@@ -185,6 +185,8 @@ def small_solve(a: Array, b: Array) -> Array:
         return jnp.stack([sum(minors[i][k] * b[i] for i in range(3)) for k in range(3)]) / det
     if n <= _WRITTEN:
         return eliminate(a, b)
+    both = jnp.result_type(a, b)
+    a, b = a.astype(both), b.astype(both)
     return jax.lax.custom_linear_solve(
         lambda x: a @ x, b, lambda _, right: _in_turn(a, right), lambda _, right: _in_turn(a.T, right)
     )

@@ -51,6 +51,7 @@ with some thousand programs has no areas left (65530 on Linux), and ends within 
 
 _clock = itertools.count()
 _functions: weakref.WeakSet[_CachedFunction] = weakref.WeakSet()
+_listing = threading.Lock()  # of `_functions`
 
 
 def cached(function: Callable[P, T]) -> Callable[P, T]:
@@ -58,7 +59,7 @@ def cached(function: Callable[P, T]) -> Callable[P, T]:
 
     Under a JAX transformation it is just the compiled function. The key of a program on disk holds all that it depends on: the
     shapes and types of arrays, the static parts of the arguments, JAX's options, the versions, when the sources were changed,
-    and the processor. The 512 programs that were used last are held in memory, others are read again.
+    and the processor. The 512 programs that were used last are held in memory, others are read or traced again.
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
     (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
@@ -72,7 +73,8 @@ class _CachedFunction(Generic[P, T]):
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
-        _functions.add(self)
+        with _listing:
+            _functions.add(self)
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -178,7 +180,9 @@ _UNKNOWN = _Program(lambda *_: [], (), None)
 
 def _forget_oldest() -> None:
     """Frees the programs beyond `_MOST` that were not used for longest."""
-    held = [(p.used, function, asked) for function in _functions for asked, p in list(function.ready.items()) if p is not None]
+    with _listing:
+        functions = list(_functions)
+    held = [(p.used, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None]
     for _, function, asked in sorted(held, key=lambda each: each[0])[: max(len(held) - _MOST, 0)]:
         program = function.ready.pop(asked, None)
         if program is not None:

@@ -10,7 +10,7 @@ __all__ = ["Solved", "elastic"]
 
 _STEPS = 60
 
-_STILL, _NEAR = 8, 1e-5
+_STILL, _NEAR = 8, 1e-6
 """A point this near to optimal that has not come to half as much in so many steps comes no nearer: that is rounding."""
 
 
@@ -97,7 +97,7 @@ def elastic(
     scale = 1.0 + np.abs(linear).max(axis=1)
     ridge = 1e-13 * np.eye(n)
 
-    best, least, improved = (x, dual), np.full(s, np.inf), np.zeros(s, int)
+    best, least, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
     for k in range(_STEPS):
         stationary = _times(quadratic, x) + linear + _times(turned, dual)
         primal = _times(rows, x) + slack - right
@@ -105,7 +105,7 @@ def elastic(
         # Rounding may spoil a point that was good already: the best one counts.
         off = np.maximum(np.maximum(gap, np.abs(stationary).max(axis=1)) / scale, np.abs(primal).max(axis=1))
         better = off < least
-        improved = np.where(off < 0.5 * least, k, improved)
+        improved, mark = np.where(off < 0.5 * mark, k, improved), np.where(off < 0.5 * mark, off, mark)
         least = np.where(better, off, least)
         best = tuple(np.where(better[:, None], new, old) for new, old in zip((x, dual), best, strict=True))
         done = (least < 1e-11) | ((least < _NEAR) & (k - improved >= _STILL))

@@ -26,8 +26,7 @@ from random_scenes import (
 )
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
-from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
 
 SCENES = {"two platforms": two_platforms(), "motor": motor_driven()}
 

@@ -10,8 +10,7 @@ import pytest
 from scenes import published, some_state
 
 import jaxvib as jv
-from jaxvib.motion.analysis.scaled_error import error_scale, scaled_error
-from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
 
 
 def test_an_ensemble_is_a_loop_of_runs():

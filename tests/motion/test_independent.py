@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from small_machine import GRAVITY, small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.integrate import natural_units
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.ode.control import PIController
 
 

@@ -94,15 +94,21 @@ def test_a_balanced_rotor_settles_although_its_rounding_does_not():
 
 
 def test_what_is_steady_in_the_mean():
-    """Scatter and beats are, trends and what dies away are not, and few stretches tell nothing."""
-    k, noise = np.arange(32), np.random.default_rng(0).normal(size=(32, 3))
-    drift = np.full(32, 1e-3)
-    steady = np.column_stack([drift, 5.0 + 0.01 * noise])
-    assert _steady_in_the_mean(steady) and not _steady_in_the_mean(steady[:31])
-    assert _steady_in_the_mean(np.column_stack([drift, 5.0 + 0.01 * np.sin(2.3 * k)]))
-    assert not _steady_in_the_mean(np.column_stack([drift, 5.0 + 0.01 * noise + 1e-3 * k[:, None]]))
-    assert not _steady_in_the_mean(np.column_stack([drift * 0.9**k, 5.0 + 0.01 * noise]))
-    assert not _steady_in_the_mean(np.column_stack([drift * 0.98**k, 5.0 + 0.01 * 0.98**k]))
+    """Scatter and beats are; trends, slow humps and what dies away, however slowly, are not."""
+    k, random = np.arange(32), np.random.default_rng(0)
+    noise, drift = random.normal(size=(32, 3)), 1e-3 * random.uniform(0.5, 2.0, 32)
+
+    def steady(drift, values):
+        return _steady_in_the_mean(np.column_stack([drift, np.broadcast_to(np.transpose(values), (3, 32)).T]))
+
+    assert steady(drift, 5.0 + 0.01 * noise)
+    assert steady(drift, 5.0 + 0.01 * np.sin(2.3 * k))
+    assert steady(drift, 5.0 + 1e-3 * np.sin(k / 20.0))  # less than the drift says
+    assert not steady(drift, 5.0 + 0.01 * noise + 5e-3 * k[:, None])
+    assert not steady(drift, 5.0 + 0.1 * np.cos(2.0 * np.pi * (k - 16.0) / 400.0) ** 8)
+    assert not steady(drift * 0.9**k, 5.0 + 0.01 * noise)
+    for share in (0.96, 0.98):
+        assert not steady(1e-3 * share**k, 5.0 + 0.01 * share**k * np.sin(2.3 * k))
 
 
 def test_settle_stops_where_a_stretch_fails():

@@ -39,3 +39,10 @@ def test_solves_of_a_batch_and_their_derivatives_call_no_library_for_the_batch(n
     for derived in (lambda f: f, jax.jacfwd, jax.grad, lambda f: jax.jacfwd(jax.grad(f))):
         np.testing.assert_allclose(derived(ours)(1.1), derived(right)(1.1), rtol=1e-12)
         assert _called(derived(ours)) == (set() if n <= 8 else {2})
+
+
+@pytest.mark.parametrize("n", [3, 8, 9])
+def test_types_may_be_mixed(n):
+    a = jnp.asarray(np.random.default_rng(n).normal(size=(n, n)) + 1j * np.eye(n))
+    x = small_solve(a, jnp.arange(1.0 * n))
+    np.testing.assert_allclose(a @ x, np.arange(n), atol=1e-12)

@@ -12,12 +12,15 @@ from jax import Array
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import LEAST, natural_units
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
-__all__ = ["STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure"]
+__all__ = ["LEAST", "STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure"]
+
+LEAST = 1e-4
+"""Changes of amplitudes below this share of the unbalance radius S/M, such as a balanced rotor's, are told relative to that."""
 
 STATE = {
     "displacement": in_unit("m or rad", "coordinate"),
@@ -52,8 +55,8 @@ class AbstractMeasured(eqx.Module):
     **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
     `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
     directions the root of the sum of both squares; `drift` the largest change of an amplitude from the first to the second half
-    of those turns, relative to the largest amplitude or to 1 % of the loads' unbalance radius S/M where that is more (a
-    balanced rotor has no amplitude of its own), or the relative change of `omega` where that is more; `settled` whether it is
+    of those turns, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M where that is more (a balanced
+    rotor has no amplitude of its own), or the relative change of `omega` where that is more; `settled` whether it is
     below 1e-3.
     """
 

@@ -13,15 +13,13 @@ from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import Spin, State
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
 
-__all__ = ["LEAST", "error_scale", "estimated_error", "natural_units", "scaled_error", "turned"]
-
-LEAST = 0.01
-"""Changes of amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to
-that."""
+__all__ = ["error_scale", "estimated_error", "natural_units", "scaled_error", "turned"]
 
 
+@cached
 def natural_units(scene: Scene) -> State:
     """Natural units of the state: the unbalance radius S/M, that times the rotor's speed; 1 rad, the rotor's speed; of a slip
     the rotor's speed at the loads' distance from its axis.

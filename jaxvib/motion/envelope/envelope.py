@@ -19,8 +19,8 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured
-from jaxvib.motion.analysis.scaled_error import LEAST, natural_units
+from jaxvib.motion.analysis.measure import LEAST, Measured
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state

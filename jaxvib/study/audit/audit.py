@@ -14,7 +14,6 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import LEAST
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -22,7 +21,7 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.accuracy.exact_reference import usual_mode
 from jaxvib.study.audit.compared import CHANGES, Asked, EffectRow, effect_row, field_operations
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
-from jaxvib.study.audit.questions import JamQuestion, RunQuestion, admitted
+from jaxvib.study.audit.questions import LEAST, JamQuestion, RunQuestion, admitted
 from jaxvib.study.audit.tiers import TierRow, tier_rows
 from jaxvib.study.audit.variants import possible_variants, present_variants
 from jaxvib.units import Number, count, number

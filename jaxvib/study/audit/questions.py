@@ -14,7 +14,8 @@ from jaxvib.equations.collected import require_collected
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import LEAST, natural_units
+from jaxvib.motion.analysis import measure
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
@@ -25,7 +26,7 @@ from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
 from jaxvib.steady.orbits.orbit import OrbitStatus
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
-__all__ = ["JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
+__all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
 
 _APART = 0.05
 """How far from their middle the outermost loads start, rad: none stay together only because nothing parts them."""
@@ -34,6 +35,9 @@ _ROUNDING = 1e-9
 
 _WINDOW = 100
 """Slow periods over which the end of a run is measured: an imbalance and jammed loads beat."""
+
+LEAST = 0.01
+"""Amplitudes below this share of the loads' unbalance radius S/M, such as a balanced rotor's, are judged relative to that."""
 
 _GRID = 100
 """Load speeds among which an exact fold is looked for at once."""
@@ -202,7 +206,10 @@ def _read(scene: Scene, run: Run, fold: float) -> Values:
     kind = status_name(run.regime.name) if ended else f"failed: {status_name(run.status)}"
     drift, amplitude = float(run.drift), np.asarray(run.amplitude)
     moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")
-    magnified = max(1.0, LEAST * float(natural_units(scene).displacement) / moved) if moved > 0.0 else 1.0
+    unit = float(natural_units(scene).displacement)
+    magnified = max(1.0, LEAST * unit / moved) if moved > 0.0 else 1.0
+    # The drift is relative to no less than another share of the unit.
+    drift *= max(moved, measure.LEAST * unit) / max(moved, LEAST * unit)
     return Values(
         kind,
         float(run.omega),
