@@ -223,7 +223,7 @@ CASES = (
         scene=_lossless,
         answer=_conserved,
         reference=lambda scene: Reference([_energy(plain(scene), _swinging(scene))]),
-        within=(1e-6, 1e-2),
+        within=(1e-7, 1e-2),
     ),
     Case(
         "run-up through the resonance, fast",

@@ -31,6 +31,7 @@ ONE_LOAD = CASES["one load"]
         ("three platforms alike, weak links", "right"),
         ("one load", "right"),
         ("watch of 1e-9 kg, run", "right"),
+        ("energy over 1e4 turns", "right"),
         ("drag 0, exact jam", "named"),
     ],
 )
