@@ -27,7 +27,17 @@ from jaxvib.draw.style import (
 )
 from jaxvib.errors import InputError
 
-__all__ = ["PARTS", "before_after", "branch_diagram", "convergence", "front_chart", "solid_and_dashed"]
+__all__ = [
+    "PARTS",
+    "before_after",
+    "branch_diagram",
+    "convergence",
+    "crossings",
+    "front_chart",
+    "log_limits",
+    "solid_and_dashed",
+    "stretches",
+]
 
 
 PARTS = ("speed", "amplitude", "force")
@@ -87,7 +97,7 @@ def branch_diagram(
         empty.set_axis_off()
     n = scale * rotor_speed
     high = float(np.max(n[np.isfinite(n)]))
-    crossings = _crossings(rotor_speed, stable, modes, at)
+    crossed = crossings(rotor_speed, stable, modes, at)
     for axis, (label, group) in zip(axes, rows, strict=False):
         for j, (name, values) in enumerate(group):
             solid_and_dashed(
@@ -108,12 +118,12 @@ def branch_diagram(
             _speed_lines(axis, scale, resonances, marks, high)
         else:
             axis.set_yscale("log")
-            axis.set_ylim(*_reach([values for _, values in group], rotor_speed, omega, resonances))
+            axis.set_ylim(*log_limits([values for _, values in group], rotor_speed, omega, resonances))
             log_ticks(axis)
         if at is not None:
             axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
-            heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossings]
-            told = [(number, filled) for _ in group for _, _, number, filled in crossings]
+            heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossed]
+            told = [(number, filled) for _ in group for _, _, number, filled in crossed]
             numbered(axis, scale * at, heights, [number for number, _ in told], [filled for _, filled in told])
     if ax is None:
         legend_outside(figure, axes, 4 if columns > 1 else 2)
@@ -124,7 +134,7 @@ def branch_diagram(
     return figure if ax is None else ax
 
 
-def _reach(
+def log_limits(
     curves: Sequence[np.ndarray], rotor_speed: np.ndarray, omega: np.ndarray, resonances: np.ndarray
 ) -> tuple[float, float]:
     """The limits of a logarithmic axis: what the curves reach from half the lowest resonance on; below it, where loads run with
@@ -150,7 +160,7 @@ def _speed_lines(
     axis.set_ylim(0.0, 1.06 * high)
 
 
-def _crossings(
+def crossings(
     rotor_speed: np.ndarray, stable: np.ndarray, modes: np.ndarray | None, at: float | None
 ) -> list[tuple[int, float, str, bool]]:
     """Where a branch meets the rotor speed `at`: the point before, the share of the way to the next, the mode's number, and
@@ -182,17 +192,26 @@ def solid_and_dashed(
     """One line for each unbroken stretch, solid where `stable`; neighbouring stretches share a point so that no gap shows.
     `widths` of the solid ones and of the dashed ones; with a `marker` the line has one here and there, to be known without
     colour."""
-    cuts = np.flatnonzero(stable[1:] != stable[:-1]) + 1
     sparse = {"marker": marker, "markevery": 0.11, "ms": 4.0, "mfc": "white"} if marker else {}
     labelled = False
-    for start, stop in zip([0, *cuts], [*(cuts + 1), len(x)], strict=True):
-        if not np.any(np.isfinite(x[start:stop]) & np.isfinite(y[start:stop])):
+    for along, solid in stretches(stable):
+        if not np.any(np.isfinite(x[along]) & np.isfinite(y[along])):
             continue  # matplotlib places no marks on a line without a point
-        solid = bool(stable[start])
         name = label if solid and not labelled else None
         labelled = labelled or solid
         style, width = ("-", widths[0]) if solid else (UNSTABLE, widths[1])
-        axis.plot(x[start:stop], y[start:stop], color=color, ls=style, lw=width, label=name, **sparse)
+        axis.plot(x[along], y[along], color=color, ls=style, lw=width, label=name, **sparse)
+
+
+def stretches(stable: np.ndarray) -> list[tuple[slice, bool]]:
+    """The unbroken stretches of a line, each with whether it is stable; neighbours share a point.
+
+    >>> stretches(np.array([True, True, False]))
+    [(slice(0, 3, None), True), (slice(2, 3, None), False)]
+    """
+    cuts = (np.flatnonzero(stable[1:] != stable[:-1]) + 1).tolist()
+    stops = [*(cut + 1 for cut in cuts), len(stable)]
+    return [(slice(start, stop), bool(stable[start])) for start, stop in zip([0, *cuts], stops, strict=True)]
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Drawn:

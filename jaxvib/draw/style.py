@@ -28,10 +28,12 @@ __all__ = [
     "legend_above",
     "legend_outside",
     "load_names",
+    "log_places",
     "log_ticks",
     "numbered",
     "panels",
     "speed_scale",
+    "together",
 ]
 
 SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
@@ -123,6 +125,19 @@ def panels(
     return figure, list(grid.ravel())
 
 
+def log_places(low: float, high: float, most: int = 9) -> LogLocator:
+    """Where a logarithmic axis has ticks: at powers of ten over three decades or more, at most so many, else between them too.
+
+    >>> [float(x) for x in log_places(0.4, 3.0).tick_values(0.4, 3.0) if 0.4 < x < 3.0]
+    [0.5, 1.0, 2.0]
+    """
+    decades = math.log10(high / low)
+    if decades >= 3.0:
+        return LogLocator(numticks=most)
+    between = (1.0, 2.0, 5.0) if decades > 0.6 else (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    return LogLocator(subs=(1.0, 3.0) if decades > 1.5 else between)
+
+
 def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     """Ticks of a logarithmic axis, call it when its limits are set: powers of ten over three decades or more, else plain
     numbers, with as many between as there is room for.
@@ -135,15 +150,9 @@ def log_ticks(axis: Axes, which: Literal["x", "y"] = "y") -> None:
     """
     line = axis.xaxis if which == "x" else axis.yaxis
     low, high = line.get_view_interval()
-    decades = math.log10(high / low)
     line.set_minor_formatter(NullFormatter())
-    if decades >= 3.0:
-        line.set_major_locator(LogLocator(numticks=9))
-        line.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False))
-        return
-    between = (1.0, 2.0, 5.0) if decades > 0.6 else (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
-    line.set_major_locator(LogLocator(subs=(1.0, 3.0) if decades > 1.5 else between))
-    line.set_major_formatter("{x:g}")
+    line.set_major_locator(log_places(low, high))
+    line.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False) if high / low >= 1e3 else "{x:g}")
 
 
 def legend_above(axis: Axes, columns: int = 4, **options: Any) -> None:
@@ -170,19 +179,12 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
     low, high = axis.get_ylim()
     inside = sorted((k for k, y in enumerate(heights) if np.isfinite(y) and low <= y <= high), key=lambda k: heights[k])
     to_share = axis.transScale + axis.transLimits
-    shares = {k: float(to_share.transform((x, heights[k]))[1]) for k in inside}
-    groups: list[list[int]] = []
     for k in inside:
         axis.plot([x], [heights[k]], "o", ms=4.5, mfc="black" if filled[k] else "white", mec="black", zorder=4)
-        # Near the last of a group, whose text shall not be far from its first.
-        share, (first, last) = shares[k], (shares[groups[-1][0]], shares[groups[-1][-1]]) if groups else (-1.0, -1.0)
-        near = share - last < 0.045 and share - first < 0.09
-        groups = [*groups[:-1], [*groups[-1], k]] if near else [*groups, [k]]
-    for group in groups:
-        share = np.mean([shares[k] for k in group])
+    for share, text in together([(float(to_share.transform((x, heights[k]))[1]), names[k]) for k in inside]):
         axis.annotate(
-            ", ".join(sorted({names[k] for k in group})),
-            (x, to_share.inverted().transform((0.0, float(share)))[1]),
+            text,
+            (x, to_share.inverted().transform((0.0, share))[1]),
             xytext=(6, 0),
             textcoords="offset points",
             va="center",
@@ -191,6 +193,21 @@ def numbered(axis: Axes, x: float, heights: Sequence[float], names: Sequence[str
             zorder=5,
             bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
         )
+
+
+def together(named: Sequence[tuple[float, str]]) -> list[tuple[float, str]]:
+    """Names at heights, ascending, as shares of the panel's: what would cover each other as one text between.
+
+    >>> together([(0.1, "1"), (0.5, "4"), (0.52, "3")])
+    [(0.1, '1'), (0.51, '3, 4')]
+    """
+    groups: list[list[tuple[float, str]]] = []
+    for share, name in named:
+        # Near the last of a group, whose text shall not be far from its first.
+        first, last = (groups[-1][0][0], groups[-1][-1][0]) if groups else (-1.0, -1.0)
+        near = share - last < 0.045 and share - first < 0.09
+        groups = [*groups[:-1], [*groups[-1], (share, name)]] if near else [*groups, [(share, name)]]
+    return [(sum(share for share, _ in group) / len(group), ", ".join(sorted({name for _, name in group}))) for group in groups]
 
 
 def legend_outside(figure: Figure, axes: Sequence[Axes], columns: int, **options: Any) -> None:

@@ -36,7 +36,6 @@ __all__ = [
     "text",
     "toml",
     "tried",
-    "vector",
 ]
 
 ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
@@ -48,9 +47,6 @@ Amplitudes and forces are zero to peak. What is seen here is the theory of light
 
 _SPEEDS = 81
 """Rotor speeds of a Campbell diagram."""
-
-_TICKS = 5
-"""So many ticks, at most, an axis has."""
 
 
 class Tried(NamedTuple):
@@ -68,13 +64,11 @@ def tried(ask: Callable[[], Scene]) -> Tried:
         return Tried(None, str(error))
 
 
-def image(draw: Callable[[], Figure | str], scene: Tried) -> str:
-    """A figure, or the text of an SVG file, as an HTML image that holds its own data, or the sentence that says why there is
-    none."""
+def image(draw: Callable[[], str], scene: Tried) -> str:
+    """The text of an SVG file as an HTML image that holds its own data, or the sentence that says why there is none."""
 
     def made() -> str:
-        drawn = draw()
-        data = base64.b64encode((drawn if isinstance(drawn, str) else vector(drawn)).encode()).decode()
+        data = base64.b64encode(draw().encode()).decode()
         return f'<img style="max-width:100%" src="data:image/svg+xml;base64,{data}">'
 
     return _shown(made, scene)
@@ -132,40 +126,28 @@ def heading(scene: Scene) -> str:
     )
 
 
-def diagram(scene: Scene, most: float) -> Figure:
+def diagram(scene: Scene, most: float) -> str:
     """Of a machine that moves up and down, the branch diagram with the force chart; of a rotor, the Campbell diagram.
 
     **Arguments**: `most` the greatest rotor speed shown, rad/s; more where the scene's own speed asks for it.
 
-    **Returns** a matplotlib figure. **Raises** `InputError` for scenes that the theory leaves out; it says which part.
+    **Returns** the text of an SVG file. **Raises** `InputError` for scenes that the theory leaves out; it says which part.
 
     >>> import jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
-    >>> diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0).axes[0].get_ylabel()
-    'whirl speed, rpm'
+    >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0)
+    True
     """
-    from matplotlib.ticker import LogLocator, MaxNLocator  # slow to import: only who draws pays
+    from jaxvib.explore.chart import chart  # slow to import: only who draws pays
 
     speed = float(scene.drive.speed)
     most = max(most, 1.15 * speed)
     if has_branches(scene):
-        found = jax.device_get(branches(scene, most=most))
-        figure = found.plot(unit="rpm", most=most, show=("speed", "force"))
-        for axis in figure.axes:  # each tick costs a millisecond, a power of ten set as a formula several
-            axis.minorticks_off()
-            axis.xaxis.set_major_locator(MaxNLocator(_TICKS))
-            if axis.get_yscale() == "log":
-                axis.yaxis.set_major_locator(LogLocator(numticks=_TICKS))
-                axis.yaxis.set_major_formatter("{x:g}")
-            else:
-                axis.yaxis.set_major_locator(MaxNLocator(_TICKS))
-        figure.set_layout_engine(None)  # arranging a figure takes longer than drawing it
-        figure.subplots_adjust(left=0.075, right=0.99, bottom=0.17, top=0.83, wspace=0.2)
-        return figure
+        return chart(jax.device_get(branches(scene, most=most)), most)
     figure = jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))).plot(at=speed, unit="rpm")
-    figure.set_layout_engine(None)
+    figure.set_layout_engine(None)  # arranging a figure takes longer than drawing it
     figure.subplots_adjust(left=0.11, right=0.98, bottom=0.12, top=0.86)
-    return figure
+    return _vector(figure)
 
 
 def readings(scene: Scene) -> str:
@@ -194,7 +176,7 @@ def machine(scene: Scene, mode: int | None) -> str:
     return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))
 
 
-def vector(figure: Figure) -> str:
+def _vector(figure: Figure) -> str:
     """A figure as the text of an SVG file, drawn once (`savefig` draws twice) and in two thirds of the time of a PNG file:
     letters are left to the browser."""
     from matplotlib import rc_context

@@ -111,7 +111,7 @@ def test_what_cannot_be_shown_is_said(one_mass):
 def _drawn_lines(picture: str) -> list[list[str]]:
     """The outlines in an SVG file, each the list of its points."""
     return [
-        re.findall(r"[ML] [-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(picture).iter(f"{SVG}path")
+        re.findall(r"[ML] ?[-.0-9]+ [-.0-9]+", path.get("d", "")) for path in ElementTree.fromstring(picture).iter(f"{SVG}path")
     ]
 
 
@@ -134,10 +134,45 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
     assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
     assert f"{float(after.resonances[0]):.6g}" in pictures.text(lambda: pictures.readings(moved), pictures.Tried(moved, ""))
-    drawn = pictures.vector(pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed)))
+    drawn = pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
     assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
     again = jv.scene_from_toml(pictures.toml(pictures.Tried(moved, "")))
     assert float(again.machine.stiffness[0]) == 2e5
+
+
+@pytest.mark.parametrize("kind", ["two_mass", "network"])
+def test_the_charts_lines_are_the_branches(kind):
+    """Read back by the numbers at the ticks, every point of the picture's lines lies on a branch, and every jam is marked."""
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    most = 1.4 * float(scene.drive.speed)
+    found = jax.device_get(jv.branches(scene, most=most))
+    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    spans = [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
+    titles = {text: x for x, _, text, _ in spans if text in ("speed of loads, rpm", "foundation force, N, zero to peak")}
+    middle = titles["foundation force, N, zero to peak"]
+    ticks = [(x, y, float(text), e.get("text-anchor")) for x, y, text, e in spans if re.fullmatch(r"[-+.e0-9]+", text or "")]
+    rpm = 30.0 / np.pi
+    for right, values, log in ((False, rpm * found.omega, False), (True, found.foundation_force, True)):
+        here = [tick for tick in ticks if (tick[0] > middle - 1.0) == right]
+        across = np.polyfit(*zip(*[(x, value) for x, _, value, anchor in here if anchor == "middle"], strict=True), 1)
+        # The base of a text stands 0.35 of its size below its middle.
+        levels = [(y - 0.35 * 11.5, np.log(value) if log else value) for _, y, value, anchor in here if anchor == "end"]
+        up = np.polyfit(*zip(*levels, strict=True), 1)
+        curves = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == "#004488" and p.get("d")]
+        lines = [np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float) for p in curves]
+        points = np.concatenate([line for line in lines if (line[0, 0] > middle - 1.0) == right])
+        assert len(points) > 200
+        heights = np.log(np.maximum(values, 1e-300)) if log else values
+        there = np.stack([found.rotor_speed * rpm / across[0], heights / up[0]], axis=1)  # in dots
+        line = np.stack([np.polyval(across, points[:, 0]) / across[0], np.polyval(up, points[:, 1]) / up[0]], axis=1)
+        a, b = there[:-1], there[1:]
+        with np.errstate(invalid="ignore"):
+            share = np.clip(((line[:, None] - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1), 0.0, 1.0)
+            away = np.nanmin(np.hypot(*np.moveaxis(line[:, None] - a - share[..., None] * (b - a), -1, 0)), axis=1)
+        assert np.max(away) < 0.5
+    modes = jv.jam_modes(scene).mode_numbers()
+    told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
+    assert sorted(told) == sorted(2 * modes)
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,10 +49,17 @@ def spring(start: Point, end: Point, width: float = 0.2, coils: int = 6) -> np.n
     >>> spring((0.0, 0.0), (0.0, 1.0)).shape
     (16, 2)
     """
-    zigzag = np.linspace(0.15, 0.85, 2 * coils + 1)
-    side = np.where(np.arange(2 * coils + 1) % 2, 0.5, -0.5) * width
+    forward, side = _zigzag(coils)
+    return _along(start, end, forward, width * side)
+
+
+@functools.cache
+def _zigzag(coils: int) -> tuple[np.ndarray, np.ndarray]:
+    """A spring's points along its axis, as shares, and to the side, in widths."""
+    side = np.where(np.arange(2 * coils + 1) % 2, 0.5, -0.5)
     side[[0, -1]] = 0.0
-    return _along(start, end, np.concatenate([[0.0], zigzag, [0.93, 1.0]]), np.concatenate([[0.0], side, [0.0, 0.0]]))
+    zigzag = np.linspace(0.15, 0.85, 2 * coils + 1)
+    return np.concatenate([[0.0], zigzag, [0.93, 1.0]]), np.concatenate([[0.0], side, [0.0, 0.0]])
 
 
 def damper(start: Point, end: Point, width: float = 0.2, cup: float = 0.4) -> np.ndarray:
@@ -69,8 +77,13 @@ def box(left: float, right: float, bottom: float, top: float) -> np.ndarray:
 
 def circle(centre: Point, radius: float, points: int = 61) -> np.ndarray:
     """A circle."""
+    return np.asarray(centre) + radius * _unit_circle(points)
+
+
+@functools.cache
+def _unit_circle(points: int) -> np.ndarray:
     turn = np.linspace(0.0, 2.0 * np.pi, points)
-    return np.stack([centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn)], axis=1)
+    return np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
 def arrow(start: Point, way: Point, width: float = 0.09) -> np.ndarray:

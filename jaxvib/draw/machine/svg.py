@@ -20,7 +20,7 @@ _POINT = 100.0 / 72.0
 
 _SIZES = {"small": 8.3, "x-small": 7.0}
 _ANCHORS = {"left": "start", "center": "middle", "right": "end"}
-_DASHES = {":": "1 2", "--": "4 2"}
+_DASHES = {":": "1 2", "--": "4 2", "-.": "9 2 2 2"}
 
 
 def svg(
@@ -133,4 +133,7 @@ def _text(x: float, y: float, text: str, look: dict[str, object]) -> str:
     base = y + first[str(look.get("va", "center"))]
     anchor = _ANCHORS[str(look.get("ha", "left"))]
     spans = "".join(f'<tspan x="{x:.1f}" y="{base + k * step:.1f}">{html.escape(line)}</tspan>' for k, line in enumerate(lines))
-    return f'<text font-family="sans-serif" font-size="{size:.1f}" text-anchor="{anchor}">{spans}</text>'
+    style = f' font-weight="{look["fontweight"]}"' if "fontweight" in look else ""
+    if "bbox" in look:  # what lies behind the letters is covered
+        style += ' stroke="white" stroke-width="4" paint-order="stroke"'
+    return f'<text font-family="sans-serif" font-size="{size:.1f}"{style} text-anchor="{anchor}">{spans}</text>'
