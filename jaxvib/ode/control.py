@@ -28,14 +28,15 @@ _State: TypeAlias = tuple[Array, Array | None]
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
     """A PI controller for a method of order 8 that keeps the error of each step below a tolerance.
 
-        e = max |error| / (tolerance (unit + relative |y|)),    h_next = 0.88 e_before^(1/16) / e^(3/32) h
+        e = max |error| / (tolerance (unit + relative |y|)),    h_next = s e_before^(1/16) / e^(3/32) h
 
-    over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = 0.88 / e^(1/8) h. The exponents
-    are products of square roots, which cost less than a power. Steps that stay as long as they are have e = 0.88^32 = 1/60, so
-    that what adds up over 10^5 of them stays near the tolerance. h_next / h lies between 0.2 and 5. A step whose error is not a
-    number is rejected with e = infinity; where no shorter step advances the time in its dtype, the run ends with
-    `diffrax.RESULTS.dt_min_reached`, with more than `max_steps` steps with `diffrax.RESULTS.max_steps_reached`: a limit that is
-    a number of the program, so that another one needs no other program.
+    over all numbers of the state y; a step with e > 1 is rejected and tried again with h_next = s / e^(1/8) h. The exponents
+    are products of square roots, which cost less than a power. Steps that stay as long as they are have e = s^32: in double
+    precision s = 0.88 and e = 1/60, so that what adds up over 10^5 steps stays near the tolerance; in single precision s = 0.97
+    and e = 0.38, since estimates of less than that are soon errors of rounding, which shorter steps hardly lessen. h_next / h
+    lies between 0.2 and 5. A step whose error is not a number is rejected with e = infinity; where no shorter step advances the
+    time in its dtype, the run ends with `diffrax.RESULTS.dt_min_reached`, with more than `max_steps` steps with
+    `diffrax.RESULTS.max_steps_reached`: a limit that is a number of the program, so that another one needs no other program.
 
     **Attributes**: `tolerance` scalar, without a unit; `unit` and `relative`, trees like the state, of what counts as 1 in each
     of its numbers (in its unit) and of which share of |y| is added to it. `relative` is 0 for angles: they grow without end,
@@ -114,7 +115,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(e)))))
         accept = e <= 1.0
         cube = root * root * root
-        factor = 0.88 * jnp.where(accept, root_before * root_before, 1.0 / root) / cube
+        factor = (0.88 if e.dtype == jnp.float64 else 0.97) * jnp.where(accept, root_before * root_before, 1.0 / root) / cube
         factor = jnp.clip(factor, 0.2, jnp.where(accept, 5.0, 0.9))
         start = jnp.where(accept, t1, t0)
         end = start + factor * (t1 - t0)

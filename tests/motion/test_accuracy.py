@@ -61,10 +61,10 @@ def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
     monkeypatch.setattr("jaxvib.motion.simulate._ATTEMPTS", 2)
     asked = dict(start=some_state(s), save="window", stepsize_controller=jv.Accuracy(1e-12), max_steps=MAX_STEPS)
     # So long that rounding alone makes more than this error.
-    run = jv.simulate(s, 400.0, **asked, throw=False)
+    run = jv.simulate(s, 200.0, **asked, throw=False)
     assert bool(run.status == jv.RunStatus.not_accurate) and float(run.error) > 1e-12
     with pytest.raises(jv.ComputationError, match=r"asked for 1\.0e-12") as caught:
-        jv.simulate(s, 400.0, **asked)
+        jv.simulate(s, 200.0, **asked)
     assert caught.value.status == "not_accurate"
 
 

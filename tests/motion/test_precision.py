@@ -50,7 +50,7 @@ def test_an_imbalance_sets_the_unit_where_loads_hardly_shake():
         run = jv.simulate(light, 2.0, save="window", stepsize_controller=jv.Tolerance(1e-5), estimate=False)
         answer = moment * w**2 / abs(4e4 - 50.0 * w**2 + 1j * w * 3e3)
         np.testing.assert_allclose(run.amplitude, [answer], rtol=1e-4)
-        assert int(run.steps) < 1500
+        assert int(run.steps) < 400
 
 
 def machine32(machine):
