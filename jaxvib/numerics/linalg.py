@@ -227,7 +227,7 @@ def damped_newton(balance: Callable[[Array], Array], start: Array, iterations: i
         x, value, slopes, damping = carry
         normal = slopes.T @ slopes
         damped = normal + damping * jnp.diag(jnp.diagonal(normal) + jnp.finfo(x.dtype).tiny)
-        change = eliminate(damped, slopes.T @ value)
+        change = small_solve(damped, slopes.T @ value)
         trial = x - jnp.clip(change, -0.5, 0.5)
         new = balance(trial)
         better = jnp.sum(new**2) < jnp.sum(value**2)  # and not NaN

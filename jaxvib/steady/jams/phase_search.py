@@ -15,11 +15,11 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
-from jaxvib.numerics.linalg import damped_newton
 from jaxvib.results.fields import in_unit
 from jaxvib.results.status import sentence
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
+from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, in_one_call, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
@@ -31,7 +31,6 @@ from jaxvib.steady.jams.phases import (
     loads_with_drag,
     parts_of,
     phase_jam,
-    torques_at,
 )
 from jaxvib.units import count
 
@@ -42,9 +41,6 @@ if TYPE_CHECKING:
 
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
-_GRID = 240
-"""Load speeds at which phases are looked for, besides those near resonances."""
-
 _SHOWN = 30.0
 """So many times the scene's drag, and the same part of it, a figure of all jams reaches."""
 
@@ -53,9 +49,6 @@ _SAME_LINE = 5e-3
 
 _SAME = 1e-6
 """Jams whose speeds differ by less, relative, and whose phases do not, are one."""
-
-_HALVINGS = 6
-"""Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
 
 
 class PhaseJams(AbstractPhaseJam):
@@ -92,7 +85,7 @@ class PhaseJams(AbstractPhaseJam):
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 
         omega = np.asarray(self.omega)
-        speeds = np.unique(np.concatenate([_load_speeds(parts_of(self.scene)), omega]))
+        speeds = np.unique(np.concatenate([load_speeds(parts_of(self.scene)), omega]))
         branches: list[PhaseBranch] = []
         curves = []
         for k, place in enumerate(np.searchsorted(speeds, omega)):
@@ -151,32 +144,25 @@ def phase_jams(
     if near is not None:
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
-    number = count(starts, "starts", each=64.0 * loads.count * _GRID)
+    number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
     parts = parts_of(scene)
-    speeds = _load_speeds(parts)
     rng = np.random.default_rng(count(seed, "seed", low=0))
-    sets = [rng.uniform(-np.pi, np.pi, (number, loads.count)), _regular(parts)]
-    phases = np.concatenate(sets)
-    factor, angles, good = _phases_at(parts, jnp.asarray(speeds), jnp.asarray(phases))
-    omega, phase = _starts(parts, speeds, np.asarray(factor), np.asarray(angles), np.asarray(good))
-    many = _power_of_2(omega.size)
-    omega, phase = (np.asarray(x)[: omega.size] for x in _many(parts, jnp.asarray(omega[many]), jnp.asarray(phase[many])))
+    omega, phase = starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count)))
+    omega, phase = in_one_call(lambda w, a: _balanced_many(parts, w, a), omega, phase)
     groups = _equal_loads(parts)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
     # Where a start was solved for hardly, the same jam comes out once more: what is distinct is told of the jams themselves.
-    jams = [jam_from(scene, jnp.asarray(omega[k]), jnp.asarray(phase[k])) for k in starts_at[places]]
-    found = [k for k, jam in enumerate(jams) if bool(jam.status == PhaseStatus.found)]
-    speeds, angles = (np.asarray([getattr(jams[k], name) for k in found]) for name in ("omega", "phase"))
-    places, reached = _distinct(speeds, angles, reached[found], groups)
-    if not found:
-        # Nothing was found: the arrays are empty.
-        jams = [jam_from(scene, parts.speed, jnp.asarray(phases[0]))]
-    order = sorted(range(len(places)), key=lambda i: (-round(speeds[places[i]], 6), not bool(jams[found[places[i]]].stable)))
-    keep = np.asarray([found[places[i]] for i in order], dtype=int)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[keep], *jams)
-    fields = {name: getattr(stacked, name) for name in PhaseJam.__dataclass_fields__}
-    return PhaseJams(**fields, starts=jnp.asarray(reached[order], dtype=int), scene=scene)
+    # With nothing to solve from, one that is no jam: the arrays have their shapes, and end up empty.
+    first = (omega[starts_at[places]], phase[starts_at[places]]) if places else (np.array([float(parts.speed)]), phase[:1])
+    jams = in_one_call(lambda w, a: _jams_from(scene, w, a), *first)
+    found = np.flatnonzero(np.asarray(jams.status == PhaseStatus.found)) if places else np.zeros(0, dtype=int)
+    places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
+    keep = found[np.asarray(places, dtype=int)]
+    order = sorted(range(keep.size), key=lambda i: (-round(float(jams.omega[keep[i]]), 6), not jams.stable[keep[i]]))
+    fields = {name: getattr(jams, name) for name in PhaseJam.__dataclass_fields__}
+    sorted_fields = jax.tree.map(lambda leaf: jnp.asarray(leaf[keep[order]]), fields)
+    return PhaseJams(**sorted_fields, starts=jnp.asarray(reached[order], dtype=int), scene=scene)
 
 
 def _distinct(
@@ -196,95 +182,16 @@ def _distinct(
     return places, np.asarray(reached, dtype=int)
 
 
-def _starts(
-    parts: Parts, speeds: np.ndarray, factor: np.ndarray, phase: np.ndarray, good: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Speeds and phases to solve from, given the drag multiples (no, ns) of phases (no, ns, count) at load `speeds` (no,).
-
-    Where a pattern, followed to the next load speed up or down, passes the multiple 1 there is a jam between the two, which is
-    narrowed down by halving. Points whose own multiple is near 1 are starts too.
-    """
-    places = np.flatnonzero(good)
-    if places.size == 0:
-        return speeds[:1], phase[:1, 0]
-    row, size = places // good.shape[1], np.log(factor.ravel()[places])
-    angles = phase.reshape(-1, phase.shape[-1])[places]
-    digits = [1e4 * size[:, None], 1e3 * np.cos(angles), 1e3 * np.sin(angles)]
-    kinds = np.concatenate([row[:, None], *(np.round(d).astype(int) for d in digits)], axis=1)
-    once = np.unique(kinds, axis=0, return_index=True)[1]
-    row, size, angles = row[once], size[once], angles[once]
-    near = np.abs(size) < np.log(3.0)
-    omega, phases = [speeds[row[near]]], [angles[near]]
-    for side in (-1, 1):
-        beside = speeds[np.clip(row + side, 0, speeds.size - 1)]
-        there, _, found = _follow(parts, beside, angles)
-        low, high, held = (x[found & (size * there < 0.0)] for x in (speeds[row], beside, np.arange(row.size)))
-        at, sign = angles[held], np.sign(size[held])
-        for _ in range(_HALVINGS):
-            middle = (low + high) / 2.0
-            there, turned, found = _follow(parts, middle, at)
-            same = found & (there * sign > 0.0)
-            low, high, at = np.where(same, middle, low), np.where(same, high, middle), np.where(same[:, None], turned, at)
-        omega.append(low)
-        phases.append(at)
-    return np.concatenate(omega), np.concatenate(phases)
-
-
-def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`_phases` at each of some load speeds (n,) from its own start (n, count), with the logarithm of the drag's multiple."""
-    if omega.size == 0:
-        return omega, phase, omega > 0.0
-    many = _power_of_2(omega.size)
-    factor, angles, good = (
-        np.asarray(x)[: omega.size] for x in _followed_phases(parts, jnp.asarray(omega[many]), jnp.asarray(phase[many]))
-    )
-    return np.log(np.where(good, factor, 1.0)), angles, good
+@cached
+def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
+    """`jam_from` many speeds and phases."""
+    return eqx.filter_vmap(jam_from, in_axes=(None, 0, 0))(scene, omega, phase)
 
 
 @cached
-def _followed_phases(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
-    return jax.vmap(lambda w, start: _phases(parts, influence_of(parts, w)[0], w, start))(omega, phase)
-
-
-def _power_of_2(n: int) -> np.ndarray:
-    """Places 0 .. n - 1, starting over until there is a power of 2 of them, so that few scenes compile anew."""
-    return np.resize(np.arange(n), 2 ** int(np.ceil(np.log2(max(n, 1024)))))
-
-
-@cached
-def _many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
+def _balanced_many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
     """`balanced` from many speeds and phases."""
     return eqx.filter_vmap(balanced, in_axes=(None, 0, 0))(parts, omega, phase)
-
-
-@cached
-def _phases_at(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
-    """`_phases` at load speeds (no,) from starts (ns, count): drag multiples (no, ns), phases (no, ns, count), success."""
-    influences = jax.vmap(lambda w: influence_of(parts, w)[0])(omega)
-    return jax.vmap(lambda w, a: jax.vmap(lambda start: _phases(parts, a, w, start))(phase))(omega, influences)
-
-
-def _phases(parts: Parts, influence: Array, omega: Array, start: Array) -> tuple[Array, Array, Array]:
-    """The multiple of the drag and the phases (count,) of a jam at a given load speed, near `start` (count,); whether found.
-
-    All loads must need the same multiple, - T_j / (b_j R_j^2 (n - w)): it is explicit, and the phases are all that is sought.
-    """
-
-    def needs(x: Array) -> Array:
-        angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
-        return -torques_at(parts, influence, omega, angles) / (parts.drag * (parts.speed - omega))
-
-    scale = jnp.sum(jnp.abs(influence) * parts.unbalance[:, None] * parts.unbalance[None, :]) * omega**4 / jnp.min(parts.drag)
-    scale = scale / jnp.abs(parts.speed - omega)
-
-    def differ(x: Array) -> Array:
-        each = needs(x) / scale
-        return each[1:] - each[:-1]
-
-    x = damped_newton(differ, start[1:] - start[0]) if start.shape[0] > 1 else start[1:]
-    each = needs(x)
-    good = (jnp.max(jnp.abs(each - each[0])) < 1e-8 * scale) & (each[0] > 0.0)
-    return each[0], jnp.concatenate([jnp.zeros(1, x.dtype), x]), good
 
 
 def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
@@ -332,35 +239,14 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
         w, begins = at
         start = jnp.where(begins, phase, last)
         influence, answer = influence_of(parts, w)
-        factor, angles, good = _phases(parts, influence, w, start)
+        factor, angles, residual = phases_near(parts, influence, w, start)
+        good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (factor > 0.0)
         braked = eqx.tree_at(lambda field: field.drag, parts.averaged, factor * parts.drag)
         growth = averaged_growth(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
     return jax.lax.scan(step, phase, (omega, anew))[1]
-
-
-def _load_speeds(parts: Parts) -> np.ndarray:
-    """Load speeds below the rotor's, closer together near the carrier's resonances at this rotor speed."""
-    mass, nd = np.asarray(parts.model.mass), parts.model.mass.shape[0]
-    stiffness, damping = np.asarray(parts.model.carrier.stiffness), np.asarray(parts.model.damping(parts.speed))
-    flow = np.linalg.solve(mass, np.concatenate([-stiffness, -damping], axis=1))
-    poles = np.linalg.eigvals(np.concatenate([np.eye(nd, 2 * nd, nd), flow]))
-    speed = float(parts.speed)
-    centres = np.unique(np.abs(poles[np.abs(poles.imag) > 0.0].imag))
-    apart = np.concatenate([[0.0], np.geomspace(1e-4, 0.3, 30)])
-    crowd = [w * (1.0 + side * apart) for w in centres for side in (-1.0, 1.0)]
-    top = speed * (1.0 - np.geomspace(1e-6, 0.1, 12))
-    speeds = np.unique(np.concatenate([np.linspace(0.02, 0.98, _GRID) * speed, top, *crowd]))
-    return speeds[(speeds > 1e-3 * speed) & (speeds < speed)]
-
-
-def _regular(parts: Parts) -> np.ndarray:
-    """Regular sets of phases (ns, count): together, and every split into two opposite groups."""
-    n = parts.unbalance.shape[0]
-    splits = range(2 ** min(n - 1, 5))
-    return np.array([[np.pi * ((k >> j) & 1) if j < min(n - 1, 5) else 0.0 for j in range(n)] for k in splits])
 
 
 def _equal_loads(parts: Parts) -> list[np.ndarray]:
