@@ -200,8 +200,10 @@ def numbers(
 
 def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
     try:
-        # What JAX does not hold yet NumPy converts: no program need be compiled for it.
-        array = jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype=float), dtype=float)
+        # What JAX does not hold yet NumPy converts: no program need be compiled for it. What single precision cannot hold is
+        # infinite, which `_checked` refuses.
+        with np.errstate(over="ignore"):
+            array = jnp.asarray(value if isinstance(value, jax.Array) else np.asarray(value, dtype=float), dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}") from error
     if array.shape != shape:

@@ -95,7 +95,8 @@ def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
                 f"loads may have {_LEAST:g} to {1.0 / _LEAST:g} times the machine's mass",
             )
     if drag is not None:
-        share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
+        with np.errstate(over="ignore"):  # too much to be a number is not too little
+            share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
         lost = (share > 0.0) & (share < _LEAST)
         if np.any(lost):
             least = _LEAST * float(np.max(each[lost])) * float(drive.speed)

@@ -92,6 +92,7 @@ def test_numbers_that_rounding_loses_are_refused_when_a_scene_is_made():
         with pytest.raises(jv.InputError, match=says):
             made(**changes)
     assert made(drag=0.0).loads.count == made(mass=1e-9, drag=1e-20).loads.count == 3
+    assert made(mass=1e-9, drag=1e300).loads.count == 3  # what a share of a load's speed comes to is no number
 
 
 def test_arrays_that_no_memory_holds_are_refused():

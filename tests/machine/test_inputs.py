@@ -1,5 +1,6 @@
 """What is said about wrong machines, loads, drives and effects."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -86,6 +87,11 @@ def test_wrong_input_is_one_sentence(case):
     text = str(error.value)
     assert text.startswith(sentence), text
     assert "\n" not in text and text.startswith(error.value.field)
+
+
+def test_a_number_that_single_precision_cannot_hold_is_not_finite():
+    with jax.enable_x64(False), pytest.raises(jv.InputError, match=r"loads\.drag is inf N s/m; a finite number is needed"):
+        balls(drag=1e300)
 
 
 def test_dimensionless_forms_refuse_what_cannot_be():
