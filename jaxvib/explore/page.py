@@ -45,14 +45,23 @@ def _(controls, pictures, scene, scene_at):
 
 
 @app.cell
-def _(machine, mo, pictures, scene):
-    mo.Html(pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine))
+def _(machine, mode, pictures, scene):
+    # All before any is sent: a browser that draws the first would take the processor from the next.
+    chart = pictures.image(lambda: pictures.diagram(machine.value, 4.0 / 3.0 * float(scene.drive.speed)), machine)
+    numbers = pictures.text(lambda: pictures.readings(machine.value), machine)
+    film = pictures.image(lambda: pictures.machine(machine.value, mode.value), machine)
+    return chart, film, numbers
+
+
+@app.cell
+def _(chart, mo):
+    mo.Html(chart)
     return
 
 
 @app.cell
-def _(machine, mo, pictures):
-    mo.Html(pictures.text(lambda: pictures.readings(machine.value), machine))
+def _(mo, numbers):
+    mo.Html(numbers)
     return
 
 
@@ -72,8 +81,8 @@ def _(mo, pictures, scene):
 
 
 @app.cell
-def _(machine, mo, mode, pictures):
-    mo.Html(pictures.image(lambda: pictures.machine(machine.value, mode.value), machine))
+def _(film, mo):
+    mo.Html(film)
     return
 
 

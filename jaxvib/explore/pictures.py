@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from jaxvib.errors import ComputationError, InputError
+from jaxvib.explore.sliders import scene_at, sliders_of
 from jaxvib.machine.files import scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.branches import branches
@@ -98,6 +99,9 @@ def prepare(scene: Scene) -> None:
     """Compiles and draws once what the page will ask for, so that its first slider moves as fast as the next."""
     most = 4.0 / 3.0 * float(scene.drive.speed)
     given = Tried(scene, "")
+    for slider in sliders_of(scene):
+        if slider.place is not None:  # another number of loads is another program
+            scene_at(scene, {slider.name: slider.steps[slider.steps.index(slider.start) - 1]})
     for _ in range(2):
         image(lambda: diagram(scene, most), given)
         text(lambda: readings(scene), given)
