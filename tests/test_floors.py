@@ -136,3 +136,23 @@ def test_folders_and_files_are_small():
                 long.append(f"{path.relative_to(ROOT)}: {lines} lines")
     assert {str(folder): count for folder, count in folders.items() if count > MOST_FILES} == {}
     assert long == []
+
+
+def test_the_page_on_the_layout_names_every_module():
+    rows, folder = collections.defaultdict(str), ""
+    for line in (ROOT / "CONTRIBUTING.md").read_text().splitlines():
+        if line.startswith("|"):
+            first, rest = line.strip("|").split("|", 1)
+            named = first.split("`")[1::2]
+            folder = named[0] if named else folder
+            rows[folder] += rest
+    missing = []
+    for name in sources():
+        *parts, module = name.split(".")
+        if (ROOT.joinpath(*parts, module)).is_dir():
+            continue  # a package
+        while "/".join(parts) not in rows:
+            parts.pop()
+        if f"`{module}`" not in rows["/".join(parts)]:
+            missing.append(name)
+    assert not missing, f"CONTRIBUTING.md does not name {', '.join(missing)}"
