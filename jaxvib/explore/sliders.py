@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -132,5 +133,10 @@ def _slider(scene: Scene, place: Place, factors: np.ndarray) -> Slider:
         return Slider(place.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, place)
     unit, scale = shown_unit(place.unit, float(values[0]))
     start = float(f"{scale * values[0]:.6g}")
-    steps = sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)})
-    return Slider(place.name, names_of(scene, place)[0], unit, tuple(steps), start, place)
+    return Slider(place.name, names_of(scene, place)[0], unit, _steps(start, tuple(factors.tolist())), start, place)
+
+
+@functools.lru_cache(maxsize=256)
+def _steps(start: float, factors: tuple[float, ...]) -> tuple[float, ...]:
+    """The values from `start` on and back, with four digits; kept, since every move asks for those of all sliders."""
+    return tuple(sorted({start, *(float(f"{f * start:.4g}") for f in factors if f != 1.0)}))

@@ -71,7 +71,7 @@ def svg(
 def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], seconds: float, turns: float) -> str:
     """A part with its motion: a shift of the whole where it keeps its shape, else from outline to outline."""
     first = frames[0]
-    outlines = np.array([place(frame.points) for frame in frames])
+    outlines = place(np.array([frame.points for frame in frames]))
     shift = np.array([outline[0] for outline in outlines]) - outlines[0, 0]
     draw = f'<path d="{_path(outlines[0], first.filled)}"{_style(first)}'
     if len(frames) == 1:
@@ -81,7 +81,7 @@ def _part(frames: Sequence[Part], place: Callable[[np.ndarray], np.ndarray], sec
         angles = f'from="0 {x:.1f} {y:.1f}" to="-360 {x:.1f} {y:.1f}"'
         turning = f'<animateTransform attributeName="transform" type="rotate" {angles} {_for_ever(seconds / turns)}'
         draw = f"{draw}>{turning}</path>"
-        moved = np.array([place(np.asarray(frame.axis)) for frame in frames]) - (x, y)
+        moved = place(np.array([frame.axis for frame in frames])) - (x, y)
     elif np.nanmax(np.abs(outlines - outlines[0] - shift[:, None])) < 0.05:
         draw, moved = f"{draw}/>", shift
     else:
