@@ -9,7 +9,7 @@ from jaxvib.errors import ComputationError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.sketch import checked_scene
 from jaxvib.show.views import view_of
-from jaxvib.show.wheel import Pose, at_rest, caption
+from jaxvib.show.wheel import Pose, at_rest, caption, places_of
 from jaxvib.steady.jams.jam import Jam
 
 __all__ = ["moving", "still"]
@@ -45,9 +45,11 @@ def moving(scene: Scene, jam: Jam) -> str:
     first, *others = (np.asarray(u, float) for u in scene.loads.rest())
     wave = np.exp(1j * theta)[:, None] * amplitude
     displacement, velocity = np.real(wave), np.real(1j * omega * wave)
+    angles = theta[:, None] + np.zeros_like(first)
+    own = places_of(scene.loads, (angles, *others))  # of all poses at once
     poses = [
-        Pose(q, v, (np.full_like(first, angle), *others), 0.0)
-        for q, v, angle in zip(displacement, velocity, theta, strict=True)
+        Pose(q, v, (angle, *others), 0.0, [x[k] if x.ndim > 1 else x for x in own])
+        for k, (q, v, angle) in enumerate(zip(displacement, velocity, angles, strict=True))
     ]
     forces = [view.support_forces(pose) for pose in poses]
     totals = [np.array([force[:, 1].sum()]) for force in forces]

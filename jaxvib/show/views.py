@@ -277,7 +277,7 @@ class ShaftView(View):
         corners = [(s, side) for s, side in ((body[0], -1), (body[1], -1), (body[1], 1), (body[0], 1))]
         points = np.array([[self._x(s), self._y(s, pose, reach) + 0.38 * side] for s, side in corners])
         found.append(Part(points, _BODY, True))
-        up = self.wheel.places(pose.angle)[1]
+        up = self.wheel.places(pose)[1]
         for s in np.unique(self.stations):
             x, y = self._x(s), self._y(s, pose, reach)
             disc = box(x - 0.09, x + 0.09, y - self.wheel.rim, y + self.wheel.rim)

@@ -18,12 +18,14 @@ __all__ = ["Pose", "Wheel", "at_rest", "caption", "places_of", "shown"]
 
 class Pose(NamedTuple):
     """Where everything is at an instant: `displacement` (nd,) m and `velocity` (nd,) m/s, of tilts rad and rad/s, the loads'
-    coordinates `angle`, (count,) each, and the angle `turn` of the rotor, rad."""
+    coordinates `angle`, (count,) each, and the angle `turn` of the rotor, rad; `own`, the loads' own positions (count,) each,
+    where they are known already."""
 
     displacement: np.ndarray
     velocity: np.ndarray
     angle: tuple[np.ndarray, ...]
     turn: float
+    own: Sequence[np.ndarray] | None = None
 
 
 _UNITS = {
@@ -98,9 +100,10 @@ class Wheel:
         self.size = 0.12 * radius / 0.7 if own is None else max(float(own) * self.scale, 0.05)
         self.rim = radius + max(1.15 * self.size, 0.1)
 
-    def places(self, angle: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    def places(self, pose: Pose) -> list[np.ndarray]:
         """Where the loads are relative to the axis, in the drawing: across, up, and along where they move there."""
-        return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in places_of(self.loads, angle)]
+        own = places_of(self.loads, pose.angle) if pose.own is None else pose.own
+        return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
 
     def parts(self, centre: tuple[float, float], pose: Pose) -> list[Part]:
         """The rim, the loads' circle, two spokes that turn with the rotor, and the loads."""
@@ -115,7 +118,7 @@ class Wheel:
             found.append(Part(np.array([centre - self.rim * e, centre + self.rim * e]), look, axis=centre))
         mark = circle(tuple(centre + 0.82 * self.rim * np.array([np.cos(pose.turn), np.sin(pose.turn)])), 0.05)
         found.append(Part(mark, {"fc": "#9a9a9a", "ec": "none", "zorder": 3.2}, True, centre))
-        across, up, *_ = self.places(pose.angle)
+        across, up, *_ = self.places(pose)
         for j in range(self.loads.count):
             color = COLORS[j % len(COLORS)]
             place = (x + float(across[j]), y + float(up[j]))
