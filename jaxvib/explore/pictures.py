@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import gc
 import html
 import io
@@ -101,7 +102,8 @@ def prepare(scene: Scene) -> None:
     given = Tried(scene, "")
     for slider in sliders_of(scene):
         if slider.place is not None:  # another number of loads is another program
-            scene_at(scene, {slider.name: slider.steps[slider.steps.index(slider.start) - 1]})
+            moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
+            tried(functools.partial(scene_at, scene, moved))
     for _ in range(2):
         image(lambda: diagram(scene, most), given)
         text(lambda: readings(scene), given)

@@ -26,8 +26,8 @@ _WIDE = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "mach
 _MOST = 12
 """So many sliders stand for numbers of a machine one by one; of a larger one, one slider moves all of a kind."""
 
-_DECADES = np.geomspace(0.1, 10.0, 81)
-_SHARES = np.arange(1, 301) / 100.0
+_DECADES = tuple(np.geomspace(0.1, 10.0, 81).tolist())
+_SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
 
 
 class Slider(NamedTuple):
@@ -125,7 +125,7 @@ def _entries(scene: Scene, place: Place) -> list[Place]:
     return [places_of(scene, f"{place.name}[{k}]", "slider") for k in range(place.size) if values[k]]
 
 
-def _slider(scene: Scene, place: Place, factors: np.ndarray) -> Slider:
+def _slider(scene: Scene, place: Place, factors: tuple[float, ...]) -> Slider:
     values = np.asarray(place.read(scene))
     if place.size > 1:
         part, _, field = place.name.partition(".")
@@ -133,7 +133,7 @@ def _slider(scene: Scene, place: Place, factors: np.ndarray) -> Slider:
         return Slider(place.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, place)
     unit, scale = shown_unit(place.unit, float(values[0]))
     start = float(f"{scale * values[0]:.6g}")
-    return Slider(place.name, names_of(scene, place)[0], unit, _steps(start, tuple(factors.tolist())), start, place)
+    return Slider(place.name, names_of(scene, place)[0], unit, _steps(start, factors), start, place)
 
 
 @functools.lru_cache(maxsize=256)

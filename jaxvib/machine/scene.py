@@ -79,6 +79,7 @@ class Scene(eqx.Module):
         self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # shares of the largest and least numbers there are
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
     """**Raises** `InputError` for numbers, where they are known, of which one is lost in the rounding of another: loads too
     heavy or too light beside the machine, drag too weak beside their inertia."""
@@ -95,8 +96,7 @@ def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
                 f"loads may have {_LEAST:g} to {1.0 / _LEAST:g} times the machine's mass",
             )
     if drag is not None:
-        with np.errstate(over="ignore"):  # too much to be a number is not too little
-            share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
+        share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
         lost = (share > 0.0) & (share < _LEAST)
         if np.any(lost):
             least = _LEAST * float(np.max(each[lost])) * float(drive.speed)

@@ -11,10 +11,11 @@ import numpy as np
 from jax import Array
 
 from jaxvib.numerics.linalg import damped_newton
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at
 
-__all__ = ["LOAD_SPEEDS", "in_chunks", "load_speeds", "phases_near", "starts_of"]
+__all__ = ["LOAD_SPEEDS", "in_two_programs", "load_speeds", "phases_near", "starts_of"]
 
 LOAD_SPEEDS = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
@@ -70,7 +71,7 @@ def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndar
     """Phases at each of some load speeds (n,) near its own (n, count), with the logarithm of the drag's multiple."""
     if omega.size == 0:
         return omega, phase, omega > 0.0
-    found = in_chunks(lambda w, a: _few_steps(parts, w, a), omega, phase)
+    found = in_two_programs(lambda w, a: _few_steps(parts, w, a), omega, phase)
     factor, angles, good = _gone_on(parts, omega, *found)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
@@ -88,7 +89,7 @@ def _gone_on(
         left = np.flatnonzero(~(residual < eps**0.75))
         if left.size == 0:
             break
-        again = in_chunks(lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
+        again = in_two_programs(lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
         for whole, part in zip((factor, phase, residual), again, strict=True):
             whole[left] = part
     return factor, phase, (residual < eps**0.5) & (factor > 0.0)
@@ -99,13 +100,9 @@ def _few_steps(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, 
     return jax.vmap(lambda w, start: phases_near(parts, influence_of(parts, w)[0], w, start, _FEW))(omega, phase)
 
 
-def in_chunks(call: Callable[[Array, Array], Any], omega: np.ndarray, phase: np.ndarray) -> Any:
-    """What `call` gives for speeds (n,) and phases (n, count), as NumPy's arrays. It is asked for 32 or for 1024 of them at a
-    time, the first ones again at the end, so that two programs do for any n."""
-    size = _CHUNKS[0] if omega.size <= _CHUNKS[0] else _CHUNKS[1]
-    many = np.resize(np.arange(omega.size), size * -(-omega.size // size)).reshape(-1, size)
-    found = [call(jnp.asarray(omega[some]), jnp.asarray(phase[some])) for some in many]
-    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[: omega.size], *found)
+def in_two_programs(function: Callable[[Array, Array], Any], omega: np.ndarray, phase: np.ndarray) -> Any:
+    """`in_chunks` of speeds (n,) and phases (n, count), of 32 or of 1024 cases, so that two programs do for any n."""
+    return in_chunks(_CHUNKS[omega.size > _CHUNKS[0]], function, omega, phase)
 
 
 def load_speeds(parts: Parts) -> np.ndarray:
