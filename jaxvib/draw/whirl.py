@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from jaxvib.draw.style import COLORS, GUIDE, OPERATING, Drawn, SpeedUnit, legend_above, panels, speed_scale
 
-__all__ = ["campbell_diagram"]
+__all__ = ["campbell_diagram", "critical_groups", "whirl_lines"]
 
 
 def campbell_diagram(
@@ -31,13 +31,7 @@ def campbell_diagram(
     scale = speed_scale(unit)
     figure, (axis,) = panels(1, size=(7.0, 4.6), ax=ax)
     for with_rotor, line, color, label in ((True, "-", COLORS[0], "forward whirl"), (False, "--", COLORS[1], "backward whirl")):
-        # The k-th motion of one sense keeps its place among its kind while speeds of different sense cross.
-        count = int(np.max(np.sum(forward == with_rotor, axis=1), initial=0))
-        for k in range(count):
-            values = np.full(len(rotor_speed), np.nan)
-            for i, (w, f) in enumerate(zip(speed, forward, strict=True)):
-                own = np.sort(w[f == with_rotor])
-                values[i] = own[k] if k < len(own) else np.nan
+        for k, values in enumerate(whirl_lines(speed, forward == with_rotor)):
             alone = {"marker": "o", "ms": 4.0} if len(rotor_speed) == 1 else {}
             axis.plot(scale * rotor_speed, scale * values, ls=line, color=color, label=None if k else label, **alone)
     found = np.zeros(0) if critical is None else critical[0][np.isfinite(critical[0])]
@@ -60,15 +54,38 @@ def campbell_diagram(
 
 def _critical_marks(axis: Axes, speed: np.ndarray, forward: np.ndarray, right: float, top: float) -> None:
     """Points on the synchronous line, and their speeds beside lines that drop to the axis; close ones in one text."""
-    order = [k for k in np.argsort(speed) if np.isfinite(speed[k]) and speed[k] <= right]
-    groups: list[list[int]] = []
-    for k in order:
-        look = {"mfc": "white", "mec": COLORS[0] if forward[k] else COLORS[1], "mew": 1.4, "zorder": 4}
-        axis.plot([speed[k]], [speed[k]], "o" if forward[k] else "s", ms=6.0, **look)
-        axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
-        near = groups and speed[k] - speed[groups[-1][-1]] < 0.035 * right
-        groups = [*groups[:-1], [*groups[-1], k]] if near else [*groups, [k]]
-    for group in groups:
-        word = ", ".join(f"{speed[k]:.4g} {'forward' if forward[k] else 'backward'}" for k in group)
+    for group, word in critical_groups(speed, forward, right):
+        for k in group:
+            look = {"mfc": "white", "mec": COLORS[0] if forward[k] else COLORS[1], "mew": 1.4, "zorder": 4}
+            axis.plot([speed[k]], [speed[k]], "o" if forward[k] else "s", ms=6.0, **look)
+            axis.vlines(float(speed[k]), 0.0, float(speed[k]), color=GUIDE, lw=0.7, zorder=1.2)
         at = (speed[group[-1]], 0.02 * top)
         axis.annotate(word, at, xytext=(3, 0), textcoords="offset points", rotation=90, va="bottom", fontsize="small")
+
+
+def whirl_lines(speed: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """The lines (k, ns) of whirls of one sense, of speeds (ns, nd) those that are its `own` (ns, nd): the k-th keeps its place
+    among its kind while speeds of different sense cross; NaN where there are fewer.
+
+    >>> import numpy as np
+    >>> whirl_lines(np.array([[1.0, 2.0], [1.5, 1.4]]), np.array([[True, False], [False, True]])).tolist()
+    [[1.0, 1.4]]
+    """
+    count = int(np.max(np.sum(own, axis=1), initial=0))
+    return np.sort(np.where(own, speed, np.nan), axis=1)[:, :count].T
+
+
+def critical_groups(speed: np.ndarray, forward: np.ndarray, right: float) -> list[tuple[list[int], str]]:
+    """The critical speeds (k,) up to `right`, ascending, close ones together, and what is written beside each group.
+
+    >>> import numpy as np
+    >>> critical_groups(np.array([1.0, 10.0, 10.1]), np.array([True, True, False]), right=20.0)
+    [([0], '1 forward'), ([1, 2], '10 forward, 10.1 backward')]
+    """
+    groups: list[list[int]] = []
+    for k in np.argsort(speed).tolist():
+        if np.isfinite(speed[k]) and speed[k] <= right:
+            near = groups and speed[k] - speed[groups[-1][-1]] < 0.035 * right
+            groups = [*groups[:-1], [*groups[-1], k]] if near else [*groups, [k]]
+    senses = {True: "forward", False: "backward"}
+    return [(group, ", ".join(f"{speed[k]:.4g} {senses[bool(forward[k])]}" for k in group)) for group in groups]

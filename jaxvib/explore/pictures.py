@@ -6,9 +6,8 @@ import base64
 import functools
 import gc
 import html
-import io
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -20,9 +19,6 @@ from jaxvib.machine.scene import Scene
 from jaxvib.steady.branches import branches
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.whirl import critical_speeds, whirl
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = [
     "ABOUT",
@@ -144,16 +140,14 @@ def diagram(scene: Scene, most: float) -> str:
     >>> "whirl speed, rpm" in diagram(jv.scene_from_toml(TEMPLATES["planar_rotor"]), most=600.0)
     True
     """
-    from jaxvib.explore.chart import chart  # slow to import: only who draws pays
+    from jaxvib.explore.campbell import campbell  # slow to import: only who draws pays
+    from jaxvib.explore.chart import chart
 
     speed = float(scene.drive.speed)
     most = max(most, 1.15 * speed)
     if has_branches(scene):
         return chart(jax.device_get(branches(scene, most=most)), most)
-    figure = jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))).plot(at=speed, unit="rpm")
-    figure.set_layout_engine(None)  # arranging a figure takes longer than drawing it
-    figure.subplots_adjust(left=0.11, right=0.98, bottom=0.12, top=0.86)
-    return _vector(figure)
+    return campbell(jax.device_get(whirl(scene, np.linspace(0.0, most, _SPEEDS))), speed)
 
 
 def readings(scene: Scene) -> str:
@@ -180,15 +174,3 @@ def machine(scene: Scene, mode: int | None) -> str:
     from jaxvib.show.moving import moving, still  # slow to import: only who draws pays
 
     return still(scene) if mode is None else moving(scene, jax.device_get(jam_modes(scene)).select(mode))
-
-
-def _vector(figure: Figure) -> str:
-    """A figure as the text of an SVG file, drawn once (`savefig` draws twice) and in two thirds of the time of a PNG file:
-    letters are left to the browser."""
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    buffer = io.StringIO()
-    with rc_context({"svg.fonttype": "none"}):
-        FigureCanvasSVG(figure).print_svg(buffer)
-    return buffer.getvalue()

@@ -18,6 +18,7 @@ from jaxvib.machine.files import TEMPLATES
 from jaxvib.show.moving import moving
 
 SVG = "{http://www.w3.org/2000/svg}"
+RPM = 30.0 / np.pi
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +141,26 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     assert float(again.machine.stiffness[0]) == 2e5
 
 
+def _texts(drawn):
+    """The texts of a picture: where each stands, what it says, its element."""
+    return [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
+
+
+def _axes(spans, log=False):
+    """Both axes of a chart from the numbers at its ticks: polynomials of the dots."""
+    ticks = [(x, y, float(text), e.get("text-anchor")) for x, y, text, e in spans if re.fullmatch(r"[-+.e0-9]+", text or "")]
+    across = np.polyfit(*zip(*[(x, value) for x, _, value, anchor in ticks if anchor == "middle"], strict=True), 1)
+    # The base of a text stands 0.35 of its size below its middle.
+    levels = [(y - 0.35 * 11.5, np.log(value) if log else value) for _, y, value, anchor in ticks if anchor == "end"]
+    return across, np.polyfit(*zip(*levels, strict=True), 1)
+
+
+def _lines(drawn, color):
+    """The lines of a colour, in dots, with the figures of their dashes."""
+    paths = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == color and p.get("d") and p.get("fill") == "none"]
+    return [(np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float), p.get("stroke-dasharray")) for p in paths]
+
+
 @pytest.mark.parametrize("kind", ["two_mass", "network"])
 def test_the_charts_lines_are_the_branches(kind):
     """Read back by the numbers at the ticks, every point of the picture's lines lies on a branch, and every jam is marked."""
@@ -147,23 +168,16 @@ def test_the_charts_lines_are_the_branches(kind):
     most = 1.4 * float(scene.drive.speed)
     found = jax.device_get(jv.branches(scene, most=most))
     drawn = ElementTree.fromstring(pictures.diagram(scene, most))
-    spans = [(float(t.get("x")), float(t.get("y")), t.text, e) for e in drawn.iter(f"{SVG}text") for t in e.iter(f"{SVG}tspan")]
+    spans = _texts(drawn)
     titles = {text: x for x, _, text, _ in spans if text in ("speed of loads, rpm", "foundation force, N, zero to peak")}
     middle = titles["foundation force, N, zero to peak"]
-    ticks = [(x, y, float(text), e.get("text-anchor")) for x, y, text, e in spans if re.fullmatch(r"[-+.e0-9]+", text or "")]
-    rpm = 30.0 / np.pi
-    for right, values, log in ((False, rpm * found.omega, False), (True, found.foundation_force, True)):
-        here = [tick for tick in ticks if (tick[0] > middle - 1.0) == right]
-        across = np.polyfit(*zip(*[(x, value) for x, _, value, anchor in here if anchor == "middle"], strict=True), 1)
-        # The base of a text stands 0.35 of its size below its middle.
-        levels = [(y - 0.35 * 11.5, np.log(value) if log else value) for _, y, value, anchor in here if anchor == "end"]
-        up = np.polyfit(*zip(*levels, strict=True), 1)
-        curves = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == "#004488" and p.get("d")]
-        lines = [np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float) for p in curves]
+    for right, values, log in ((False, RPM * found.omega, False), (True, found.foundation_force, True)):
+        across, up = _axes([span for span in spans if (span[0] > middle - 1.0) == right], log)
+        lines = [line for line, _ in _lines(drawn, "#004488")]
         points = np.concatenate([line for line in lines if (line[0, 0] > middle - 1.0) == right])
         assert len(points) > 200
         heights = np.log(np.maximum(values, 1e-300)) if log else values
-        there = np.stack([found.rotor_speed * rpm / across[0], heights / up[0]], axis=1)  # in dots
+        there = np.stack([found.rotor_speed * RPM / across[0], heights / up[0]], axis=1)  # in dots
         line = np.stack([np.polyval(across, points[:, 0]) / across[0], np.polyval(up, points[:, 1]) / up[0]], axis=1)
         a, b = there[:-1], there[1:]
         with np.errstate(invalid="ignore"):
@@ -173,6 +187,26 @@ def test_the_charts_lines_are_the_branches(kind):
     modes = jv.jam_modes(scene).mode_numbers()
     told = [int(number) for _, _, text, e in spans if e.get("font-weight") == "bold" for number in text.split(", ")]
     assert sorted(told) == sorted(2 * modes)
+
+
+@pytest.mark.parametrize("kind", ["rotor", "planar_rotor"])
+def test_the_campbell_diagram_is_the_rotors_whirl(kind):
+    """Read back by the numbers at the ticks, lines are the whirls of each sense, and every critical speed is written."""
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    most = 1.4 * float(scene.drive.speed)
+    found = jax.device_get(jv.whirl(scene, np.linspace(0.0, most, pictures._SPEEDS)))
+    drawn = ElementTree.fromstring(pictures.diagram(scene, most))
+    across, up = _axes(_texts(drawn))
+    for color, dashes, own in (("#004488", None, found.forward), ("#d55e00", "4 2", ~found.forward)):
+        whirls = np.sort(RPM * np.where(own, found.speed, np.inf), axis=1)
+        lines = [(line, dash) for line, dash in _lines(drawn, color) if len(line) > 2]
+        assert len(lines) == np.max(own.sum(axis=1)) and {dash for _, dash in lines} == {dashes}
+        for k, (line, _) in enumerate(lines):
+            right = np.interp(np.polyval(across, line[:, 0]), RPM * found.rotor_speed, whirls[:, k])
+            np.testing.assert_allclose(np.polyval(up, line[:, 1]), right, atol=0.6 * abs(up[0]))
+    said = " ".join(text for *_, text, _ in _texts(drawn) if text)
+    speeds = [(w, way) for w, way in zip(RPM * found.critical.speed, found.critical.forward, strict=True) if np.isfinite(w)]
+    assert all(f"{w:.4g} {'forward' if way else 'backward'}" in said for w, way in speeds) and len(speeds) >= 2
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):

@@ -1,0 +1,72 @@
+"""The Campbell diagram of a rotor as an SVG picture."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxvib.draw.machine.parts import Text
+from jaxvib.draw.machine.svg import svg
+from jaxvib.draw.style import COLORS, GUIDE, speed_scale
+from jaxvib.draw.whirl import critical_groups, whirl_lines
+from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
+from jaxvib.steady.whirl import Whirl
+
+__all__ = ["campbell"]
+
+_FORWARD = {"color": COLORS[0], "lw": 1.5}
+_BACKWARD = {"color": COLORS[1], "lw": 1.5, "ls": "--"}
+_CRITICAL = {"fc": "white", "ec": "black", "lw": 1.2, "zorder": 4.0}
+_DROP = {"color": GUIDE, "lw": 0.7, "zorder": 1.2}
+_LETTER = 0.11
+"""A letter's width, with something to spare."""
+
+_LEGEND = {
+    "forward whirl": _FORWARD,
+    "backward whirl": _BACKWARD,
+    "whirl as fast as the rotor": ROTOR,
+    "operating speed": OPERATING,
+    "critical speeds (no damping), rpm": _CRITICAL,
+}
+"""What lines and dots look like, by what they are."""
+
+
+def campbell(found: Whirl, at: float) -> str:
+    """Whirl speeds over the rotor's speed with the critical speeds, in rpm: what `Whirl.plot` draws.
+
+    **Arguments**: `found` the whirls of one scene over rotor speeds; `at` the operating speed, rad/s.
+
+    **Returns** the text of an SVG file.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import numpy as np
+    >>> import jaxvib as jv
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> scene = jv.scene_from_toml(TEMPLATES["planar_rotor"])
+    >>> "whirl speed, rpm" in campbell(jv.whirl(scene, np.linspace(0.0, 600.0, 31)), at=460.0)
+    True
+    """
+    scale, rotor_speed = speed_scale("rpm"), np.asarray(found.rotor_speed)
+    speed, forward = np.asarray(found.speed), np.asarray(found.forward)
+    critical, ahead = scale * np.asarray(found.critical.speed), np.asarray(found.critical.forward)
+    right = scale * max(float(np.max(rotor_speed)), 1.05 * at)
+    groups = critical_groups(critical, ahead, right)
+    shown = [k for group, _ in groups for k in group]
+    top = 1.12 * max(scale * float(np.nanmax(speed)), *critical[shown].tolist(), 1e-300)
+    panel = Panel(FIRST, "whirl speed, rpm", (0.0, right), (0.0, top), wide=2.0 * WIDE + APART)
+    parts, texts = panel.frame(), panel.texts()
+    for own, look in ((forward, _FORWARD), (~forward, _BACKWARD)):
+        parts += [panel.line(scale * rotor_speed, scale * values, look) for values in whirl_lines(speed, own)]
+    end = min(top, right)
+    parts += [panel.line([0.0, end], [0.0, end], ROTOR), panel.line([scale * at] * 2, panel.y, OPERATING)]
+    for k in shown:
+        w = float(critical[k])
+        look = {**_CRITICAL, "ec": COLORS[0] if ahead[k] else COLORS[1]}
+        parts += [panel.line([w, w], [0.0, w], _DROP), dot(*panel.at(w, w), look, square=not ahead[k])]
+    ends: list[float] = []  # of the texts in each row, the lowest first
+    for group, word in groups:
+        x, _ = panel.at(float(critical[group[-1]]), 0.0)
+        row = next((k for k, end in enumerate(ends) if end < x), len(ends))
+        ends[row:] = [x + _LETTER * len(word), *ends[row + 1 :]]
+        texts.append(Text(x + 0.08, 0.2 + 0.27 * row, word, {"fontsize": "small", "bbox": {"fc": "white"}}))
+    keys, names = legend(_LEGEND)
+    return svg((0.0, FIRST + panel.wide + LAST, -0.6, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)

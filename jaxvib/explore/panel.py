@@ -1,0 +1,120 @@
+"""A chart's axes, lines and legend as outlines and texts of an SVG picture, in a tenth of the time that matplotlib takes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from jaxvib.draw.machine.parts import Part, Text, box, circle
+from jaxvib.draw.style import GUIDE, log_places
+
+__all__ = ["APART", "FIRST", "LAST", "OPERATING", "ROTOR", "TALL", "WIDE", "Panel", "dot", "legend"]
+
+WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
+"""A panel's width and height, what is left of the first, between two and right of the last, in units of the drawing."""
+
+ROTOR = {"color": GUIDE, "lw": 0.8}
+OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}
+"""What the line on which a speed is the rotor's looks like, and that of the operating speed."""
+
+_TICKS = 5
+"""So many ticks, at most, an axis has."""
+
+_FINE = 0.03
+"""Points of a line that are nearer to each other than this are left out: two dots."""
+
+_COLUMNS = (0.05, 1.9, 4.6)
+"""Where the columns of the legend begin."""
+
+_GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """A chart over the rotor's speed: where it begins at the left, what stands above it, the limits of its axes, whether its
+    height is logarithmic, and how wide it is."""
+
+    left: float
+    title: str
+    x: tuple[float, float]
+    y: tuple[float, float]
+    log: bool = False
+    wide: float = WIDE
+
+    def place(self, x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Places in the drawing."""
+        x, y, (left, right), (low, high) = np.asarray(x, float), np.asarray(y, float), self.x, self.y
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.log(y / low) / math.log(high / low) if self.log else (y - low) / (high - low)
+        return self.left + self.wide * (x - left) / (right - left), TALL * share
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """One place in the drawing."""
+        across, up = self.place(x, y)
+        return float(across), float(up)
+
+    def line(self, x: ArrayLike, y: ArrayLike, look: dict[str, Any]) -> Part:
+        """A line through points of which those below or above the chart are left out."""
+        points = np.stack(self.place(x, y), axis=1)
+        inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
+        return Part(_thinned(np.where(inside[:, None], points, np.nan)), look)
+
+    def frame(self) -> list[Part]:
+        """The axes and the lines at their ticks."""
+        (left, right), (low, high) = self.x, self.y
+        upright = [self.line([x, x], self.y, _GRID) for x, _ in self._ticks_across()]
+        level = [self.line(self.x, [y, y], _GRID) for y, _ in self._ticks_up()]
+        edge = np.array([self.place(left, high), self.place(left, low), self.place(right, low)], float)
+        return [*upright, *level, Part(edge, {"color": "black", "lw": 0.8})]
+
+    def texts(self) -> list[Text]:
+        """The numbers at the ticks and what they are of."""
+        small = {"fontsize": "small"}
+        across = [Text(self.at(x, self.y[0])[0], -0.18, text, {**small, "ha": "center"}) for x, text in self._ticks_across()]
+        up = [Text(self.left - 0.08, self.at(self.x[0], y)[1], text, {**small, "ha": "right"}) for y, text in self._ticks_up()]
+        below = Text(self.left + 0.5 * self.wide, -0.46, "rotor speed, rpm", {**small, "ha": "center"})
+        return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
+
+    def _ticks_across(self) -> list[tuple[float, str]]:
+        return _told(MaxNLocator(_TICKS).tick_values(*self.x), self.x)
+
+    def _ticks_up(self) -> list[tuple[float, str]]:
+        locator = log_places(*self.y, most=_TICKS) if self.log else MaxNLocator(_TICKS)
+        return _told(locator.tick_values(*self.y), self.y)
+
+
+def _told(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, str]]:
+    """The ticks between the limits, with their numbers."""
+    return [(x, f"{x:g}") for x in np.asarray(places, float).tolist() if limits[0] <= x <= limits[1]]
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    """A line (n, 2) without the points that are next to others; its ends and those beside a gap (NaN) stay."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _FINE)
+    gap = np.isnan(np.concatenate([[np.nan], steps, [np.nan]]))
+    keep = gap[1:] | gap[:-1]
+    keep[1:] |= gone[1:] != gone[:-1]
+    return points[keep]
+
+
+def dot(x: float, y: float, look: dict[str, Any], square: bool = False) -> Part:
+    """A round dot, or a square one, of that look."""
+    outline = box(x - 0.045, x + 0.045, y - 0.045, y + 0.045) if square else circle((x, y), 0.05, 13)
+    return Part(outline, look, filled=True)
+
+
+def legend(looks: Mapping[str, dict[str, Any]]) -> tuple[list[Part], list[Text]]:
+    """Samples of lines and of dots (those that have a filling) with their names above the charts, two in a column."""
+    parts, texts = [], []
+    for k, (name, look) in enumerate(looks.items()):
+        x, y = _COLUMNS[k // 2], TALL + (0.95, 0.68)[k % 2]
+        parts.append(dot(x + 0.2, y, look) if "fc" in look else Part(np.array([[x, y], [x + 0.4, y]]), look))
+        texts.append(Text(x + 0.5, y, name, {"fontsize": "small"}))
+    return parts, texts
