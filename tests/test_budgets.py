@@ -44,10 +44,10 @@ def forward_run(k):
 
 BUDGETS = {
     "vector field": (field, 200),
-    "jam_modes": (modes, 2700),
-    "jam_modes, gradient": (jax.grad(modes), 3950),
-    "jam_orbit": (orbit, 6500),
-    "jam_orbit, gradient": (jax.grad(orbit), 7050),
+    "jam_modes": (modes, 2030),
+    "jam_modes, gradient": (jax.grad(modes), 2750),
+    "jam_orbit": (orbit, 5510),
+    "jam_orbit, gradient": (jax.grad(orbit), 5830),
     "simulate": (run, 4630),
     "simulate, forward derivatives": (jax.jacfwd(forward_run), 9160),
     "simulate, reverse derivatives": (jax.grad(run), 8680),

@@ -60,7 +60,7 @@ class LinearModel(eqx.Module):
         n is the rotor's `speed`, rad/s; if None, loads and rotor turn together at w.
         """
         damping = self.damping(omega if speed is None else speed)
-        return self.carrier.stiffness - omega**2 * self.mass + 1j * omega * damping
+        return jax.lax.complex(self.carrier.stiffness - omega**2 * self.mass, omega * damping)
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
         """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""

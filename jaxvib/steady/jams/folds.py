@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
-from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, turning
+from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -63,8 +63,7 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 def rotor_speed_at(model: LinearModel, omega: Array, speed: Array | None = None) -> Array:
     """`jam_rotor_speed` of a scene that is assembled already."""
     scene, loads = model.scene, jammed_loads(model.scene)
-    acceleration = -(omega**2) * (model.carrier.port @ model.displacement(omega, speed))
-    forward = jnp.sum(jnp.conj(turning(model.carrier)) * acceleration)
+    forward = -(omega**2) * jnp.sum(jnp.conj(model.direction) * model.displacement(omega, speed))
     torque = -mean_torque(loads.unbalance(), jnp.ones_like(forward), forward)
     free = omega + torque / loads.drag_sum()
     if not any(effect.has_friction for effect in scene.effects):
@@ -197,17 +196,21 @@ def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -
     (at,) = jnp.nonzero(dips, size=most, fill_value=0)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
-    def lowest(low: Array, high: Array, side: Array) -> Array:
-        def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-            a, b = bracket
+    def lowest(low: Array, high: Array, at: Array, value: Array) -> tuple[Array, Array]:
+        side = jnp.sign(value)
+
+        def narrow(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+            a, b, best, least = carry
             x, y = b - step * (b - a), a + step * (b - a)
-            at_x, at_y = jax.vmap(slope)(jnp.stack([x, y]))
-            left = side * at_x < side * at_y
-            return jnp.where(left, a, x), jnp.where(left, y, b)
+            at_x, at_y = side * jax.vmap(slope)(jnp.stack([x, y]))
+            left = at_x < at_y
+            lower, where = jnp.where(left, at_x, at_y), jnp.where(left, x, y)
+            best, least = jnp.where(lower < least, where, best), jnp.where(lower < least, lower, least)
+            return jnp.where(left, a, x), jnp.where(left, y, b), best, least
 
-        a, b = jax.lax.fori_loop(0, 16, narrow, (low, high))
-        return (a + b) / 2.0
+        best, least = jax.lax.fori_loop(0, 16, narrow, (low, high, at, side * value))[2:]
+        return best, side * least
 
-    added = jax.vmap(lowest)(grid[at], grid[at + 2], sign[at + 1])
+    added, there = jax.vmap(lowest)(grid[at], grid[at + 2], grid[at + 1], value[at + 1])
     order = jnp.argsort(jnp.concatenate([grid, added]))
-    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, jax.vmap(slope)(added)])[order]
+    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, there])[order]
