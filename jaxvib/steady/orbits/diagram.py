@@ -35,7 +35,7 @@ __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 _LANES = 32
 """Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
 
-_POINTS = (8, 16, 32, 64)
+_POINTS = (16, 32, 64)
 
 
 _JUDGED = "by the multipliers of the full equations"
