@@ -77,7 +77,8 @@ class PackedSystem(eqx.Module):
 
     def method(self, lanes: bool = False) -> diffrax.AbstractSolver:
         """The method of order 8 in the form that is fastest here; `lanes` whether many runs advance together."""
-        wrap = self._wrap if self.wrapped else None
+        # Without the equations' numbers: a method holds no traced arrays.
+        wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         return UnrolledDopri8(lanes=lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else LoopDopri8(wrap=wrap)
 
     def pack(self, state: State) -> Held:

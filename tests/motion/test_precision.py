@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import published
+from scenes import published, scene
 
 import jaxvib as jv
 
@@ -55,3 +55,20 @@ def test_an_imbalance_sets_the_unit_where_loads_hardly_shake():
 
 def machine32(machine):
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), machine)
+
+
+def test_a_gradient_in_single_precision_is_that_of_double():
+    """Where angles are held within a turn, the method itself knows how: it must hold none of what is differentiated."""
+
+    def force(stiffness, machine):
+        stiffer = eqx.tree_at(lambda s: s.machine.stiffness, machine, stiffness)
+        run = jv.simulate(stiffer, 2.0, save="window", stepsize_controller=jv.Tolerance(1e-5), estimate=False)
+        return run.foundation_force
+
+    double = scene("two_mass", "balls")
+    expected = jax.grad(force)(double.machine.stiffness, double)
+    with jax.enable_x64(False):
+        single = machine32(double)
+        found = jax.grad(force)(single.machine.stiffness, single)
+        assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
