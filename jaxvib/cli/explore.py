@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import click
@@ -18,7 +19,7 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
     """A local page with sliders for SCENE; its diagrams follow, and what is found is saved as TOML.
 
     Runs until it is interrupted (Ctrl-C). Nobody but this computer reaches the page. Needs: pip install 'jaxvib[explore]'"""
-    from jaxvib.explore.pictures import prepare
+    from jaxvib.explore.pictures import prepare, prepare_counts
     from jaxvib.explore.serve import require_free, require_marimo, serve  # only who explores pays
 
     require_marimo()
@@ -26,4 +27,5 @@ def explore(scene: Path, port: int, no_browser: bool) -> None:
     loaded = jv.load_scene(scene)
     click.echo("compiling ...")
     prepare(loaded)
+    threading.Thread(target=prepare_counts, args=(loaded,), daemon=True).start()
     serve(scene, port, not no_browser, lambda address: click.echo(f"the page is at {address}; Ctrl-C ends it"))

@@ -30,6 +30,7 @@ __all__ = [
     "machine",
     "modes_of",
     "prepare",
+    "prepare_counts",
     "readings",
     "text",
     "toml",
@@ -37,7 +38,8 @@ __all__ = [
 ]
 
 ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
-step. Each number of loads is a program of its own: the first time it takes some seconds, afterwards it is stored.
+step. Each number of loads is a program of its own: the seven next to the file's are compiled while the page is open, any
+other takes a second or two the first time. Afterwards it is stored.
 
 Amplitudes and forces are zero to peak. What is seen here is the theory of light loads; `jaxvib simulate` and
 `jaxvib modes --exact` answer for the saved machine exactly."""
@@ -45,6 +47,9 @@ Amplitudes and forces are zero to peak. What is seen here is the theory of light
 
 _SPEEDS = 81
 """Rotor speeds of a Campbell diagram."""
+
+_PREPARED = 7
+"""So many other numbers of loads are compiled while the page is open."""
 
 
 class Tried(NamedTuple):
@@ -94,18 +99,35 @@ def toml(scene: Tried) -> str:
 
 def prepare(scene: Scene) -> None:
     """Compiles and draws once what the page will ask for, so that its first slider moves as fast as the next."""
-    most = 4.0 / 3.0 * float(scene.drive.speed)
-    given = Tried(scene, "")
     for slider in sliders_of(scene):
         if slider.place is not None:  # another number of loads is another program
             moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
             tried(functools.partial(scene_at, scene, moved))
     for _ in range(2):
-        image(lambda: diagram(scene, most), given)
-        text(lambda: readings(scene), given)
-        image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)
+        _draw_all(scene)
     gc.collect()
     gc.freeze()  # programs and modules stay: to look through them all again takes longer than a picture
+
+
+def prepare_counts(scene: Scene) -> None:
+    """Compiles what the page will ask for with other numbers of loads, the next ones first: each is a program of its own.
+
+    Meant for a thread beside the page. What cannot be computed is left to the page, which says why."""
+    for slider in sliders_of(scene):
+        if slider.place is None:
+            others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED]
+            for count in others:
+                moved = tried(functools.partial(scene_at, scene, {slider.name: count})).value
+                if moved is not None:
+                    _draw_all(moved)
+
+
+def _draw_all(scene: Scene) -> None:
+    most = 4.0 / 3.0 * float(scene.drive.speed)
+    given = Tried(scene, "")
+    image(lambda: diagram(scene, most), given)
+    text(lambda: readings(scene), given)
+    image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)
 
 
 def has_branches(scene: Scene) -> bool:

@@ -3,6 +3,7 @@
 import base64
 import re
 import socket
+import threading
 from xml.etree import ElementTree
 
 import jax
@@ -250,11 +251,24 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     monkeypatch.setenv("JAXVIB_EXPLORE", "")
     served = {}
     monkeypatch.setattr(uvicorn, "run", lambda page, **options: served.update(options, page=page))
+    counted = threading.Event()
     monkeypatch.setattr(pictures, "prepare", lambda scene: None)
+    monkeypatch.setattr(pictures, "prepare_counts", lambda scene: counted.set())
     monkeypatch.setattr(serve, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
     assert "the page is at http://127.0.0.1:27180" in capsys.readouterr().out and serve.served_path() == path.resolve()
+    assert counted.wait(10.0)  # beside the page, the next numbers of loads are compiled
+
+
+def test_the_next_numbers_of_loads_are_prepared_first(one_mass, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(pictures, "_draw_all", lambda scene: drawn.append(scene.loads.count))
+    pictures.prepare_counts(one_mass)
+    assert one_mass.loads.count == 3 and drawn == [4, 2, 5, 1, 6, 7, 8]
+    drawn.clear()
+    pictures.prepare_counts(jv.scene_from_toml(TEMPLATES["rotor"]))
+    assert drawn == []  # its loads have stations of their own
 
 
 def test_what_hinders_the_page_is_one_sentence(one_mass, tmp_path, monkeypatch, capsys):
