@@ -139,16 +139,16 @@ def _both(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
 
 
 class _State(NamedTuple):
-    """A step of Newton: the unknowns, the equations there with their derivative, how far the next step may go, and whether it
-    is the last one: because it needs no look at where it leads, or because there is no better one (`lost`)."""
+    """A step of Newton: the best unknowns so far with the size of their residual and the `scale` it is judged by, the change
+    that Newton asks for there, how much of it may be taken, and whether this is the end: because the whole change needs no look
+    at where it leads (`settled` alone), or because no part of it is any better (`lost` as well)."""
 
     steps: Array
     deviation: Array
     x: Array
-    residual: Array
-    matrix: Array
     norm: Array
     scale: Array
+    change: Array
     length: Array
     settled: Array
     lost: Array
@@ -165,41 +165,33 @@ def _newton(
     known = _answer(model, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
-    def look(steps: Array, deviation: Array, x: Array, length: Array) -> _State:
-        residual, matrix, scale = _linearised(model, on, given, value, deviation, x, known)
-        norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
-        return _State(steps, deviation, x, residual, matrix, norm, scale, length, norm < tiny * scale, no)
-
-    def change_of(now: _State) -> tuple[Array, Array]:
-        """Newton's step, and the part of it that may be taken."""
-        change = -jnp.linalg.solve(now.matrix, now.residual)
+    def moved(now: _State) -> tuple[Array, Array]:
         # A deviation changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
-        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(change[:-1])), 1e-300)
+        most = 1.0 / jnp.maximum(jnp.max(jnp.abs(now.change[:-1])), 1e-300)
         if given == "rotor_speed":
-            most = jnp.minimum(most, 0.5 * jnp.abs(now.x / change[-1]))
-        return change, jnp.minimum(now.length, most)
-
-    def moved(now: _State, change: Array, take: Array) -> tuple[Array, Array]:
-        return now.deviation + take * change[:-1].reshape(now.deviation.shape), now.x + take * change[-1]
+            most = jnp.minimum(most, 0.5 * jnp.abs(now.x / now.change[-1]))
+        change = jnp.minimum(now.length, most) * now.change
+        return now.deviation + change[:-1].reshape(now.deviation.shape), now.x + change[-1]
 
     def step(now: _State) -> _State:
-        change, take = change_of(now)
-        then = look(now.steps + 1, *moved(now, change, take), jnp.minimum(2.0 * now.length, 1.0))
-        better = then.norm < now.norm
+        there = moved(now)
+        residual, matrix, scale = _linearised(model, on, given, value, *there, known)
+        norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
         # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
         # first step gains, from psi = 0, says nothing of that yet.
-        sure = then.norm * (then.norm / now.norm) ** 2 < tiny / 16.0 * then.scale
-        then = then._replace(settled=sure & (then.steps > 1))
-        lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(change))
-        rounded = now.norm < 16.0 * tiny * now.scale
-        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=rounded | lost, lost=lost | rounded)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
+        sure = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
+        change = -jnp.linalg.solve(matrix, residual)
+        settled = (norm < tiny * scale) | sure
+        then = _State(now.steps + 1, *there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), settled, no)
+        lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
+        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=lost, lost=lost)
+        return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), then, stay)
 
-    begin = look(jnp.asarray(0), deviation, start, jnp.ones_like(start))
+    one, change = jnp.ones_like(start), jnp.zeros(deviation.size + 1, deviation.dtype)
+    # The first step goes nowhere: it looks at where Newton starts, which is better than nothing.
+    begin = _State(jnp.asarray(-1), deviation, start, jnp.inf * one, one, change, one, no, no)
     end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
-    change, take = change_of(end)
-    good = end.settled & ~end.lost
-    return moved(end, jnp.where(good, change, 0.0), jnp.where(good, take, 0.0))
+    return moved(end._replace(change=jnp.where(end.settled & ~end.lost, end.change, 0.0)))
 
 
 @_newton.def_jvp
