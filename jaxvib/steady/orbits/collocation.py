@@ -99,13 +99,11 @@ def _jacobian(
 
 
 class PeriodicSolution(NamedTuple):
-    """A periodic motion on its grid: `deviation` psi (G, M) rad; `omega`, `rotor_speed` rad/s; `residual` what is left of
-    the torque balance at the points, relative to the torques in it."""
+    """A periodic motion on its grid: `deviation` psi (G, M) rad; `omega`, `rotor_speed` rad/s."""
 
     deviation: Array
     omega: Array
     rotor_speed: Array
-    residual: Array
 
 
 def periodic_motion(
@@ -128,9 +126,7 @@ def periodic_motion(
         deviation = jnp.zeros((*model.unbalance.shape, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, deviation))
     psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
-    omega, speed = _both(given, value, x)
-    found = _balance(model, grid, _answer(model, grid, omega, speed), psi, omega, speed)
-    return PeriodicSolution(psi, omega, speed, jnp.max(jnp.abs(found.residual)) / found.scale)
+    return PeriodicSolution(psi, *_both(given, value, x))
 
 
 def _both(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
@@ -229,10 +225,12 @@ def _linearised(
 
 
 class BranchTangent(NamedTuple):
-    """`slope` dn/dOmega of the branch; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`,
-    rad: an estimate of what the number of points leaves."""
+    """`slope` dn/dOmega of the branch; `residual`: what is left of the torque balance at the points, relative to the torques in
+    it; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`, rad: an estimate of what the
+    number of points leaves."""
 
     slope: Array
+    residual: Array
     speed_error: Array
     deviation_error: Array
 
@@ -243,13 +241,19 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
     harmonic of psi for the deviation.
     """
-    deviation, omega, speed = motion.deviation, motion.omega, motion.rotor_speed
-    _, matrix, _ = _linearised(model, grid, "omega", omega, deviation, speed, None)
+    deviation, omega, speed = motion
 
-    def residual(w: Array) -> Array:
-        return _balance(model, grid, _answer(model, grid, w, speed), deviation, w, speed).residual.ravel()
+    def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, _Balance]]:
+        answer = _answer(model, grid, w, n)
+        found = _balance(model, grid, answer, deviation, w, n)
+        return found.residual.ravel(), (answer, found)
 
-    by_omega = jax.jvp(residual, (omega,), (jnp.ones_like(omega),))[1]
+    def along(by_omega: Array, by_speed: Array) -> tuple[Array, Array, tuple[Array, _Balance]]:
+        return jax.jvp(residual, (omega, speed), (by_omega, by_speed), has_aux=True)
+
+    both = jnp.eye(2, dtype=omega.dtype)
+    at, (by_omega, by_speed), (answer, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
+    matrix = _pinned(_jacobian(model, grid, answer, found, deviation, omega, speed), by_speed)
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
     deviation_k = _deviation_harmonics(grid, deviation)
     there = (deviation_k @ np.exp(1j * grid.deviation_orders[:, None] * fine.theta)).real
@@ -260,7 +264,12 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     slope = jnp.linalg.solve(matrix, -jnp.append(by_omega, 0.0))[-1]
     error = jnp.linalg.solve(matrix, jnp.append(jax.lax.stop_gradient(seen), 0.0))
     last = jnp.max(deviation_k[:, -1].real ** 2 + deviation_k[:, -1].imag ** 2)
-    return BranchTangent(slope, jnp.abs(error[-1] / speed), jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)))
+    return BranchTangent(
+        slope,
+        jnp.max(jnp.abs(at)) / found.scale,
+        jnp.abs(error[-1] / speed),
+        jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)),
+    )
 
 
 def _pinned(by_lag: Array, by_unknown: Array) -> Array:

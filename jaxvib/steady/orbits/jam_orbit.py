@@ -285,9 +285,8 @@ def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
 
     def one(w: Array) -> tuple[Array, Array]:
         motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
-        there = motion.residual < 4096.0 * jnp.finfo(w.dtype).eps
-        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(
-            there, branch_tangent(model, grid, motion).slope, jnp.nan
-        )
+        branch = branch_tangent(model, grid, motion)
+        there = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
+        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, branch.slope, jnp.nan)
 
     return jax.lax.map(jax.vmap(one), omega)

@@ -201,17 +201,21 @@ def orbits(
         harmonics = harmonics_of(model, grid, motion)
         return motion, harmonics, _measured(model, grid, motion, harmonics)
 
-    motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
+    if value.shape[0] == 1:  # a program without an axis of length one is a smaller one
+        alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
+        motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
+    else:
+        motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
     growth = floquet(model, grid, motion, harmonics, steps)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
     largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
 
-    slope, speed_error, deviation_error, amplitude, force, power, push = measured
+    slope, residual, speed_error, deviation_error, amplitude, force, power, push = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
-    met = motion.residual < 4096.0 * tiny
+    met = residual < 4096.0 * tiny
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
@@ -238,7 +242,7 @@ def orbits(
         amplitude=or_nan(amplitude),
         foundation_force=or_nan(force),
         power=or_nan(power),
-        residual=motion.residual,
+        residual=residual,
         error=or_nan(error),
         deviation_harmonics=or_nan(harmonics.deviation),
         displacement_harmonics=or_nan(harmonics.displacement),
@@ -252,7 +256,7 @@ def orbits(
 
 
 def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
-    """Slope, the two errors, amplitude, foundation force, power and push between loads of one motion."""
+    """Slope, residual, the two errors, amplitude, foundation force, power and push between loads of one motion."""
     branch = branch_tangent(model, grid, motion)
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real

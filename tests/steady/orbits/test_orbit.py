@@ -145,7 +145,8 @@ def many(scene, omega, points):
 
     def one(w):
         motion = periodic_motion(model, grid_of(points, True), "omega", w, jam_rotor_speed(scene, w))
-        return motion.rotor_speed, motion.residual, branch_tangent(model, grid_of(points, True), motion).speed_error
+        branch = branch_tangent(model, grid_of(points, True), motion)
+        return motion.rotor_speed, branch.residual, branch.speed_error
 
     return jax.vmap(one)(omega)
 
