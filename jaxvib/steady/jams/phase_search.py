@@ -17,9 +17,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
 from jaxvib.results.status import sentence
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
-from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, in_two_programs, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
@@ -46,6 +47,9 @@ _SHOWN = 30.0
 
 _SAME_LINE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
+
+_CHUNK = 32
+"""So many starts a program takes: mostly some hundred are left."""
 
 _SAME = 1e-6
 """Jams whose speeds differ by less, relative, and whose phases do not, are one."""
@@ -148,14 +152,14 @@ def phase_jams(
     parts = parts_of(scene)
     rng = np.random.default_rng(count(seed, "seed", low=0))
     omega, phase = starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count)))
-    omega, phase = in_two_programs(lambda w, a: _balanced_many(parts, w, a), omega, phase)
+    omega, phase = in_chunks(_CHUNK, lambda w, a: _balanced_many(parts, w, a), omega, phase)
     groups = _equal_loads(parts)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
     # Where a start was solved for hardly, the same jam comes out once more: what is distinct is told of the jams themselves.
     # With nothing to solve from, one that is no jam: the arrays have their shapes, and end up empty.
     first = (omega[starts_at[places]], phase[starts_at[places]]) if places else (np.array([float(parts.speed)]), phase[:1])
-    jams = in_two_programs(lambda w, a: _jams_from(scene, w, a), *first)
+    jams = in_chunks(_CHUNK, lambda w, a: _jams_from(scene, w, a), *first)
     found = np.flatnonzero(np.asarray(jams.status == PhaseStatus.found)) if places else np.zeros(0, dtype=int)
     places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]

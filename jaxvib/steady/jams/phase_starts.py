@@ -15,7 +15,7 @@ from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at
 
-__all__ = ["LOAD_SPEEDS", "in_two_programs", "load_speeds", "phases_near", "starts_of"]
+__all__ = ["LOAD_SPEEDS", "load_speeds", "phases_near", "starts_of"]
 
 LOAD_SPEEDS = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
@@ -23,8 +23,8 @@ LOAD_SPEEDS = 240
 _FEW, _ROUNDS = 7, 6
 """Steps of Newton's method before those that have found their phases are left out, and how often."""
 
-_CHUNKS = (32, 1024)
-"""So many speeds and sets of phases a program takes."""
+_SPEEDS, _CHUNKS = 64, (32, 1024)
+"""So many speeds a program takes with all sets of phases, and so many speeds each with its own."""
 
 _HALVINGS = 6
 """Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
@@ -39,7 +39,7 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     patterns that nearly are each other's image, one is often hidden by steeper slopes.
     """
     speeds, phases = load_speeds(parts), np.concatenate([phases, _regular(parts)])
-    first = jax.tree.map(np.asarray, _first_steps(parts, jnp.asarray(speeds), jnp.asarray(phases)))
+    first = in_chunks(_SPEEDS, lambda w: _first_steps(parts, w, jnp.asarray(phases)), speeds)
     row = np.repeat(np.arange(speeds.size), len(phases))
     factor, angles, good = _gone_on(parts, speeds[row], *(x.reshape(-1, *x.shape[2:]) for x in first))
     if not good.any():
@@ -47,7 +47,9 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
     digits = [1e4 * size[:, None], 1e3 * np.cos(angles), 1e3 * np.sin(angles)]
     kinds = np.concatenate([row[:, None], *(np.round(d).astype(int) for d in digits)], axis=1)
-    once = np.unique(kinds, axis=0, return_index=True)[1]
+    # Of each row one number is compared, which is much faster: the odds that any two of 1e5 rows share theirs are 3e-10.
+    mixed = kinds @ np.random.default_rng(0).integers(2**63, size=kinds.shape[1])
+    once = np.sort(np.unique(mixed, return_index=True)[1])
     row, size, angles = row[once], size[once], angles[once]
     near = np.abs(size) < np.log(3.0)
     omega, turned_to = [speeds[row[near]]], [angles[near]]
@@ -71,7 +73,7 @@ def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndar
     """Phases at each of some load speeds (n,) near its own (n, count), with the logarithm of the drag's multiple."""
     if omega.size == 0:
         return omega, phase, omega > 0.0
-    found = in_two_programs(lambda w, a: _few_steps(parts, w, a), omega, phase)
+    found = _in_two_programs(lambda w, a: _few_steps(parts, w, a), omega, phase)
     factor, angles, good = _gone_on(parts, omega, *found)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
@@ -89,7 +91,7 @@ def _gone_on(
         left = np.flatnonzero(~(residual < eps**0.75))
         if left.size == 0:
             break
-        again = in_two_programs(lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
+        again = _in_two_programs(lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
         for whole, part in zip((factor, phase, residual), again, strict=True):
             whole[left] = part
     return factor, phase, (residual < eps**0.5) & (factor > 0.0)
@@ -100,7 +102,7 @@ def _few_steps(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, 
     return jax.vmap(lambda w, start: phases_near(parts, influence_of(parts, w)[0], w, start, _FEW))(omega, phase)
 
 
-def in_two_programs(function: Callable[[Array, Array], Any], omega: np.ndarray, phase: np.ndarray) -> Any:
+def _in_two_programs(function: Callable[[Array, Array], Any], omega: np.ndarray, phase: np.ndarray) -> Any:
     """`in_chunks` of speeds (n,) and phases (n, count), of 32 or of 1024 cases, so that two programs do for any n."""
     return in_chunks(_CHUNKS[omega.size > _CHUNKS[0]], function, omega, phase)
 
