@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, export
+from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import no_host_checks, traced
@@ -84,7 +85,8 @@ class _CachedFunction(Generic[P, T]):
         folder = program_folder()
         if folder is None or any(traced(leaf) for leaf in leaves) or _is_debugging():
             return self.jitted(*args, **kwargs)
-        asked = (folder, treedef, tuple(map(_leaf_key, leaves)), _options())
+        home = _home(leaves)
+        asked = (folder, treedef, tuple(map(_leaf_key, leaves)), home, _options())
         try:
             program = self.ready.get(asked, _UNKNOWN)
         except TypeError:  # an argument without a hash
@@ -93,18 +95,18 @@ class _CachedFunction(Generic[P, T]):
             with self.lock:
                 program = self.ready.get(asked, _UNKNOWN)
                 if program is _UNKNOWN:
-                    program = self.ready[asked] = self._program(folder, leaves, treedef)
+                    program = self.ready[asked] = self._program(folder, leaves, treedef, home)
             _forget_oldest()
         if program is None:
             return self.jitted(*args, **kwargs)
         program.used = next(_clock)
         return program(leaf for leaf in leaves if eqx.is_array(leaf))
 
-    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable) -> _Program | None:
+    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
         """From the disk, or traced and written there; None where this call has no program that could be stored."""
         try:
             path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
-            return _read(path) or self._write(path, leaves, treedef)
+            return _read(path, home) or self._write(path, leaves, treedef, home)
         except Undescribable:
             return None
 
@@ -119,7 +121,7 @@ class _CachedFunction(Generic[P, T]):
         name = f"{self.function.__module__}:{self.function.__qualname__}"
         return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
 
-    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable) -> _Program:
+    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
         structure: list[Description] = []
         # Not the arrays of this call, which would live as long as the program.
         static = [_Slot(k) if eqx.is_array(leaf) else leaf for k, leaf in enumerate(leaves)]
@@ -139,7 +141,7 @@ class _CachedFunction(Generic[P, T]):
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
-        program = _Program.of(_compiled(path, exported), structure[0])
+        program = _Program.of(_compiled(path, exported, home), structure[0])
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
@@ -201,7 +203,7 @@ def _replace(path: Path, content: bytes) -> None:
             raise
 
 
-def _read(path: Path) -> _Program | None:
+def _read(path: Path, home: Sharding) -> _Program | None:
     """None where there is no such file, where it is another user's, and where it is damaged: it is written anew."""
     try:
         with path.open("rb") as file:
@@ -214,20 +216,30 @@ def _read(path: Path) -> _Program | None:
         exported = export.deserialize(bytearray(stored))
     except (OSError, ImportError):
         return None
-    return _Program.of(_compiled(path, exported), json.loads(head)["structure"])
+    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"])
 
 
-def _compiled(path: Path, exported: export.Exported) -> Callable[..., list[Array]]:
+def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
     run.__name__ = path.stem  # part of the key in JAX's compilation cache, which does not hold the processor
-    return jax.jit(run)
+    # Without a word on where, JAX compiles once for arrays that it may move and once for those that another program gave.
+    return jax.jit(run, in_shardings=home)
+
+
+def _home(leaves: Sequence[object]) -> Sharding:
+    """Where JAX computes with these arrays: where those are that it must not move, otherwise on the default device."""
+    for leaf in leaves:
+        if isinstance(leaf, jax.Array) and leaf.committed:
+            return leaf.sharding
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return SingleDeviceSharding(chosen if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)[0])
 
 
 def _leaf_key(leaf: Array | Hashable) -> Hashable:
     if isinstance(leaf, jax.Array):
-        return jax.typeof(leaf), leaf.sharding
+        return jax.typeof(leaf)
     return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
 
 

@@ -80,6 +80,25 @@ def test_another_question_is_another_program(folder, other, process):
     np.testing.assert_array_equal(answer[0].first, other[1] * other[0].first)
 
 
+def test_what_another_program_gave_needs_no_compilation(folder):
+    function, compiled = programs.cached(doubled), []
+
+    def listen(event, seconds, **_):
+        compiled.extend([event] * (event == "/jax/core/compile/backend_compile_duration"))
+
+    mine = Pair(jnp.arange(3.0), "a")
+    given = Pair(function(mine, 2.0)[0].first, "a")
+    assert given.first.committed and not mine.first.committed  # JAX may move the one and not the other
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        function(given, 2.0)
+        assert not compiled
+        function(given, 3.0)
+        assert compiled  # the event still has this name
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
 def test_zeros_of_both_signs_and_options_are_other_programs(folder):
     function = programs.cached(with_sign)
     assert [float(function(jnp.asarray(1.0), zero)) for zero in (0.0, -0.0)] == [1.0, -1.0]
