@@ -242,21 +242,23 @@ def _solve_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tupl
 
 def damped_newton(balance: Callable[[Array], Array], start: Array, iterations: int = 40) -> Array:
     """A zero of `balance`, by steps that are damped where they do not help (Levenberg, Marquardt), from `start`."""
+    one = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def step(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, value, slopes, damping = carry
+        x, value, size, slopes, damping = carry
         normal = slopes.T @ slopes
         damped = normal + damping * jnp.diag(jnp.diagonal(normal) + jnp.finfo(x.dtype).tiny)
-        change = small_solve(damped, slopes.T @ value)
-        trial = x - jnp.clip(change, -0.5, 0.5)
-        new = balance(trial)
-        better = jnp.sum(new**2) < jnp.sum(value**2)  # and not NaN
-        slopes = jnp.where(better, jax.jacfwd(balance)(trial), slopes)
-        damping = jnp.clip(jnp.where(better, 0.1 * damping, 8.0 * damping), 1e-14, 1e8)
-        return jnp.where(better, trial, x), jnp.where(better, new, value), slopes, damping
+        trial = x - jnp.clip(small_solve(damped, slopes.T @ value), -0.5, 0.5)
+        new, by = jax.vmap(lambda way: jax.jvp(balance, (trial,), (way,)), out_axes=(None, 1))(one)
+        left = jnp.sum(new**2)
+        better = left < size  # and not NaN
+        then = trial, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
+        stay = x, value, size, slopes, jnp.minimum(8.0 * damping, 1e8)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
 
-    first = (start, balance(start), jax.jacfwd(balance)(start), jnp.asarray(1e-2, start.dtype))
-    return jax.lax.fori_loop(0, iterations, step, first)[0]
+    # The first step goes nowhere: it looks at the start, which is better than nothing.
+    begin = start, jnp.zeros_like(start), jnp.asarray(jnp.inf, start.dtype), one, jnp.asarray(0.1, start.dtype)
+    return jax.lax.fori_loop(0, iterations + 1, step, begin)[0]
 
 
 def eliminate(a: Array, b: Array) -> Array:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +20,7 @@ LOAD_SPEEDS = 240
 _FEW, _ROUNDS = 7, 6
 """Steps of Newton's method before those that have found their phases are left out, and how often."""
 
-_SPEEDS, _CHUNKS = 64, (32, 1024)
+_SPEEDS, _CHUNK = 64, 256
 """So many speeds a program takes with all sets of phases, and so many speeds each with its own."""
 
 _HALVINGS = 6
@@ -73,7 +70,7 @@ def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndar
     """Phases at each of some load speeds (n,) near its own (n, count), with the logarithm of the drag's multiple."""
     if omega.size == 0:
         return omega, phase, omega > 0.0
-    found = _in_two_programs(lambda w, a: _few_steps(parts, w, a), omega, phase)
+    found = in_chunks(_CHUNK, lambda w, a: _few_steps(parts, w, a), omega, phase)
     factor, angles, good = _gone_on(parts, omega, *found)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
@@ -91,7 +88,7 @@ def _gone_on(
         left = np.flatnonzero(~(residual < eps**0.75))
         if left.size == 0:
             break
-        again = _in_two_programs(lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
+        again = in_chunks(_CHUNK, lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
         for whole, part in zip((factor, phase, residual), again, strict=True):
             whole[left] = part
     return factor, phase, (residual < eps**0.5) & (factor > 0.0)
@@ -100,11 +97,6 @@ def _gone_on(
 @cached
 def _few_steps(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
     return jax.vmap(lambda w, start: phases_near(parts, influence_of(parts, w)[0], w, start, _FEW))(omega, phase)
-
-
-def _in_two_programs(function: Callable[[Array, Array], Any], omega: np.ndarray, phase: np.ndarray) -> Any:
-    """`in_chunks` of speeds (n,) and phases (n, count), of 32 or of 1024 cases, so that two programs do for any n."""
-    return in_chunks(_CHUNKS[omega.size > _CHUNKS[0]], function, omega, phase)
 
 
 def load_speeds(parts: Parts) -> np.ndarray:
