@@ -9,7 +9,7 @@ from gyroscopic_rotor import rotor
 from scenes import machines, published, scene
 
 import jaxvib as jv
-from jaxvib.equations.averaged import Amplitudes, amplitudes_of, averaged_field
+from jaxvib.equations.averaged import Amplitudes, _with_conjugate, amplitudes_of, averaged_field
 from jaxvib.equations.linear import linear_model, steady_displacement
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
@@ -130,3 +130,11 @@ def test_a_state_and_its_amplitudes_are_the_same_motion():
     mass, stiffness = linear_model(s).mass, s.machine.carrier().stiffness
     np.testing.assert_allclose(v.imag @ mass @ v.imag, q.real @ stiffness @ q.real, rtol=1e-9)
     np.testing.assert_allclose(q.imag @ stiffness @ q.imag, v.real @ mass @ v.real, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_an_equation_with_its_conjugate_is_solved(size):
+    a, b, x = np.random.default_rng(size).normal(size=(3, size, size, 2)) @ [1.0, 1.0j]
+    x = x[:, 0]
+    found = _with_conjugate(jnp.asarray(a), jnp.asarray(b), jnp.asarray(a @ x + b @ np.conj(x)))
+    np.testing.assert_allclose(found, x, rtol=1e-12)

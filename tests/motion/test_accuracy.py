@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from scenes import published, some_state
+from scenes import published, scene, some_state
 
 import jaxvib as jv
+from jaxvib.motion.analysis.scaled_error import estimated_error
 
 
 def test_equal_steps_are_of_order_8():
@@ -119,3 +120,11 @@ def test_the_estimate_is_above_the_error_where_a_stop_bends_the_motion(double):
             error = np.max(np.abs(a.displacement - b.displacement)) / np.max(np.abs(b.displacement))
             below.append(error <= float(run.error))
     assert np.all(below)
+
+
+def test_the_estimate_counts_rounding_of_steps_and_of_what_turns():
+    smooth, rough = scene("two_mass", "balls"), scene("two_mass", "balls", effects=jv.Stop("5 kN/mm", gap="3 mm", platform=1))
+    eps = np.finfo(float).eps
+    for case, share in ((smooth, 0.01), (rough, 2.0)):
+        found = estimated_error(np.asarray(1e-9), 0.01, case, steps=1000, radians=3e5)
+        np.testing.assert_allclose(found, share * 1e-9 + 2.0 * eps * 301000.0, rtol=1e-12)

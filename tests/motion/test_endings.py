@@ -9,6 +9,7 @@ import pytest
 from scenes import published, scene
 
 import jaxvib as jv
+from jaxvib.motion.integrate import _grew, is_finite
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
@@ -136,3 +137,18 @@ def test_an_error_that_cannot_be_told_is_infinite():
 def test_estimates_that_nobody_can_make_are_refused(change, says):
     with pytest.raises(jv.InputError, match=says):
         jv.simulate(published().scene(), 1.0, **change)
+
+
+def test_one_coordinate_that_grows_beyond_all_bounds_is_enough():
+    first = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(3),), (jnp.zeros(3),))
+    far = eqx.tree_at(lambda s: s.displacement, first, jnp.asarray([0.0, 1e30]))
+    fast = eqx.tree_at(lambda s: s.velocity, first, jnp.asarray([1e30, 0.0]))
+    machine = scene("two_mass", "balls")
+    assert not _grew(machine, first, first) and _grew(machine, first, far) and _grew(machine, first, fast)
+    # What began as far away has not grown.
+    assert not _grew(machine, far, far)
+
+
+def test_one_number_that_is_none_is_enough():
+    state = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(3),), (jnp.asarray([0.0, jnp.nan, 0.0]),))
+    assert not is_finite(state) and is_finite(jax.tree.map(jnp.zeros_like, state))

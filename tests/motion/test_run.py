@@ -1,5 +1,7 @@
 """What a run can do."""
 
+import types
+
 import jax
 import numpy as np
 import pytest
@@ -62,3 +64,12 @@ def test_window_alone_measures_the_same(run, window):
     np.testing.assert_allclose(window.amplitude, run.amplitude, rtol=1e-12)
     np.testing.assert_allclose(window.omega, run.omega, rtol=1e-12)
     np.testing.assert_allclose(window.foundation_force, run.foundation_force, rtol=1e-12)
+
+
+def test_the_summary_names_the_loads_that_left_their_track(run):
+    def said(times):
+        return type(run)._detachment(types.SimpleNamespace(detached=np.asarray(times)))
+
+    (sentence,) = said([np.nan, 0.25, 1.5])
+    assert "loads do not press on their track (load 2 at 0.25 s, 3 at 1.5 s)" in sentence
+    assert said([np.nan, np.nan]) == []

@@ -134,3 +134,14 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
     np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * exact.regime.phase), atol=1e-2)
     np.testing.assert_allclose(unbalance, exact.regime.unbalance, atol=1e-2)
     assert not np.allclose(np.exp(1j * phase), 1.0, atol=0.3)
+
+
+@pytest.mark.parametrize(("apart", "steady"), [(2.5, True), (6.0, False)])
+def test_means_of_quarters_are_judged_by_their_own_error(apart, steady):
+    """40 stretches a quarter, scattering by +-1e-3 about means that are so many errors of a mean apart."""
+    swing = 1e-3 * np.tile([1.0, -1.0], 20)
+    error = np.std(swing, ddof=1) / np.sqrt(40.0)
+    quarters = [1.0 + swing + (apart * error if k == 2 else 0.0) for k in range(4)]
+    values = np.concatenate(quarters)
+    seen = np.stack([np.full(160, 1e-7) * (1.0 + 0.1 * np.tile([1.0, -1.0], 80)), values, values, values, values], axis=1)
+    assert _steady_in_the_mean(seen) is steady

@@ -9,6 +9,7 @@ from rotors import case, rotor_state
 from scenes import loads, machines, scene, some_state
 
 import jaxvib as jv
+from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -63,3 +64,15 @@ def test_wrapping_counts_every_turn():
         np.testing.assert_allclose(back.angle[0], np.stack(2 * [state.angle[0]]), rtol=1e-14)
         alone = motion.unpack(jax.tree.map(lambda x: x[None], held))
         np.testing.assert_allclose(np.sin(alone.angle[0][0]), np.sin(state.angle[0]), atol=1e-13)
+
+
+def test_the_fastest_and_the_slowest_of_rotor_and_resonances():
+    """One mass: its natural frequency is sqrt(k / (M + sum m_j))."""
+    machine, balls = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
+    resonance = np.sqrt(4e4 / 50.0)
+    for speed in (10.0, 100.0):
+        found = fastest_and_slowest(jv.Scene(machine, balls, jv.ConstantSpeed(speed)))
+        np.testing.assert_allclose(found, (max(speed, resonance), resonance), rtol=1e-12)
+    machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
+    two = jv.Scene(machine, balls, jv.ConstantSpeed(30.0))
+    np.testing.assert_allclose(fastest_and_slowest(two), (jv.natural_frequencies(two)[1], jv.natural_frequencies(two)[0]))

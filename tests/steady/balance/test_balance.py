@@ -13,6 +13,8 @@ from gyroscopic_rotor import rotor
 from scenes import machines
 
 import jaxvib as jv
+from jaxvib.steady.balance import states
+from jaxvib.steady.balance.speeds import _require_port_that_moves
 from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
 
 POINTS = 112
@@ -324,3 +326,19 @@ def test_a_machine_that_can_drift_is_refused():
     s = eqx.tree_at(lambda x: x.machine.stiffness, loaded(), jnp.zeros(2))
     with pytest.raises(jv.InputError, match="lets the machine drift"):
         balanced_growth(s, [30.0, 60.0])
+
+
+def test_every_change_of_stability_is_halved_to_the_same_part(monkeypatch):
+    """Two changes, one in a narrow gap and one in a wide one."""
+    monkeypatch.setattr(states, "balanced_growth", lambda scene, w, *_, **__: np.where((w > np.pi) & (w < 500.0), -1.0, 1.0))
+    speeds = np.array([1.0, 3.1415, 3.1416, 400.0, 900.0])
+    stable = (speeds > np.pi) & (speeds < 500.0)
+    found = states.stability_changes(loaded(), speeds, stable, close=1e-9)
+    np.testing.assert_allclose(found, [np.pi, 500.0], rtol=1e-9)
+
+
+def test_a_motion_without_a_spring_is_refused_whatever_holds_the_others():
+    gyroscopic = rotor(0.1, stiffness=(1.1e6, 0.0))
+    with pytest.raises(jv.InputError, match="leaves a motion of the rotor without a spring"):
+        _require_port_that_moves(gyroscopic)
+    _require_port_that_moves(rotor(0.1))

@@ -13,6 +13,7 @@ from scenes import machines, published
 from scipy.integrate import solve_ivp
 
 import jaxvib as jv
+from jaxvib.steady.orbits.floquet import _deflated, _small_solve
 from jaxvib.study.maps.stability_onset import stability_onset
 
 
@@ -129,3 +130,21 @@ def test_gradient_of_the_largest_multiplier():
     h = 1e-4
     np.testing.assert_allclose((f(flat + h * direction) - f(flat - h * direction)) / (2.0 * h), forward, rtol=1e-5)
     np.testing.assert_allclose(jnp.vdot(reverse, direction), forward, rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_a_small_system_is_solved(size):
+    weight, right = np.random.default_rng(size).normal(size=(size, size, 5)), np.random.default_rng(9).normal(size=(size, 5))
+    expected = [np.linalg.solve(np.eye(size) - weight[..., k], right[:, k]) for k in range(5)]
+    np.testing.assert_allclose(_small_solve(jnp.asarray(weight), jnp.asarray(right)), np.transpose(expected), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_known_eigenvalue_is_taken_out(sign):
+    rng = np.random.default_rng(3)
+    vectors, values = rng.normal(size=(4, 4)), np.array([1.0, -2.0, 3.0, 0.5])
+    vectors[:, 0] = [sign, -1e-12 * sign, 0.0, 0.0]  # along the first axis, where a wrong reflection is none
+    matrix = vectors @ np.diag(values) @ np.linalg.inv(vectors)
+    known, left = _deflated(jnp.asarray(matrix), jnp.asarray(vectors[:, 0]))
+    np.testing.assert_allclose(known, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(left).real), [-2.0, 0.5, 3.0], rtol=1e-9)
