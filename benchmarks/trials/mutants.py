@@ -5,7 +5,7 @@
 A mutant is the package with one change in one line: a sign, a factor, an index, a comparison, a sine in place of a cosine, a
 smaller in place of a larger. Mutants are drawn from `jaxvib/equations`, `steady`, `motion` and `ode` and from `optimize`, from
 every file in proportion to the changes it allows and at least one, by a seed. Each is given to the tests that reach its line,
-those of its own folder first and then the shortest, up to `--seconds` of them by their usual time; the first test that fails
+those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual time; the first test that fails
 ends it. Which test reaches which line is measured once, each test file in a process of its own (`coverage`).
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
@@ -208,13 +208,14 @@ def reach(out: pathlib.Path, workers: int) -> dict[str, dict]:
 
 
 def tests_of(mutant: Mutant, known: dict[str, dict], seconds: float) -> tuple[list[str], float]:
-    """The tests to run and their usual time: the file's own folder first, then the shortest, up to `seconds` in all."""
-    folder = pathlib.Path(mutant.file.removeprefix("jaxvib/")).parent
+    """The tests to run and their usual time: the file's own first, then its folder's, then the shortest, up to `seconds`."""
+    place = pathlib.Path(mutant.file.removeprefix("jaxvib/"))
+    folder = place.parent
 
-    def order(test: str) -> tuple[int, float]:
+    def order(test: str) -> tuple[bool, int, float]:
         own = pathlib.Path(test).parent.relative_to("tests")
         common = [one == other for one, other in zip(folder.parts, own.parts, strict=False)]
-        return -sum(common), known[test]["seconds"]
+        return pathlib.Path(test).stem != f"test_{place.stem}", -sum(common), known[test]["seconds"]
 
     reaching = sorted((test for test, entry in known.items() if mutant.line in entry["lines"].get(mutant.file, ())), key=order)
     taken, usual = [], 0.0
@@ -258,7 +259,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300, help="mutants to draw (300)")
     parser.add_argument("--seed", type=int, default=0, help="which ones (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
-    parser.add_argument("--seconds", type=float, default=90.0, help="tests a mutant is given, by their usual time (90)")
+    parser.add_argument("--seconds", type=float, default=180.0, help="tests a mutant is given, by their usual time (180)")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of what is known")
     asked = parser.parse_args()
