@@ -5,8 +5,8 @@
 A mutant is the package with one change in one line: a sign, a factor, an index, a comparison, a sine in place of a cosine, a
 smaller in place of a larger. Mutants are drawn from `jaxvib/equations`, `steady`, `motion` and `ode` and from `optimize`, from
 every file in proportion to the changes it allows and at least one, by a seed. Each is given to the tests that reach its line,
-those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual time; the first test that fails
-ends it. Which test reaches which line is measured once, each test file in a process of its own (`coverage`).
+those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual time; the first
+test that fails ends it. Which test reaches which line is measured once, each test file in a process of its own (`coverage`).
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
 What survived is printed with its change, to be explained or killed by a new test. All that is known is kept in `--out`, so
