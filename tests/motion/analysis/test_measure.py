@@ -37,6 +37,25 @@ def test_measure_reads_a_known_motion():
     assert bool(measured.settled)
 
 
+def test_loads_that_speed_up_drift_by_what_they_gain():
+    """phi = w t + e t^2/2 over T: the mean speed of the later half is e T/4 above that of the whole."""
+    s, w, e = scene("two_mass", "balls"), 70.0, 0.02
+    t = jnp.linspace(0.0, 5.0, 4001)
+    rest = jnp.ones((4001, 2)) * jnp.asarray([1e-3, 2e-3])
+    states = jv.State(
+        rest * jnp.sin(w * t)[:, None],
+        w * rest * jnp.cos(w * t)[:, None],
+        (jnp.broadcast_to((w * t + e * t**2 / 2.0)[:, None], (4001, 3)),),
+        (jnp.broadcast_to((w + e * t)[:, None], (4001, 3)),),
+    )
+
+    def field(_, y):
+        return jv.State(y.velocity, -(w**2) * y.displacement, y.rate, (jnp.full(3, e),))
+
+    measured = measure(s, jax.tree_util.Partial(field), t, states)
+    np.testing.assert_allclose(measured.drift, e * 5.0 / 4.0 / (w + e * 2.5), rtol=0.05)
+
+
 def test_derivatives_of_an_amplitude_move_its_extrema_along():
     """x = cos wt + p cos(2wt + 0.3): slope and curvature in p of half of peak to peak, against extrema found by bisection."""
     s, w = scene("one_mass", "balls"), 7.0
