@@ -41,7 +41,7 @@ def test_loads_that_speed_up_drift_by_what_they_gain():
     """phi = w t + e t^2/2 over T: the mean speed of the later half is e T/4 above that of the whole."""
     s, w, e = scene("two_mass", "balls"), 70.0, 0.02
     t = jnp.linspace(0.0, 5.0, 4001)
-    rest = jnp.ones((4001, 2)) * jnp.asarray([1e-3, 2e-3])
+    rest = jnp.broadcast_to(jnp.asarray([1e-3, 2e-3]), (4001, 2))
     states = jv.State(
         rest * jnp.sin(w * t)[:, None],
         w * rest * jnp.cos(w * t)[:, None],
