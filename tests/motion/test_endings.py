@@ -9,6 +9,7 @@ import pytest
 from scenes import published, scene
 
 import jaxvib as jv
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import _grew, is_finite
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
@@ -139,16 +140,25 @@ def test_estimates_that_nobody_can_make_are_refused(change, says):
         jv.simulate(published().scene(), 1.0, **change)
 
 
-def test_one_coordinate_that_grows_beyond_all_bounds_is_enough():
-    first = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(3),), (jnp.zeros(3),))
-    far = eqx.tree_at(lambda s: s.displacement, first, jnp.asarray([0.0, 1e30]))
-    fast = eqx.tree_at(lambda s: s.velocity, first, jnp.asarray([1e30, 0.0]))
-    machine = scene("two_mass", "balls")
-    assert not _grew(machine, first, first) and _grew(machine, first, far) and _grew(machine, first, fast)
-    # What began as far away has not grown.
-    assert not _grew(machine, far, far)
+def test_a_motion_has_grown_where_one_platform_alone_has():
+    """By its place or by its speed, beyond 1e8 of what it was or of the natural units."""
+    s = scene("two_mass", "balls")
+    unit = natural_units(s)
+    first = jv.initial_state(s)
+    for name in ("displacement", "velocity"):
+        size = float(getattr(unit, name))
+        for last, grown in (([0.0, 1.1e8], True), ([-1.1e8, 0.0], True), ([0.9e8, 0.9e8], False)):
+            there = eqx.tree_at(lambda y, name=name: getattr(y, name), first, size * jnp.asarray(last))
+            assert bool(_grew(s, first, there)) == grown
+    far = eqx.tree_at(lambda y: y.displacement, first, float(unit.displacement) * jnp.asarray([0.0, 1e3]))
+    assert not bool(_grew(s, far, eqx.tree_at(lambda y: y.displacement, first, 1e8 * far.displacement)))
+    assert bool(_grew(s, first, eqx.tree_at(lambda y: y.rate, first, (jnp.full(3, jnp.inf),))))
 
 
-def test_one_number_that_is_none_is_enough():
-    state = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(3),), (jnp.asarray([0.0, jnp.nan, 0.0]),))
-    assert not is_finite(state) and is_finite(jax.tree.map(jnp.zeros_like, state))
+def test_one_number_that_is_not_finite_makes_a_state_that_is_not():
+    state = jv.initial_state(scene("two_mass", "balls"))
+    assert bool(is_finite(state))
+    for bad in (jnp.nan, -jnp.inf):
+        for k, leaf in enumerate(jax.tree.leaves(state)):
+            broken = eqx.tree_at(lambda y, k=k: jax.tree.leaves(y)[k], state, leaf.at[-1].set(bad))
+            assert not bool(is_finite(broken))

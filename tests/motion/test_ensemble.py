@@ -167,6 +167,8 @@ def test_single_precision_keeps_its_phase():
         (dict(lanes=0), "lanes is 0"),
         (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),
         (dict(make=lambda v: v), "make gives"),
+        (dict(make=lambda v: (published().scene(), v)), "make gives"),
+        (dict(make=lambda v: (v, some_state(published().scene()))), "make gives"),
     ],
 )
 def test_ensembles_that_cannot_be(change, says):
@@ -175,3 +177,18 @@ def test_ensembles_that_cannot_be(change, says):
     with pytest.raises(jv.InputError) as caught:
         jv.ensemble(**given)
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(("lanes", "together"), [(2, 2), (64, 3)])
+def test_so_many_runs_advance_together_as_is_asked(monkeypatch, lanes, together):
+    """As many as there are where more are allowed: nothing is computed for runs that nobody asked for."""
+    seen = []
+
+    def in_chunks(size, *_, **__):
+        seen.append(size)
+        raise InterruptedError
+
+    monkeypatch.setattr("jaxvib.motion.ensemble.in_chunks", in_chunks)
+    with pytest.raises(InterruptedError):
+        jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(8), lanes=lanes)
+    assert seen == [together]

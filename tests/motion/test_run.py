@@ -56,6 +56,7 @@ def test_to_xarray_has_names_and_units(run):
 
 def test_summary_and_plot_show_the_run(run):
     assert run.summary().startswith("the run reached its end: 20 s") and "zero to peak: y1" in run.summary()
+    assert "detached" not in run.summary()
     assert len(run.plot().axes) == 6  # three quantities, each as a whole and its last periods
 
 

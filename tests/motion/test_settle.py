@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import scene
+from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
 from jaxvib.motion.settle import _steady_in_the_mean
@@ -145,3 +146,45 @@ def test_means_of_quarters_are_judged_by_their_own_error(apart, steady):
     values = np.concatenate(quarters)
     seen = np.stack([np.full(160, 1e-7) * (1.0 + 0.1 * np.tile([1.0, -1.0], 80)), values, values, values, values], axis=1)
     assert _steady_in_the_mean(seen) is steady
+
+
+def begins_at(monkeypatch, s, **given):
+    """The state that the first stretch starts from."""
+    starts = []
+
+    def simulate(scene, until, *, start, **_):
+        starts.append(start)
+        raise InterruptedError
+
+    monkeypatch.setattr("jaxvib.motion.settle.simulate", simulate)
+    with pytest.raises(InterruptedError):
+        jv.settle(s, **given)
+    return starts[0]
+
+
+def test_loads_start_apart_in_a_jam_and_together_at_rest(monkeypatch):
+    s = scene("two_mass", "balls", speed=150.0)
+    np.testing.assert_allclose(np.diff(begins_at(monkeypatch, s, mode=3).azimuth), [0.05, 0.05], rtol=1e-12)
+    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s).azimuth), [0.0, 0.0])
+    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, start="rest").azimuth), [0.0, 0.0])
+
+
+@pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])
+def test_the_last_32_stretches_are_judged_or_more_where_they_are_shorter(monkeypatch, periods, stretches):
+    """Of 100 slow periods each; a whole number of them in every quarter."""
+    run, seen = small_run(save="window"), []
+    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *_, **__: run)
+    monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
+    found = jv.settle(small_machine(), start=small_start(), periods=periods)
+    assert found.status_name == "beating" and seen == [(stretches, 5)] * 2
+
+
+def test_means_scatter_by_their_standard_errors():
+    """Quarters of n values whose spread is 1: their means lie within 3.6 / sqrt(n) of each other where they do not move."""
+    for n in (8, 32):
+        spread = np.resize([1.0, -1.0], n) * np.sqrt((n - 1) / n)  # the variance is 1
+        drift = np.resize([0.9e-9, 1.1e-9, 1.1e-9, 0.9e-9], 4 * n)
+        for share, steady in ((0.98, True), (1.02, False)):
+            shift = np.repeat([0.0, 0.0, 0.0, share * 3.6 / np.sqrt(n)], n)
+            values = 5.0 + np.tile(spread, 4) + shift
+            assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady

@@ -1,15 +1,20 @@
 """The arguments of a run, and runs in batches."""
 
+import dataclasses
+
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import published, some_state
-from small_machine import small_machine, small_start
+from scenes import published, scene, some_state
+from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.integrate import integrate
+from jaxvib.motion.integrate import StepControl, fastest_and_slowest, integrate
+from jaxvib.motion.simulate import _control, _enough_samples, _raise_if_failed, _shrink, _to_accuracy, enough_steps
+from jaxvib.ode.dopri8_loop import LoopDopri8
 
 
 @pytest.mark.parametrize(
@@ -76,3 +81,94 @@ def test_a_scan_of_parameters_is_one_compilation():
         for tolerance in (1e-6, 1e-8):
             jv.simulate(moved, 7.0, start=start, stepsize_controller=jv.Tolerance(tolerance), save="window", max_steps=2**14)
     assert integrate.jitted._cached._cache_size() - before <= 1
+
+
+@pytest.mark.parametrize("speed", [10.0, 60.0])
+def test_what_moves_fastest_and_slowest(speed):
+    """The rotor or the platform, sqrt(4e4 / (50 + 2.4)) rad/s with three balls of 0.8 kg on it, whichever it is."""
+    own = np.sqrt(4e4 / 52.4)
+    found = fastest_and_slowest(scene("one_mass", "balls", speed=speed))
+    np.testing.assert_allclose(found, [max(own, speed), own], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("turns", "steps"), [(8, 2**13), (1000, 2**19), (1100, 2**20)])
+def test_a_run_may_take_500_steps_a_turn(turns, steps):
+    """And 4096 besides, rounded up to a power of 2."""
+    s = scene("one_mass", "balls", speed=100.0)
+    assert enough_steps(s, jnp.asarray(2.0 * np.pi * turns / 100.0)) == steps
+
+
+@pytest.mark.parametrize(("turns", "samples"), [(1000, 16384), (1100, 262144)])
+def test_so_many_states_are_kept_unless_said_otherwise(turns, samples):
+    """More for more than 1024 turns of the rotor."""
+    s = scene("one_mass", "balls", speed=100.0)
+    assert _enough_samples(s, jnp.asarray(2.0 * np.pi * turns / 100.0)) == samples
+
+
+def test_steps_are_chosen_to_1e_8_and_in_single_precision_to_1e_5():
+    for dtype, tolerance in ((jnp.float64, 1e-8), (jnp.float32, 1e-5)):
+        np.testing.assert_allclose(_control(jnp.asarray(1.0, dtype), None, None).tolerance, tolerance, rtol=1e-6)
+
+
+def test_less_of_a_difference_is_counted_to_vanish_than_a_method_of_order_8_lets():
+    """An eighth is left where steps are half as long, 100^-0.45 where the tolerance is a hundredth."""
+    equal, adaptive = ((lambda n: StepControl(steps=jnp.asarray(n))), (lambda x: StepControl(tolerance=jnp.asarray(x))))
+    np.testing.assert_allclose(_shrink(equal(200.0), equal(100.0)), 0.125, rtol=1e-12)
+    np.testing.assert_allclose(_shrink(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
+
+
+class Asked(Exception):
+    """What the engine was called with."""
+
+
+@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode()])
+@pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
+def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, double, adjoint):
+    """In single precision the engine's own, which alone keeps angles within a turn."""
+
+    def asked(scene, end, state, solver, *_):
+        raise Asked(solver)
+
+    monkeypatch.setattr("jaxvib.motion.simulate.integrate", asked)
+    with jax.enable_x64(double):
+        s = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), small_machine())
+        run = lambda n: jv.simulate(eqx.tree_at(lambda x: x.drive.speed, s, n), 5.0, save="window", adjoint=adjoint)  # noqa: E731
+        with pytest.raises(Asked) as found:
+            jax.eval_shape(run, jnp.asarray(3.0))
+        with pytest.raises(Asked) as plainly:
+            run(jnp.asarray(3.0))
+    (solver,) = found.value.args
+    assert isinstance(solver, LoopDopri8) and solver.tangents == (adjoint is not None) if double else solver is None
+    assert plainly.value.args == (None,)
+
+
+def test_the_next_tolerance_is_smaller_by_a_little_more_than_what_is_missing(monkeypatch):
+    """Of an error 10, 1e3 and 1e9 times what is asked, and of one that nobody knows."""
+    base = small_run(save="window")
+    for times, low, high in (
+        (10.0, 1e-3, 0.1),
+        (1e3, 1e-5, 1e-3),
+        (1e9, 0.99e-5, 1.01e-5),
+        (np.inf, 1e-3, 0.1),
+        (1.01, 0.05, 0.11),
+    ):
+        asked, errors = [], iter([times * 1e-4, 0.5e-4])
+
+        def run(control, asked=asked):
+            asked.append(float(control.tolerance))
+            return base
+
+        compared = lambda *_, errors=errors: dataclasses.replace(base, error=jnp.asarray(next(errors)))  # noqa: E731
+        monkeypatch.setattr("jaxvib.motion.simulate._compared", compared)
+        found = _to_accuracy(base.scene, run, StepControl(tolerance=jnp.asarray(1e-6)), 1e-4)
+        assert bool(found.status == jv.RunStatus.done) and len(asked) == 3 and asked[0] > asked[1] == 1e-6
+        assert low <= asked[2] / asked[1] <= high, times
+
+
+def test_a_run_to_an_accuracy_that_needs_more_steps_says_so():
+    run, asked = small_run(save="window"), jv.Accuracy(1e-6)
+    for status, says in ((jv.RunStatus.max_steps_reached, "64 steps"), (jv.RunStatus.not_accurate, "asked for 1.0e-06")):
+        with pytest.raises(jv.ComputationError) as error:
+            _raise_if_failed(dataclasses.replace(run, status=status), 64, asked)
+        assert says in str(error.value)
+        assert ("asked for" in str(error.value)) == (status is jv.RunStatus.not_accurate)

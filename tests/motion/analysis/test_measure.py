@@ -9,6 +9,7 @@ from small_machine import small_run
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import measure
+from jaxvib.motion.analysis.scaled_error import estimated_error
 
 
 def test_measure_reads_a_known_motion():
@@ -97,3 +98,29 @@ def test_derivatives_of_an_amplitude_move_its_extrema_along():
 def test_a_growing_motion_is_not_settled():
     run = small_run()
     assert not bool(run.settled) and "not settled" in run.summary()
+
+
+def test_a_change_of_the_loads_speed_is_told_relative_to_it():
+    """A platform that repeats itself, a load whose speed rises by 1 %: its mean over the second half, against that of all."""
+    s, n = scene("one_mass", "balls"), 3
+    t = jnp.linspace(0.0, 20.0, 2001)
+    angle, rate = 50.0 * (t + 0.5 * 0.01 * t**2 / 20.0), 50.0 * (1.0 + 0.01 * t / 20.0)
+    each = lambda x: jnp.broadcast_to(x[:, None], (t.shape[0], n))  # noqa: E731
+    states = jv.State(jnp.sin(50.0 * t)[:, None], 50.0 * jnp.cos(50.0 * t)[:, None], (each(angle),), (each(rate),))
+
+    def field(_, y):
+        return jv.State(y.velocity, -2500.0 * y.displacement, y.rate, (jnp.full(n, 0.5 * 0.01 * 50.0 / 10.0),))
+
+    measured = measure(s, jax.tree_util.Partial(field), t, states)
+    # Speeds grow evenly: their mean over the second half is that at 15 s, over all of it that at 10 s, but for part of a turn.
+    np.testing.assert_allclose(measured.drift, 0.0025 / 1.005, rtol=0.02)
+    assert not bool(measured.settled)
+
+
+def test_rounding_counts_for_every_step_and_radian():
+    """2 eps for each, beside the share of the difference; twice the difference where an effect bends the motion."""
+    s, eps = scene("one_mass", "balls"), 2.0**-52
+    np.testing.assert_allclose(estimated_error(0.0, 0.5, s, 1000, 500), 3000.0 * eps, rtol=1e-12)
+    np.testing.assert_allclose(estimated_error(1e-4, 0.5, s), 5e-5, rtol=1e-12)
+    bent = scene("one_mass", "balls", effects=(jv.Stop(1e6, gap=1e-3),))
+    np.testing.assert_allclose(estimated_error(1e-4, 0.5, bent), 2e-4, rtol=1e-12)

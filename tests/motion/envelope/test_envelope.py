@@ -12,6 +12,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.motion.envelope.envelope import _Tolerance
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
@@ -152,6 +153,29 @@ def test_a_run_reads_like_a_simulation(caught):
     assert caught.summary().startswith("the averaged run reached its end: 60 s") and "zero to peak: y1" in caught.summary()
     assert caught.trajectory.time.shape == (256,) and caught.trajectory.amplitude.shape == (256, 1)
     np.testing.assert_allclose(caught.trajectory.rotor_speed[-1], 60.0)
+
+
+def test_the_ripple_of_a_run_is_the_greatest_in_its_window():
+    run = jv.envelope(small(effects=(jv.Gravity(),)), 0.05, start="spin_up", throw=False)
+    each = np.asarray(run.window.ripple)
+    np.testing.assert_array_equal(run.ripple, each.max(axis=0))
+    assert np.all(each.min(axis=0) < 0.9 * each.max(axis=0))
+
+
+def test_an_error_is_relative_to_the_length_of_a_vector_and_never_to_an_angle():
+    """A block of two numbers, of which one is 0, and an angle of 1e6 rad: what each may be off by to a relative 1e-3."""
+    controller = diffrax.PIDController(rtol=1e-3, atol=1e-9, norm=lambda error: jnp.max(jnp.abs(error)))
+    steps = _Tolerance(controller=controller, blocks=(2, 1))
+    y, state = jnp.asarray([0.0, 1.0, 1e6]), (jnp.asarray(False), jnp.asarray(1.0), jnp.asarray(1.0))
+    state = steps.init(None, 0.0, 1.0, y, 0.1, None, lambda *_: y, 4)[1]
+
+    def kept(*error):
+        return bool(steps.adapt_step_size(0.0, 0.1, y, y, None, jnp.asarray(error), 4, state)[0])
+
+    assert kept(0.9e-3, 0.0, 0.0) and not kept(1.1e-3, 0.0, 0.0)
+    assert kept(0.0, 0.9e-3, 0.0) and not kept(0.0, 1.1e-3, 0.0)
+    assert kept(0.0, 0.0, 0.9e-9) and not kept(0.0, 0.0, 1.1e-9)
+    assert not kept(jnp.nan, 0.0, 0.0)
 
 
 def test_a_batch_with_a_jam_that_is_absent_says_so():

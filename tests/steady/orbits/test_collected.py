@@ -173,3 +173,16 @@ def test_a_rotor_out_of_balance_has_no_periodic_jam():
     s = scene("two_mass", effects=(jv.StaticImbalance(0.01),))
     with pytest.raises(jv.InputError, match=r"effects\.static_imbalance shakes the machine at the rotor's own speed"):
         jv.jam_orbit(s, mode=1)
+
+
+def test_bodies_of_single_loads_have_together_the_numbers_of_the_one_that_all_are():
+    """Drag, inertia and unbalance of three balls named one by one, against m R, 7/5 m R^2 and b R^2 of each."""
+    machine, drive = machines()["one_mass"], jv.ConstantSpeed(50.0)
+    mass, drag = np.array([0.6, 1.2, 0.9]), np.array([0.7, 1.5, 1.1])
+    each = assembled(jv.Scene(machine, jv.balls(count=3, mass=mass, radius=0.1, drag=drag), drive))
+    np.testing.assert_allclose(each.unbalance, mass * 0.1, rtol=1e-14)
+    np.testing.assert_allclose(each.inertia, 1.4 * mass * 0.1**2, rtol=1e-14)
+    np.testing.assert_allclose(each.drag, drag * 0.1**2, rtol=1e-14)
+    shared = assembled(jv.Scene(machine, jv.balls(count=3, mass=0.6, radius=0.1, drag=0.7), drive))
+    found = [float(x[0]) for x in (shared.unbalance, shared.inertia, shared.drag)]
+    np.testing.assert_allclose(found, [3 * 0.6 * 0.1, 3 * 1.4 * 0.6 * 0.1**2, 3 * 0.7 * 0.1**2], rtol=1e-14)
