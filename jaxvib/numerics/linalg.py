@@ -204,7 +204,7 @@ def _written_solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Arra
 def _adjugate(a: Array) -> tuple[Array, Array]:
     """adj(a) and det(a) of 2 or 3 equations: a adj(a) = det(a) 1."""
     if a.shape[0] == 2:
-        cofactors = np.array([[1.0, -1.0], [-1.0, 1.0]], a.dtype) * a[::-1, ::-1]
+        cofactors = a[::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]], a.dtype)
     else:
         below, above = jnp.roll(a, -1, 0), jnp.roll(a, 1, 0)
         cofactors = jnp.roll(below, -1, 1) * jnp.roll(above, 1, 1) - jnp.roll(below, 1, 1) * jnp.roll(above, -1, 1)
