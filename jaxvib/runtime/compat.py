@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import importlib
 import importlib.metadata
 import inspect
 import json
@@ -20,7 +21,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HAS_JAXPRS",
+    "HAS_RULES",
     "ClosedJaxpr",
     "Jaxpr",
     "JaxprEqn",
@@ -39,16 +41,21 @@ __all__ = [
     "Var",
     "accepted_flags",
     "backend_started",
+    "beneath",
     "custom_vmap",
     "enumeration_names",
     "enumeration_of",
+    "evaluating",
+    "is_zero",
     "jaxpr_as_fun",
     "no_host_checks",
+    "primitive",
     "rewritten",
     "short_end",
     "traced",
     "user_folder",
     "wide_vectors_are_right",
+    "zero_of",
 ]
 
 _TESTED = ((0, 10), (0, 12))
@@ -66,6 +73,31 @@ except ImportError:
     if not TYPE_CHECKING:
         ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
+
+
+def _module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+core, ad, batching, mlir = map(
+    _module, ("jax.extend.core", "jax.interpreters.ad", "jax.interpreters.batching", "jax.interpreters.mlir")
+)
+HAS_RULES = all(
+    hasattr(module, name)
+    for module, name in (
+        (core, "Primitive"),
+        (ad, "Zero"),
+        (ad, "primitive_jvps"),
+        (ad, "primitive_transposes"),
+        (batching, "primitive_batchers"),
+        (mlir, "lower_fun"),
+        (mlir, "register_lowering"),
+    )
+)
+"""Rules of primitives. Without them derivatives of cached functions are traced in each process."""
 
 
 def rewritten(
@@ -113,6 +145,61 @@ def traced(value: object) -> bool:
         return isinstance(value, jax.Array) and not value.devices()
     except jax.errors.ConcretizationTypeError:
         return True
+
+
+def beneath(tracer: object) -> object | None:
+    """What a derivative or a batch is taken of where `tracer` stands for it; None where that is not known, as under `jit`."""
+    kind = type(tracer).__name__
+    return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
+
+
+def evaluating() -> contextlib.AbstractContextManager[None]:
+    """In here known numbers are computed with at once, whatever JAX is transforming; without it they are part of that."""
+    context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
+    return context()
+
+
+def primitive(
+    name: str,
+    *,
+    computed: Callable[..., list[Array]],
+    in_batch: Callable[..., tuple],
+    differentiated: Callable[..., tuple] | None = None,
+    transposed: Callable[..., list] | None = None,
+    traced: Callable[..., list[Array]] | None = None,
+    abstract: Callable[..., Sequence] | None = None,
+) -> Callable[..., list[Array]]:
+    """A function of arrays, and of what else it is given by name, of which JAX knows no more than these rules.
+
+    **Arguments**: what it computes, in numbers; in a batch, of arrays and the axis of each; differentiated, of arrays and
+    tangents; transposed, of cotangents and arrays; what is traced in its place, and the types of its results. **Returns** a
+    function, of numbers only where rules have another form (`HAS_RULES`).
+    """
+    if not HAS_RULES:
+        return computed
+    made = core.Primitive(name)
+    made.multiple_results = True
+    made.def_impl(computed)
+    batching.primitive_batchers[made] = in_batch
+    if differentiated is not None:
+        ad.primitive_jvps[made] = differentiated
+    if transposed is not None:
+        ad.primitive_transposes[made] = transposed
+    if abstract is not None:
+        made.def_abstract_eval(abstract)
+    if traced is not None:
+        mlir.register_lowering(made, mlir.lower_fun(traced, multiple_results=True))
+    return made.bind
+
+
+def is_zero(tangent: object) -> bool:
+    """Whether a rule of a `primitive` is given no tangent."""
+    return isinstance(tangent, ad.Zero)
+
+
+def zero_of(x: Array) -> object:
+    """No tangent of `x`, as rules of a `primitive` return it."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def backend_started() -> bool:

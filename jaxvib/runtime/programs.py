@@ -1,272 +1,280 @@
-"""Programs cached on disk, so that the next process that asks the same question need not trace them.
+"""Functions whose programs are stored on disk, and those of their derivatives too.
 
-A program is stored as `jax.export` writes it, under a line of JSON that describes the structure of its result. What XLA makes
-of it is in JAX's own compilation cache. Nothing that is read is run as Python.
+A stored program cannot be differentiated; what can be is a primitive that stands for it. The rules of that primitive ask for
+further stored programs, which were traced from derivatives of the function: its tangents, its values with what the reverse
+derivative needs of them, the reverse derivative itself, and batches of these.
 """
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import functools
-import hashlib
-import importlib.metadata
-import itertools
-import json
-import os
-import tempfile
 import threading
-import weakref
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, export
-from jax.sharding import Sharding, SingleDeviceSharding
+from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import no_host_checks, traced
-from jaxvib.runtime.cpu import processor
+from jaxvib.runtime.compat import HAS_RULES, beneath, evaluating, is_zero, primitive, traced, zero_of
 from jaxvib.runtime.startup import start
-from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Undescribable, describe, rebuild
+from jaxvib.runtime.stored import StoredFunction, is_debugging
+from jaxvib.runtime.structure import Skeleton, Undescribable, describe
 
-__all__ = ["cached"]
+__all__ = ["CachedFunction", "cached"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
-"""Whose versions a traced program depends on."""
 
-_OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
-"""JAX's options that a traced program depends on."""
+def cached(function: Callable[P, T]) -> CachedFunction[P, T]:
+    """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `StoredFunction`.
 
-
-_MOST = 512
-"""So many programs are held in memory, those that were used last. XLA maps each into some dozens of areas of memory: a process
-with some thousand programs has no areas left (65530 on Linux), and ends within the compiler without a word."""
-
-_clock = itertools.count()
-_functions: weakref.WeakSet[_CachedFunction] = weakref.WeakSet()
-_listing = threading.Lock()  # of `_functions`
-
-
-def cached(function: Callable[P, T]) -> Callable[P, T]:
-    """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `use_cache`.
-
-    Under a JAX transformation it is just the compiled function. The key of a program on disk holds all that it depends on: the
-    shapes and types of arrays, the static parts of the arguments, JAX's options, the versions, when the sources were changed,
-    and the processor. The 512 programs that were used last are held in memory, others are read or traced again.
-
-    Some programs are not stored, but traced in each process: those with arguments of a class from outside
-    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
+    Derivatives by `jax.jvp`, `grad`, `jacfwd`, `jacrev` and batches by `vmap` have programs of their own, cached alike. Where
+    these are derivatives of derivatives, or `jit` is around them, it is just the compiled function that JAX transforms.
     """
-    return _CachedFunction(function)
+    return CachedFunction(function)
 
 
-class _CachedFunction(Generic[P, T]):
+class CachedFunction(Generic[P, T]):
     def __init__(self, function: Callable[P, T]):
-        self.function = no_host_checks()(function)
-        self.jitted = eqx.filter_jit(self.function)
-        self.ready: dict[Hashable, _Program | None] = {}
-        self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
-        with _listing:
-            _functions.add(self)
+        self.stored = StoredFunction(function)
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
         start()
         leaves, treedef = jax.tree.flatten((args, kwargs))
         leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
-        folder = program_folder()
-        if folder is None or any(traced(leaf) for leaf in leaves) or _is_debugging():
-            return self.jitted(*args, **kwargs)
-        home = _home(leaves)
-        asked = (folder, treedef, tuple(map(_leaf_key, leaves)), home, _options())
-        try:
-            program = self.ready.get(asked, _UNKNOWN)
-        except TypeError:  # an argument without a hash
-            return self.jitted(*args, **kwargs)
-        if program is _UNKNOWN:
-            with self.lock:
-                program = self.ready.get(asked, _UNKNOWN)
-                if program is _UNKNOWN:
-                    program = self.ready[asked] = self._program(folder, leaves, treedef, home)
-            _forget_oldest()
-        if program is None:
-            return self.jitted(*args, **kwargs)
-        program.used = next(_clock)
-        return program(leaf for leaf in leaves if eqx.is_array(leaf))
-
-    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
-        """From the disk, or traced and written there; None where this call has no program that could be stored."""
-        try:
-            path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
-            return _read(path, home) or self._write(path, leaves, treedef, home)
-        except Undescribable:
-            return None
-
-    def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
-        def abstract(leaf: Array) -> str:
-            device, *others = leaf.sharding.device_set
-            if others or device.platform != jax.devices()[0].platform:
-                raise Undescribable("an array is not on one device of the kind that is used first")
-            return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
-
-        asked = describe(jax.tree.unflatten(treedef, leaves), abstract)
-        name = f"{self.function.__module__}:{self.function.__qualname__}"
-        return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
-
-    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
-        structure: list[Description] = []
-        # Not the arrays of this call, which would live as long as the program.
-        static = [_Slot(k) if eqx.is_array(leaf) else leaf for k, leaf in enumerate(leaves)]
-
-        def flat(*arrays: Array) -> list[Array]:
-            given, found = iter(arrays), []
-            args, kwargs = jax.tree.unflatten(treedef, [next(given) if isinstance(x, _Slot) else x for x in static])
-            out = self.function(*args, **kwargs)  # pyright: ignore[reportCallIssue]
-            structure[:] = [describe(out, found.append)]
-            return found
-
-        jitted = jax.jit(flat)
-        try:
-            exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
-            stored = bytes(exported.serialize())
-        except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
-            if not structure:  # the function's own error
-                raise
-            return _Program.of(jitted, structure[0])
-        program = _Program.of(_compiled(path, exported, home), structure[0])
-        head = json.dumps({"structure": structure[0]}).encode() + b"\n"
-        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
-            _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
-        return program
+        moved = [leaf for leaf in leaves if traced(leaf)]
+        if not moved:
+            return self.stored(leaves, treedef)
+        if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, moved)):
+            question = _Question(self, Skeleton.of(leaves, treedef))
+            if _is_describable(question):
+                return question.result(_stored(*(leaf for leaf in leaves if eqx.is_array(leaf)), question=question))
+        return self.stored.jitted(*args, **kwargs)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Slot:
-    """Stands where an array goes."""
-
-    place: int
-
-
-@dataclasses.dataclass
-class _Program:
-    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used."""
-
-    run: Callable[..., list[Array]]
-    leaves: Sequence[object]
-    treedef: Hashable
-    used: int = dataclasses.field(default_factory=lambda: next(_clock))
-
-    @classmethod
-    def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
-        places = itertools.count()
-        leaves, treedef = jax.tree.flatten(rebuild(structure, map(_Slot, places)))
-        if sum(isinstance(leaf, _Slot) for leaf in leaves) != next(places):
-            raise Undescribable("an array of the result is in a static field")
-        return cls(run, leaves, treedef)
-
-    def __call__(self, arrays: Iterable[Array]) -> Any:
-        found = self.run(*arrays)
-        return jax.tree.unflatten(self.treedef, [found[x.place] if isinstance(x, _Slot) else x for x in self.leaves])
+def _is_simple(tracer: object) -> bool:
+    """Whether one derivative or one batch is asked for, of numbers that are known."""
+    value = beneath(tracer)
+    return value is not None and not traced(value)
 
 
-_UNKNOWN = _Program(lambda *_: [], (), None)
+@dataclasses.dataclass(frozen=True, repr=False)
+class _Question:
+    """A function of the arrays of its arguments, all else being given; `skeletons` what its results were last put into."""
+
+    function: CachedFunction
+    arguments: Skeleton
+    skeletons: list[Skeleton] = dataclasses.field(default_factory=list, compare=False)
+
+    def __call__(self, arrays: Sequence[Array]) -> Any:
+        """Traced, by the function itself."""
+        args, kwargs = self.arguments.filled(arrays)
+        return self.function.stored.function(*args, **kwargs)
+
+    def split(self, result: Any) -> list[Array]:
+        """The arrays of a result; what is left is kept for `result`."""
+        leaves, treedef = jax.tree.flatten(result)
+        self.skeletons[:] = [Skeleton.of(leaves, treedef)]
+        return [leaf for leaf in leaves if eqx.is_array(leaf)]
+
+    def result(self, arrays: Sequence[Array]) -> Any:
+        return self.skeletons[0].filled(arrays)
 
 
-def _forget_oldest() -> None:
-    """Frees the programs beyond `_MOST` that were not used for longest."""
-    with _listing:
-        functions = list(_functions)
-    held = [(p.used, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None]
-    for _, function, asked in sorted(held, key=lambda each: each[0])[: max(len(held) - _MOST, 0)]:
-        program = function.ready.pop(asked, None)
-        if program is not None:
-            program.run.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Writes a file at once, so that another process never reads half a program; nothing is left where that fails."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-        try:
-            file.write(content)
-            file.close()
-            os.replace(file.name, path)
-        except OSError:
-            os.unlink(file.name)
-            raise
-
-
-def _read(path: Path, home: Sharding) -> _Program | None:
-    """None where there is no such file, where it is another user's, and where it is damaged: it is written anew."""
+@functools.lru_cache(256)
+def _is_describable(question: _Question) -> bool:
+    """Whether its program can be told from others on disk."""
     try:
-        with path.open("rb") as file:
-            if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
-                return None
-            digest, _, content = file.read().partition(b"\n")
-        if digest != _digest(content).encode():
-            return None
-        head, _, stored = content.partition(b"\n")
-        exported = export.deserialize(bytearray(stored))
-    except (OSError, ImportError):
-        return None
-    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"])
+        describe((question.function, question.arguments), lambda _: None)
+    except Undescribable:
+        return False
+    return True
 
 
-def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:
-    def run(*arrays: Array) -> list[Array]:
-        return exported.call(*arrays)  # pyright: ignore[reportReturnType]
-
-    run.__name__ = path.stem  # part of the key in JAX's compilation cache, which does not hold the processor
-    # Without a word on where, JAX compiles once for arrays that it may move and once for those that another program gave.
-    return jax.jit(run, in_shardings=home)
+# --- programs of derivatives ---
 
 
-def _home(leaves: Sequence[object]) -> Sharding:
-    """Where JAX computes with these arrays: where those are that it must not move, otherwise on the default device."""
-    for leaf in leaves:
-        if isinstance(leaf, jax.Array) and leaf.committed:
-            return leaf.sharding
-    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return SingleDeviceSharding(chosen if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)[0])
+def _moving(question: _Question, active: Sequence[bool], arrays: Sequence[Array]) -> tuple[Callable[..., Any], list[Array]]:
+    """The function of its `active` arrays, which returns the numbers that have derivatives and, beside them, all; and these."""
+
+    def function(*moving: Array) -> tuple[list[Array], list[Array]]:
+        given = iter(moving)
+        found = question.split(question([next(given) if moves else x for moves, x in zip(active, arrays, strict=True)]))
+        return [x for x in found if _has_slope(x)], found
+
+    return function, [x for moves, x in zip(active, arrays, strict=True) if moves]
 
 
-def _leaf_key(leaf: Array | Hashable) -> Hashable:
-    if isinstance(leaf, jax.Array):
-        return jax.typeof(leaf)
-    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
+def _has_slope(x: Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-def _is_debugging() -> bool:
-    """Whether JAX runs programs operation by operation, or may have to."""
-    return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
+@cached
+def _pushed(
+    question: _Question, active: tuple[bool, ...], arrays: list[Array], tangents: list[Array]
+) -> tuple[Any, list[Array]]:
+    """The result, and the tangents of its numbers."""
+    function, moving = _moving(question, active, arrays)
+    _, slopes, found = jax.jvp(function, moving, tangents, has_aux=True)
+    return question.result(found), slopes
 
 
-def _options() -> tuple[Hashable, ...]:
-    return tuple(getattr(jax.config, name) for name in _OPTIONS)
+@cached
+def _noted(question: _Question, active: tuple[bool, ...], arrays: list[Array]) -> tuple[Any, list[Array]]:
+    """The result, and what the reverse derivative needs."""
+    found, pullback = _pullback(question, active, arrays)
+    return question.result(found), [leaf for leaf in jax.tree.leaves(pullback) if eqx.is_array(leaf)]
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+@cached
+def _pulled(
+    question: _Question,
+    active: tuple[bool, ...],
+    asked: tuple[bool, ...],
+    types: tuple[tuple[tuple[int, ...], str, bool], ...],
+    notes: list[Array],
+    slopes: list[Array],
+) -> list[Array]:
+    """Cotangents of the `active` arrays from those of the result's numbers, as far as these are `asked`."""
+    pullback, zeros = _traced_pullback(question, active, types)
+    given = iter(slopes)
+    return list(pullback.filled(notes)([next(given) if wanted else zero for wanted, zero in zip(asked, zeros, strict=True)]))
 
 
-@functools.cache
-def _sources() -> str:
-    """Changes whenever a line of the code that programs are traced from may have changed."""
-    package = Path(__file__).parents[1]
-    packages = [package, package.parent / "optimize"]
-    files = [file.stat() for each in packages for file in sorted(each.rglob("*.py"))]
-    versions = [importlib.metadata.version(name) for name in _PACKAGES]
-    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {[(file.st_size, file.st_mtime_ns) for file in files]}"
+def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
+    """The result's arrays and the reverse derivative, whose form is noted for `_traced_pullback`."""
+    function, moving = _moving(question, active, arrays)
+    numbers, pullback, found = jax.vjp(function, *moving, has_aux=True)
+    form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, numbers))
+    with _noting:
+        _pullbacks[question, active, _types(arrays)] = form
+        while len(_pullbacks) > _MOST:
+            _pullbacks.popitem(last=False)
+    return found, pullback
 
 
-@functools.cache
-def _machine() -> str:
-    """What a program is compiled for."""
-    return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
+_MOST = 64
+"""So many forms of reverse derivatives are held: they are needed where a program of one is traced, soon after or never."""
+
+_pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[Any, ...]]] = collections.OrderedDict()
+_noting = threading.Lock()
+
+
+def _traced_pullback(question: _Question, active: tuple[bool, ...], types: Any) -> tuple[Skeleton, tuple[Any, ...]]:
+    """The reverse derivative without the numbers it needs, and zeros of the kind of what it is a function of."""
+    if (question, active, types) not in _pullbacks:  # `_noted` came from the disk
+        arrays = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in types]
+        jax.eval_shape(lambda *known: _pullback(question, active, known)[0], *arrays)
+    return _pullbacks[question, active, types]
+
+
+def _types(arrays: Sequence[Array]) -> tuple[tuple[tuple[int, ...], str, bool], ...]:
+    return tuple((x.shape, str(x.dtype), bool(jax.typeof(x).weak_type)) for x in arrays)
+
+
+@cached
+def _mapped(question: _Question, batched: tuple[bool, ...], arrays: list[Array]) -> Any:
+    """The results of many, as far as arrays are `batched` along their first axis."""
+    shares = _shares_result(question, batched)
+
+    def one(*arrays: Array) -> Any:
+        found = question(arrays)
+        return (question.split(found[0]), found[1]) if shares else question.split(found)
+
+    axes = [0 if is_batched else None for is_batched in batched]
+    found = jax.vmap(one, in_axes=axes, out_axes=(None, 0) if shares else 0)(*arrays)
+    return (question.result(found[0]), found[1]) if shares else question.result(found)
+
+
+def _shares_result(question: _Question, batched: Sequence[bool]) -> bool:
+    """Whether these are many tangents of one result."""
+    if question.function is not _pushed:
+        return False
+    _, _, arrays, _ = question.arguments.tree[0]
+    return not any(batched[: len(arrays)])
+
+
+# --- the rules of the primitives ---
+
+
+def _computed(*arrays: Array, question: _Question) -> list[Array]:
+    leaves, treedef = jax.tree.flatten(question.arguments.filled(arrays))
+    return question.split(question.function.stored(leaves, treedef))
+
+
+def _differentiated(arrays: Sequence[Array], tangents: Sequence[Any], *, question: _Question) -> tuple[list[Array], list[Any]]:
+    active = tuple(not is_zero(tangent) for tangent in tangents)
+    moving = [tangent for moves, tangent in zip(active, tangents, strict=True) if moves]
+    if all(not traced(tangent) or _is_simple(tangent) for tangent in moving):
+        result, slopes = _pushed(question, active, list(arrays), moving)
+    else:  # tangents that nobody knows: the derivative is to be transposed
+        with evaluating():
+            result, notes = _noted(question, active, list(arrays))
+        types = tuple(jax.typeof(x) for x in jax.tree.leaves(result) if eqx.is_array(x) and _has_slope(x))
+        slopes = _slopes(*moving, at=_Known(question, active, list(arrays), notes, types))
+    found, given = question.split(result), iter(slopes)
+    return found, [next(given) if _has_slope(x) else zero_of(x) for x in found]
+
+
+def _in_batch(arrays: Sequence[Array], axes: Sequence[Any], *, question: _Question) -> tuple[list[Array], list[Any]]:
+    batched = tuple(axis is not None for axis in axes)
+    first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
+    result = _mapped(question, batched, first)
+    found = question.split(result)
+    shared = len(jax.tree.leaves(result[0])) if _shares_result(question, batched) else 0
+    return found, [None if k < shared else 0 for k in range(len(found))]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class _Known:
+    """Where a derivative is taken, what the reverse one needs, and the types of results that have one. JAX writes parameters of
+    primitives out whenever it maps them: no `repr`, which would write out all the numbers."""
+
+    question: _Question
+    active: tuple[bool, ...]
+    arrays: list[Array]
+    notes: list[Array]
+    types: tuple[Any, ...]
+
+
+def _known_slopes(*tangents: Array, at: _Known) -> list[Array]:
+    return _pushed(at.question, at.active, at.arrays, list(tangents))[1]
+
+
+def _traced_slopes(*tangents: Array, at: _Known) -> list[Array]:
+    return _pushed.stored.function(at.question, at.active, at.arrays, list(tangents))[1]
+
+
+def _slopes_in_batch(tangents: Sequence[Array], axes: Sequence[Any], *, at: _Known) -> tuple[list[Array], list[int]]:
+    found = jax.vmap(functools.partial(_known_slopes, at=at), in_axes=tuple(axes))(*tangents)
+    return found, [0] * len(found)
+
+
+def _transposed(slopes: Sequence[Any], *_: Any, at: _Known) -> list[Array]:
+    asked = tuple(not is_zero(slope) for slope in slopes)
+    wanted = [slope for is_asked, slope in zip(asked, slopes, strict=True) if is_asked]
+    with contextlib.nullcontext() if any(map(traced, wanted)) else evaluating():
+        return _pulled(at.question, at.active, asked, _types(at.arrays), at.notes, wanted)
+
+
+_stored = primitive("stored", computed=_computed, differentiated=_differentiated, in_batch=_in_batch)
+"""A function of known numbers, under one derivative or one batch."""
+
+_slopes = primitive(
+    "stored_slopes",
+    computed=_known_slopes,
+    in_batch=_slopes_in_batch,
+    transposed=_transposed,
+    traced=_traced_slopes,
+    abstract=lambda *_, at: at.types,
+)
+"""Tangents of its results, as a linear function of those of its arguments."""

@@ -9,19 +9,75 @@ import dataclasses
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import numpy as np
 
-__all__ = ["KNOWN_PACKAGES", "Description", "Undescribable", "describe", "rebuild"]
+__all__ = ["KNOWN_PACKAGES", "Description", "Skeleton", "Slot", "Undescribable", "describe", "leaf_key", "rebuild"]
 
 Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
 """What JSON can hold."""
 
 KNOWN_PACKAGES = {"jaxvib", "optimize", "jax", "equinox", "diffrax", "optimistix", "optax", "lineax"}
 """Whose classes and functions a description may name: their sources and versions are known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """Stands in a tree where an array goes, the one of this number."""
+
+    place: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A tree without its arrays: a `Slot` stands for each. Two are equal where their structures and all other leaves are."""
+
+    tree: Any
+
+    @classmethod
+    def of(cls, leaves: Sequence[object], treedef: Any) -> Skeleton:
+        """That of a tree with these leaves."""
+        places = itertools.count()
+        return cls(jax.tree.unflatten(treedef, [Slot(next(places)) if eqx.is_array(x) else x for x in leaves]))
+
+    @functools.cached_property
+    def flat(self) -> tuple[tuple[object, ...], Any]:
+        """Leaves and structure."""
+        leaves, treedef = jax.tree.flatten(self.tree)
+        return tuple(leaves), treedef
+
+    @functools.cached_property
+    def key(self) -> Hashable:
+        return tuple(map(leaf_key, self.flat[0])), self.flat[1]
+
+    @property
+    def size(self) -> int:
+        """The number of arrays."""
+        return sum(isinstance(leaf, Slot) for leaf in self.flat[0])
+
+    def filled(self, arrays: Iterable[object]) -> Any:
+        """The tree with these arrays in its slots."""
+        leaves, treedef = self.flat
+        given = tuple(arrays)
+        return jax.tree.unflatten(treedef, [given[x.place] if isinstance(x, Slot) else x for x in leaves])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Skeleton) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+def leaf_key(leaf: Any) -> Hashable:
+    """What a program depends on of a leaf of its arguments: of an array its type, else the leaf."""
+    if isinstance(leaf, jax.Array):
+        return jax.typeof(leaf)
+    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
 
 
 class Undescribable(Exception):
@@ -48,7 +104,7 @@ def describe(value: object, array: Callable[[Any], Description]) -> Description:
             return {"tuple": [inner(x) for x in value]}
         case dict() if type(value) is dict:
             return {"dict": [[inner(key), inner(x)] for key, x in value.items()]}
-    if isinstance(value, type) or inspect.isroutine(value):
+    if isinstance(value, type) or inspect.isroutine(value) or hasattr(value, "__wrapped__"):
         return {"name": _name(value)}
     try:
         return {"class": _name(type(value)), "fields": [inner(getattr(value, name)) for name in _fields(type(value))]}

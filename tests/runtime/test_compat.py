@@ -89,15 +89,39 @@ def test_functions_can_have_a_rule_for_vmap(kind):
     assert called == ([] if kind is compat._PlainVmap else [(2, [True])])
 
 
+def test_primitives_take_rules(monkeypatch):
+    """`jax.interpreters`: batches, derivatives, transposes, lowering."""
+    assert compat.HAS_RULES
+    rules = {"computed": lambda x: [2.0 * x], "in_batch": lambda x, axes: ([2.0 * x[0]], axes)}
+    doubled = compat.primitive("doubled", **rules)
+    assert doubled(jnp.asarray(2.0)) == [4.0]
+    assert jax.vmap(lambda x: doubled(x)[0])(jnp.arange(3.0)).tolist() == [0.0, 2.0, 4.0]
+    monkeypatch.setattr(compat, "HAS_RULES", False)
+    assert compat.primitive("doubled", **rules) is rules["computed"]
+
+
+def test_known_numbers_are_computed_with_while_jax_transforms():
+    """`jax.core.eval_context`."""
+    seen = []
+
+    def look(x):
+        with compat.evaluating():
+            seen.append(jnp.arange(3.0).sum())
+        return x
+
+    jax.jit(look)(1.0)
+    assert not compat.traced(seen[0]) and float(seen[0]) == 3.0
+
+
 def test_options_of_jax_can_be_read():
     """Attributes of jax.config; each changes the key of a cached program or where it is cached."""
-    from jaxvib.runtime.programs import _OPTIONS, _is_debugging
+    from jaxvib.runtime.stored import _OPTIONS, is_debugging
 
     assert jax.config.jax_enable_x64 is True and jax.config.jax_compilation_cache_dir
-    assert all(hasattr(jax.config, name) for name in _OPTIONS) and not _is_debugging()
+    assert all(hasattr(jax.config, name) for name in _OPTIONS) and not is_debugging()
     for option in (jax.disable_jit(), jax.debug_nans(True), jax.debug_infs(True)):
         with option:
-            assert _is_debugging()
+            assert is_debugging()
 
 
 def test_this_jaxlib_starts_with_the_flags_of_prepare_cpu():

@@ -104,7 +104,7 @@ function = programs.cached(doubled)
 doubled.__module__ = "jaxvib.doubled"
 for k, found in many.in_parallel(lambda k: function(jnp.full(2, float(k))), range(7)):
     assert found.devices() == {{jax.devices()[k % 3]}} and found.tolist() == [2.0 * k] * 2, (k, found.devices())
-assert None not in function.ready.values() and len(list(programs.program_folder().glob("*.program"))) == 1
+assert None not in function.stored.ready.values() and len(list(programs.program_folder().glob("*.program"))) == 1
 """
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -129,8 +129,7 @@ class JamModes(AbstractJam):
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
         row = self.row(mode)
-        fields = {name: getattr(self, name) for name in Jam.__dataclass_fields__}
-        jam = Jam(**jax.tree.map(lambda leaf: leaf[row] if eqx.is_array_like(leaf) else leaf, fields))
+        jam = _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), row)
         if throw and not traced(self.omega) and not np.asarray(self.exists)[row]:
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
@@ -151,6 +150,11 @@ class JamModes(AbstractJam):
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         return _modes_chart(self, self.resonances, unit, ax)
+
+
+@cached
+def _row(jams: Jam, row: int) -> Jam:
+    return jax.tree.map(lambda leaf: leaf[row], jams)
 
 
 def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, ax: Onto) -> Drawn:

@@ -1,0 +1,251 @@
+"""Programs stored on disk, so that the next process that asks the same question need not trace them.
+
+A program is stored as `jax.export` writes it, under a line of JSON that describes the structure of its result. What XLA makes
+of it is in JAX's own compilation cache. Nothing that is read is run as Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import itertools
+import json
+import os
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, export
+from jax.sharding import Sharding, SingleDeviceSharding
+
+from jaxvib.runtime.cache import program_folder
+from jaxvib.runtime.compat import no_host_checks
+from jaxvib.runtime.cpu import processor
+from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
+
+__all__ = ["StoredFunction"]
+
+T = TypeVar("T")
+
+_PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
+"""Whose versions a traced program depends on."""
+
+_OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
+"""JAX's options that a traced program depends on."""
+
+
+_MOST = 512
+"""So many programs are held in memory, those that were used last. XLA maps each into some dozens of areas of memory: a process
+with some thousand programs has no areas left (65530 on Linux), and ends within the compiler without a word."""
+
+_clock = itertools.count()
+_functions: weakref.WeakSet[StoredFunction] = weakref.WeakSet()
+_listing = threading.Lock()  # of `_functions`
+
+
+class StoredFunction(Generic[T]):
+    """A function of trees of arrays and of what can be hashed, compiled, whose programs are stored on disk.
+
+    The key of a program on disk holds all that it depends on: the shapes and types of arrays, the static parts of the
+    arguments, JAX's options, the versions, when the sources were changed, and the processor. The 512 programs that were used
+    last are held in memory, others are read or traced again.
+
+    Some programs are not stored, but traced in each process: those with arguments of a class from outside
+    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
+    """
+
+    def __init__(self, function: Callable[..., T]):
+        self.function = no_host_checks()(function)
+        self.jitted = eqx.filter_jit(self.function)
+        self.ready: dict[Hashable, _Program | None] = {}
+        self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
+        with _listing:
+            _functions.add(self)
+
+    def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
+        """The function of arguments (args, kwargs) with these leaves, none of which JAX is transforming."""
+        folder = program_folder()
+        if folder is None or is_debugging():
+            return self._jitted(leaves, treedef)
+        home = _home(leaves)
+        asked = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
+        try:
+            program = self.ready.get(asked, _UNKNOWN)
+        except TypeError:  # an argument without a hash
+            return self._jitted(leaves, treedef)
+        if program is _UNKNOWN:
+            with self.lock:
+                program = self.ready.get(asked, _UNKNOWN)
+                if program is _UNKNOWN:
+                    program = self.ready[asked] = self._program(folder, leaves, treedef, home)
+            _forget_oldest()
+        if program is None:
+            return self._jitted(leaves, treedef)
+        program.used = next(_clock)
+        return program(leaf for leaf in leaves if eqx.is_array(leaf))
+
+    def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
+        args, kwargs = jax.tree.unflatten(treedef, leaves)
+        return self.jitted(*args, **kwargs)
+
+    def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
+        """From the disk, or traced and written there; None where this call has no program that could be stored."""
+        try:
+            path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
+            return _read(path, home) or self._write(path, leaves, treedef, home)
+        except Undescribable:
+            return None
+
+    def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
+        def abstract(leaf: Array) -> str:
+            device, *others = leaf.sharding.device_set
+            if others or device.platform != jax.devices()[0].platform:
+                raise Undescribable("an array is not on one device of the kind that is used first")
+            return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
+
+        asked = describe(jax.tree.unflatten(treedef, leaves), abstract)
+        name = f"{self.function.__module__}:{self.function.__qualname__}"
+        return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
+
+    def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
+        structure: list[Description] = []
+        # Not the arrays of this call, which would live as long as the program.
+        given = Skeleton.of(leaves, treedef)
+
+        def flat(*arrays: Array) -> list[Array]:
+            args, kwargs = given.filled(arrays)
+            out, found = self.function(*args, **kwargs), []
+            structure[:] = [describe(out, found.append)]
+            return [jnp.asarray(x, x.dtype) for x in found]  # read from the disk, results have types of their own
+
+        jitted = jax.jit(flat)
+        try:
+            exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
+            stored = bytes(exported.serialize())
+        except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
+            if not structure:  # the function's own error
+                raise
+            return _Program.of(jitted, structure[0])
+        program = _Program.of(_compiled(path, exported, home), structure[0])
+        head = json.dumps({"structure": structure[0]}).encode() + b"\n"
+        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
+            _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
+        return program
+
+
+@dataclasses.dataclass
+class _Program:
+    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used."""
+
+    run: Callable[..., list[Array]]
+    result: Skeleton
+    used: int = dataclasses.field(default_factory=lambda: next(_clock))
+
+    @classmethod
+    def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
+        places = itertools.count()
+        result = Skeleton(rebuild(structure, map(Slot, places)))
+        if result.size != next(places):
+            raise Undescribable("an array of the result is in a static field")
+        return cls(run, result)
+
+    def __call__(self, arrays: Iterable[Array]) -> Any:
+        return self.result.filled(self.run(*arrays))
+
+
+_UNKNOWN = _Program(lambda *_: [], Skeleton(()))
+
+
+def _forget_oldest() -> None:
+    """Frees the programs beyond `_MOST` that were not used for longest."""
+    with _listing:
+        functions = list(_functions)
+    held = [(p.used, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None]
+    for _, function, asked in sorted(held, key=lambda each: each[0])[: max(len(held) - _MOST, 0)]:
+        program = function.ready.pop(asked, None)
+        if program is not None:
+            program.run.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Writes a file at once, so that another process never reads half a program; nothing is left where that fails."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+        try:
+            file.write(content)
+            file.close()
+            os.replace(file.name, path)
+        except OSError:
+            os.unlink(file.name)
+            raise
+
+
+def _read(path: Path, home: Sharding) -> _Program | None:
+    """None where there is no such file, where it is another user's, and where it is damaged: it is written anew."""
+    try:
+        with path.open("rb") as file:
+            if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
+                return None
+            digest, _, content = file.read().partition(b"\n")
+        if digest != _digest(content).encode():
+            return None
+        head, _, stored = content.partition(b"\n")
+        exported = export.deserialize(bytearray(stored))
+    except (OSError, ImportError):
+        return None
+    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"])
+
+
+def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:
+    def run(*arrays: Array) -> list[Array]:
+        return exported.call(*arrays)  # pyright: ignore[reportReturnType]
+
+    run.__name__ = path.stem  # part of the key in JAX's compilation cache, which does not hold the processor
+    # Without a word on where, JAX compiles once for arrays that it may move and once for those that another program gave.
+    return jax.jit(run, in_shardings=home)
+
+
+def _home(leaves: Sequence[object]) -> Sharding:
+    """Where JAX computes with these arrays: where those are that it must not move, otherwise on the default device."""
+    for leaf in leaves:
+        if isinstance(leaf, jax.Array) and leaf.committed:
+            return leaf.sharding
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return SingleDeviceSharding(chosen if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)[0])
+
+
+def is_debugging() -> bool:
+    """Whether JAX runs programs operation by operation, or may have to."""
+    return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
+
+
+def _options() -> tuple[Hashable, ...]:
+    return tuple(getattr(jax.config, name) for name in _OPTIONS)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+@functools.cache
+def _sources() -> str:
+    """Changes whenever a line of the code that programs are traced from may have changed."""
+    package = Path(__file__).parents[1]
+    packages = [package, package.parent / "optimize"]
+    files = [file.stat() for each in packages for file in sorted(each.rglob("*.py"))]
+    versions = [importlib.metadata.version(name) for name in _PACKAGES]
+    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {[(file.st_size, file.st_mtime_ns) for file in files]}"
+
+
+@functools.cache
+def _machine() -> str:
+    """What a program is compiled for."""
+    return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
