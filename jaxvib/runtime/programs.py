@@ -8,7 +8,6 @@ derivative needs of them, the reverse derivative itself, and batches of these.
 from __future__ import annotations
 
 import collections
-import contextlib
 import dataclasses
 import functools
 import threading
@@ -22,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import HAS_RULES, beneath, evaluating, is_zero, primitive, traced, zero_of
+from jaxvib.runtime.compat import HAS_RULES, beneath, is_zero, primitive, traced, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe
@@ -217,8 +216,7 @@ def _differentiated(arrays: Sequence[Array], tangents: Sequence[Any], *, questio
     if all(not traced(tangent) or _is_simple(tangent) for tangent in moving):
         result, slopes = _pushed(question, active, list(arrays), moving)
     else:  # tangents that nobody knows: the derivative is to be transposed
-        with evaluating():
-            result, notes = _noted(question, active, list(arrays))
+        result, notes = _noted(question, active, list(arrays))
         types = tuple(jax.typeof(x) for x in jax.tree.leaves(result) if eqx.is_array(x) and _has_slope(x))
         slopes = _slopes(*moving, at=_Known(question, active, list(arrays), notes, types))
     found, given = question.split(result), iter(slopes)
@@ -262,8 +260,7 @@ def _slopes_in_batch(tangents: Sequence[Array], axes: Sequence[Any], *, at: _Kno
 def _transposed(slopes: Sequence[Any], *_: Any, at: _Known) -> list[Array]:
     asked = tuple(not is_zero(slope) for slope in slopes)
     wanted = [slope for is_asked, slope in zip(asked, slopes, strict=True) if is_asked]
-    with contextlib.nullcontext() if any(map(traced, wanted)) else evaluating():
-        return _pulled(at.question, at.active, asked, _types(at.arrays), at.notes, wanted)
+    return _pulled(at.question, at.active, asked, _types(at.arrays), at.notes, wanted)
 
 
 _stored = primitive("stored", computed=_computed, differentiated=_differentiated, in_batch=_in_batch)

@@ -28,7 +28,7 @@ from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import no_host_checks
+from jaxvib.runtime.compat import evaluating, no_host_checks
 from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
@@ -91,7 +91,8 @@ class StoredFunction(Generic[T]):
         if program is None:
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
-        return program(leaf for leaf in leaves if eqx.is_array(leaf))
+        with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
+            return program(leaf for leaf in leaves if eqx.is_array(leaf))
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
         args, kwargs = jax.tree.unflatten(treedef, leaves)
