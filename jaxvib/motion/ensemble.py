@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
@@ -31,6 +31,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.structure import Skeleton
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
@@ -168,7 +169,8 @@ def ensemble(
     # What all runs share stays one number: it is not read anew for each.
     shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]
     shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
-    leaves, rest = jax.tree.flatten(made)
+    leaves, treedef = jax.tree.flatten(made)
+    form = Skeleton.of(leaves, treedef)
     own = [leaf for leaf, same in zip(leaves, shared, strict=True) if not same]
     common = [leaf[0] for leaf, same in zip(leaves, shared, strict=True) if same]
     require(stepsize_controller, EqualSteps)
@@ -185,7 +187,7 @@ def ensemble(
     counts = jnp.asarray([each, coarse] if compared else [each], end.dtype)
 
     def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
-        return _together(own, common, end, counts, tuple(shared), rest, equations)
+        return _together(own, common, end, counts, tuple(shared), form, equations)
 
     ends = in_chunks(lanes, together, own, shared=(common, end, counts))
     last, load_speed, apart, finite, detached, taken = jax.tree.map(jnp.asarray, ends)
@@ -230,14 +232,14 @@ def _together(
     end: Array,
     counts: Array,
     same: tuple[bool, ...],
-    rest: Hashable,
+    form: Skeleton,
     equations: Equations,
 ) -> _Ends:
     """Runs side by side: those of their numbers that are their `own` with a leading axis, and what they have in `common`."""
 
     def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
-        scene, state = jax.tree.unflatten(rest, [next(ours) if shared else next(mine) for shared in same])
+        scene, state = form.filled(next(ours) if shared else next(mine) for shared in same)
         return _run(scene, state, end, counts, equations)
 
     return jax.vmap(one)(own)

@@ -11,6 +11,7 @@ from scenes import published, some_state
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
+from jaxvib.runtime import cache
 
 
 def test_an_ensemble_is_a_loop_of_runs():
@@ -52,6 +53,16 @@ def error_of(given, k, found, exact):
     """What `Ensemble.error` is about, of run k."""
     a, b = nth(found.state, k), nth(exact.state, k)
     return float(scaled_error(a, b, error_scale(b, natural_units(make(nth(given, k))[0]))))
+
+
+def test_another_process_need_not_trace_an_ensemble(tmp_path):
+    """Not even where `make` is written in the call: the program is that of the scenes it made."""
+    cache.keep_programs(tmp_path)
+    try:
+        jv.ensemble(lambda value: make(value), values(), 5.0, stepsize_controller=jv.EqualSteps(200))
+    finally:
+        cache.keep_programs(None)
+    assert list(tmp_path.glob("_together-*.program"))
 
 
 def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():
