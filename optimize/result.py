@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -14,7 +14,7 @@ from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.run import Run
-from jaxvib.results.fields import in_unit
+from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
 from optimize.space.numbers import shown_unit
 
@@ -54,19 +54,10 @@ class Outcome:
     foundation_force: float
     force_per_amplitude: float
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, Plain]:
         """The same for JSON: freed numbers beside the quantities, None where there is no number."""
-
-        def plain(value: float) -> float | None:
-            return value if math.isfinite(value) else None
-
-        return {
-            **self.parameters,
-            "omega": plain(self.omega),
-            "amplitude": [plain(a) for a in self.amplitude],
-            "foundation_force": plain(self.foundation_force),
-            "force_per_amplitude": plain(self.force_per_amplitude),
-        }
+        told = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
+        return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in told}}.items()}
 
 
 class Row(NamedTuple):

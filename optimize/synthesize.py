@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -27,7 +28,7 @@ from optimize.search.sense import influences_of, limits_of, machines_of, neighbo
 from optimize.space import DesignSpace
 from optimize.wishes.answers import Answers
 from optimize.wishes.jams import between
-from optimize.wishes.quantity import Demand, Pair, Quantity, walk
+from optimize.wishes.quantity import Demand, Pair, Quantity, Tier, walk
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
@@ -211,7 +212,7 @@ def _searched(
     for loads in space.counts or (space.scene.loads.count,):
         here = space if loads == space.scene.loads.count else _with_loads(space, loads)
         problem = problem_of(here, objective, demands, options.starts)
-        if problem.keys and space.scene.loads.circular and not float(space.scene.loads.drag_sum()) > 0.0:  # pyright: ignore
+        if problem.keys and not float(jammed_loads(space.scene).drag_sum()) > 0.0:
             raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
         found = choose(problem, options, tell)
         if found is None:
@@ -297,8 +298,8 @@ def _other_tiers(
 ) -> tuple[list[float], list[float]]:
     """The same quantities of the exact motion, and of the run that checks the design; NaN where they have no such tier."""
 
-    def value(quantity: Quantity, answers: Answers, tier: str) -> float:
-        other = quantity.at_tier(tier)  # pyright: ignore[reportArgumentType]
+    def value(quantity: Quantity, answers: Answers, tier: Tier) -> float:
+        other = quantity.at_tier(tier)
         if other == quantity and tier not in {getattr(q, "tier", None) for q in walk(quantity)}:
             return math.nan
         if tier == "time" and any(getattr(q, "tier", tier) != tier or hasattr(q, "case") for q in walk(other)):

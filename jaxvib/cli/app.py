@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import json
 import re
@@ -171,13 +172,10 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
     @click.option(
         "--report", type=click.Path(path_type=Path, dir_okay=False), help="Write one web page with all of it (.html)."
     )
+    @functools.wraps(command)  # click keeps a command's own options on the function itself
     def wrapped(as_json: bool, out: Path | None, report: Path | None, **rest: Any) -> None:
         command(output=Output(as_json, out, report, rest.get("scene")), **rest)
 
-    wrapped.__name__ = command.__name__
-    wrapped.__doc__ = command.__doc__
-    # click keeps a command's own options on the function itself
-    wrapped.__click_params__ = getattr(command, "__click_params__", []) + wrapped.__click_params__  # pyright: ignore
     return wrapped
 
 
@@ -227,7 +225,7 @@ def _way_out(arguments: list[str], error: InputError) -> str:
     return " (--speed gives one)" if table == "drive" and name in ("", "kind") and "speed" in options else ""
 
 
-def _failed(wants_json: bool, code: int, error: dict[str, Any]) -> int:
+def _failed(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
     click.echo(f"jaxvib: {error['message']}", err=True)
     if wants_json:
         click.echo(json.dumps({"error": error}, indent=2))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,6 +15,7 @@ from jaxvib.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from jaxvib.results.fields import Plain
     from jaxvib.results.result import Result
 
 __all__ = ["CSV", "Output"]
@@ -85,17 +85,19 @@ class Output:
         write_csv(result, axis, path)
         self.files.append(str(path))
 
-    def done(self, document: dict[str, Any], text: Callable[[], str], name: str, result: Result | None = None) -> None:
+    def done(self, document: Mapping[str, object], text: Callable[[], str], name: str, result: Result | None = None) -> None:
         """Prints the document or the text, and writes the document to NAME.json in the folder and the report.
 
         The units of the document's numbers in the report are those of the `result` that they are from."""
         path = self.file(f"{name}.json")
-        document = _plain(document)
-        body = json.dumps(document, indent=2, allow_nan=False)
+        from jaxvib.results.fields import plain  # slow to import, and --help needs none of it
+
+        told = {key: plain(value) for key, value in document.items()}
+        body = json.dumps(told, indent=2, allow_nan=False)
         if path is not None:
             path.write_text(body + "\n", encoding="utf-8")
         if self.report is not None:
-            self._reported(self.report, document, text, name, result)
+            self._reported(self.report, told, text, name, result)
         if self.as_json:
             click.echo(body)
             return
@@ -104,7 +106,7 @@ class Output:
             click.echo(f"wrote {written}")
 
     def _reported(
-        self, path: Path, document: dict[str, Any], text: Callable[[], str], name: str, result: Result | None
+        self, path: Path, document: dict[str, Plain], text: Callable[[], str], name: str, result: Result | None
     ) -> None:
         from jaxvib.machine.files import load_scene
         from jaxvib.machine.scene import Scene
@@ -127,14 +129,3 @@ class Output:
         )
         path.write_text(found.html(), encoding="utf-8")
         self.files.append(str(path))
-
-
-def _plain(value: Any) -> Any:
-    """The value for JSON; a number that is not finite becomes null, which a reader cannot mistake for one."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

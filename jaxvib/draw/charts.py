@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +15,7 @@ from jaxvib.draw.style import (
     OPERATING,
     UNSTABLE,
     Drawn,
+    Look,
     Onto,
     SpeedUnit,
     legend_above,
@@ -224,7 +224,7 @@ def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", a
     # What nearly vanishes leaves the axis: all others would be lines.
     low, high = max(min([0.7, *ratios[drawn]]), 1e-4), min(max([1.4, *ratios[drawn]]), 1e4)
     for place, ratio, there, (_, before, after) in zip(places, ratios, drawn, rows, strict=True):
-        look: Any = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
+        look: Look = {"color": COLORS[0]} if ratio <= 1.0 else {"color": COLORS[3], "hatch": "///", "edgecolor": "white"}
         if there:
             axis.barh(place, ratio - 1.0, left=1.0, height=0.6, lw=0.0, **look)
         share = f"   ({ratio:.3g} x)" if there else ""

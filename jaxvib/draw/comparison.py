@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -68,7 +68,7 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     """
     names = list(dict.fromkeys(name for panel in panels_by_title.values() for name in panel.lines))
     # Colours repeat after 8 and marks after 7, so that no two lines look alike.
-    looks = {name: dict(color=COLORS[k % len(COLORS)], marker="os^Dv*P"[k % 7]) for k, name in enumerate(names)}
+    looks = {name: (COLORS[k % len(COLORS)], "os^Dv*P"[k % 7]) for k, name in enumerate(names)}
     columns = len(panels_by_title) if ax is not None else min(2, len(panels_by_title))
     figure, cells = panels(-(-len(panels_by_title) // columns), columns, size=(6.6, 4.4), ax=ax)
     for spare in cells[len(panels_by_title) :]:
@@ -76,12 +76,15 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     for axes, (title, panel) in zip(cells, panels_by_title.items(), strict=False):
         _cost_panel(axes, panel, wanted, looks)
         axes.set_title(title)
-    handles: list[Any] = [Line2D([], [], ms=5, **look) for look in looks.values()]  # pyright: ignore[reportArgumentType]
-    handles += [Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"), Patch(color=_FLOOR)]
+    handles = [
+        *(Line2D([], [], ms=5, color=color, marker=marker) for color, marker in looks.values()),
+        Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"),
+        Patch(color=_FLOOR),
+    ]
     told = ["cheapest within " + ", ".join(f"{error:.0e}" for error in wanted), "reference's own error"]
     if ax is None:
-        place: Any = {"loc": "outside upper left", "ncols": 3 * columns, "frameon": False, "fontsize": "small"}
-        figure.legend(handles, [*names, *told], **place)
+        labels, place = [*names, *told], "outside upper left"
+        figure.legend(handles, labels, loc=place, ncols=3 * columns, frameon=False, fontsize="small")
     else:
         legend_above(cells[0], 2, handles=handles, labels=[*names, *told])
     return figure if ax is None else ax
@@ -90,10 +93,11 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
 _FLOOR = "#e6e6e6"
 
 
-def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Mapping[str, Any]) -> None:
+def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Mapping[str, tuple[str, str]]) -> None:
     for name, points in panel.lines.items():
         seconds, error = points[np.isfinite(points[:, 1])].T
-        axes.loglog(seconds, np.maximum(error, 1e-16), ms=5, **looks[name])
+        color, marker = looks[name]
+        axes.loglog(seconds, np.maximum(error, 1e-16), ms=5, color=color, marker=marker)
     floor = min(max(panel.floor, 1e-17), 1.0)
     axes.axhspan(1e-17, floor, color=_FLOOR, zorder=0.4)
     if panel.best.size:
@@ -265,14 +269,11 @@ def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Draw
     axes.set_yticks(range(len(cases)), cases)
     axes.set_ylim(len(cases) - 0.4, -0.6)
     axes.set_xlabel("error, relative")
-    looks: list[Any] = [
-        dict(marker="o"),
-        dict(marker="o", mfc="none"),
-        dict(marker="|", ms=8),
-        dict(marker="s"),
-        dict(marker="x"),
-    ]
-    handles = [Line2D([], [], ls="", color="black", **look) for look in looks]
+
+    def shown(marker: str, ms: float = 6.0, mfc: str = "black") -> Line2D:
+        return Line2D([], [], ls="", color="black", marker=marker, ms=ms, mfc=mfc)
+
+    handles = [shown("o"), shown("o", mfc="none"), shown("|", ms=8), shown("s"), shown("x")]
     handles += [Patch(color=COLORS[k % len(COLORS)]) for k in range(len(dtypes))]
     names = ["true", "claimed", "bound", "named status", "FAILED", *dtypes]
     legend_above(axes, 4, handles=handles, labels=names)

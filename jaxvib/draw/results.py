@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +13,7 @@ from jaxvib.draw.style import (
     MARKERS,
     STROKES,
     Drawn,
+    Look,
     Onto,
     SpeedUnit,
     legend_above,
@@ -96,7 +96,7 @@ def shapes_chart(
     many, width = len(names), 0.8 / len(names)
     for k, name in enumerate(names):
         places = np.arange(len(frequency)) + (k - 0.5 * (many - 1)) * width
-        look: Any = {
+        look: Look = {
             "color": COLORS[k % len(COLORS)],
             "hatch": ("", "///", "...", "xxx")[k % 4],
             "edgecolor": "white",

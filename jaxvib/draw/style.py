@@ -23,6 +23,7 @@ __all__ = [
     "STROKES",
     "UNSTABLE",
     "Drawn",
+    "Look",
     "Onto",
     "SpeedUnit",
     "legend_above",
@@ -45,6 +46,9 @@ Onto: TypeAlias = "Axes | Sequence[Axes] | None"
 Drawn: TypeAlias = "Figure | Any"
 """What a plot gives back: its figure, or, where axes were given, what was given: who calls knows which (`Any`)."""
 
+Look: TypeAlias = dict[str, Any]
+"""How something is drawn: matplotlib's options, each of its own type."""
+
 COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
 """Colours that readers with any colour vision tell apart, and of unlike greys where they follow each other; further series
 start over."""
@@ -59,7 +63,7 @@ UNSTABLE = (0, (3, 2))
 GUIDE = "#8a8a8a"
 """The colour of lines that are no data: resonances, limits, the speed of the rotor."""
 
-OPERATING: Any = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
+OPERATING: Look = {"color": "black", "lw": 1.0, "ls": (0, (8, 2, 2, 2)), "zorder": 1.5}
 """The line of the speed at which the machine runs."""
 
 _STYLE: Any = {

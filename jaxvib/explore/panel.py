@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from jaxvib.draw.machine.parts import Part, Text, box, circle
-from jaxvib.draw.style import GUIDE, log_places
+from jaxvib.draw.style import GUIDE, Look, log_places
 
 __all__ = ["APART", "FIRST", "LAST", "OPERATING", "ROTOR", "TALL", "WIDE", "Panel", "dot", "legend"]
 
@@ -59,7 +58,7 @@ class Panel:
         across, up = self.place(x, y)
         return float(across), float(up)
 
-    def line(self, x: ArrayLike, y: ArrayLike, look: dict[str, Any]) -> Part:
+    def line(self, x: ArrayLike, y: ArrayLike, look: Look) -> Part:
         """A line through points of which those below or above the chart are left out."""
         points = np.stack(self.place(x, y), axis=1)
         inside = (points[:, 1] >= 0.0) & (points[:, 1] <= TALL)
@@ -104,13 +103,13 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return points[keep]
 
 
-def dot(x: float, y: float, look: dict[str, Any], square: bool = False) -> Part:
+def dot(x: float, y: float, look: Look, square: bool = False) -> Part:
     """A round dot, or a square one, of that look."""
     outline = box(x - 0.045, x + 0.045, y - 0.045, y + 0.045) if square else circle((x, y), 0.05, 13)
     return Part(outline, look, filled=True)
 
 
-def legend(looks: Mapping[str, dict[str, Any]]) -> tuple[list[Part], list[Text]]:
+def legend(looks: Mapping[str, Look]) -> tuple[list[Part], list[Text]]:
     """Samples of lines and of dots (those that have a filling) with their names above the charts, two in a column."""
     parts, texts = [], []
     for k, (name, look) in enumerate(looks.items()):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import weakref
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +51,7 @@ def checked(scene: Scene) -> Scene:
     return scene
 
 
-def _number(name: str, leaf: Any) -> Array:
+def _number(name: str, leaf: object) -> Array:
     """A leaf as a floating-point array. **Raises** `InputError` for a text, and for what is known and not finite."""
     if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):
         try:

@@ -20,6 +20,7 @@ __all__ = [
     "Pressing",
     "Twisting",
     "balls",
+    "own_radius",
     "pendulums",
     "require_side_by_side",
     "rollers",
@@ -117,6 +118,15 @@ class Loads(eqx.Module):
     def own_frequency(self, speed: Array) -> Array | None:
         """The frequency of the loads' own motions that a step must resolve beside the rotor's `speed`, rad/s; or None."""
         return None
+
+
+def own_radius(loads: Loads, field: str = "loads.own_radius") -> Array:
+    """r m of loads that have a size. **Raises** `InputError`, of `field`, for others."""
+    own = getattr(loads, "own_radius", None)
+    if own is None:
+        advice = "give balls or rollers their own_radius"
+        raise InputError(field, f"needs loads that roll, with an own_radius; {loads.kind!r} have none here: {advice}")
+    return own
 
 
 class CircularLoads(Loads):

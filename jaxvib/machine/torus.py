@@ -13,7 +13,7 @@ from jaxvib.machine.loads import Loads, Pressing, Twisting, require_side_by_side
 from jaxvib.units import Number, number, numbers, traced
 from jaxvib.units import count as whole
 
-__all__ = ["TEMPLATE", "TorusBalls", "torus_balls"]
+__all__ = ["TEMPLATE", "TorusBalls", "in_torus", "torus_balls"]
 
 _ROLLING = 0.4
 """kappa - 1 of a solid ball: its moment of inertia is 2/5 m r^2."""
@@ -112,6 +112,14 @@ class TorusBalls(Loads):
     def own_frequency(self, speed: Array) -> Array:
         """w sqrt((R + rho) / (kappa rho)): of small motions about the outer equator of balls that turn with the rotor."""
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
+
+
+def in_torus(loads: Loads, asking: str) -> TorusBalls:
+    """The loads, where they are balls in a torus. **Raises** `InputError`, which says who is `asking` for them, for others."""
+    if not isinstance(loads, TorusBalls):
+        told = f"{asking} asks for balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
+        raise InputError("loads.kind", f"is {loads.kind!r}; {told}")
+    return loads
 
 
 def torus_balls(

@@ -92,8 +92,9 @@ def html_report(
     if not isinstance(result, Result):
         raise InputError("result", f"is a {type(result).__name__}; give a result, such as that of jv.simulate")
     kind, path = type(result).__name__, Path(path)
-    if scene is None and isinstance(getattr(result, "scene", None), Scene):
-        scene = result.scene  # pyright: ignore[reportAttributeAccessIssue]
+    own = getattr(result, "scene", None)
+    if scene is None and isinstance(own, Scene):
+        scene = own
     drawn = [(kind, result.plot())] if figures is None else figures
     page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import TypeAlias, TypeGuard
 
 from jaxvib.machine.files import scene_to_toml
 from jaxvib.machine.scene import Scene
@@ -56,8 +56,8 @@ def results(document: Mapping[str, Plain], units: Units, depth: int = 0) -> str:
             single.append((name, value))
         elif isinstance(value, Mapping):
             below.append((name, results(value, units, depth + 1)))
-        elif isinstance(value, list) and value and all(isinstance(row, Mapping) for row in value):
-            below.append((name, _rows(value, units)))  # pyright: ignore[reportArgumentType]
+        elif _entries(value):
+            below.append((name, _rows(value, units)))
         elif isinstance(value, list) and value:
             below.append((name, _grid(value)))
     heads = "".join(f"<h3>{escaped(_words(name))}{_unit_of(name, units)}</h3>{body}" for name, body in below if body)
@@ -75,6 +75,10 @@ def parameters(scene: Scene) -> str:
         for each in value if isinstance(value, list) else [value]:
             parts.append((f"effect: {_words(name)}", each, units_of_fields("effects", name)))
     return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in parts)
+
+
+def _entries(value: Plain) -> TypeGuard[list[Mapping[str, Plain]]]:
+    return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
 
 
 def _words(name: str) -> str:
@@ -126,11 +130,9 @@ def _side(rows: Sequence[Mapping[str, Plain]], name: str) -> str:
 
 def _grid(values: Sequence[Plain]) -> str:
     """A long list, or one of lists."""
-    if all(isinstance(x, list) and _plain(x) for x in values):
-        body = "".join(
-            "<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>"  # pyright: ignore
-            for row in values[:_ROWS]
-        )
+    rows = [x for x in values if isinstance(x, list) and _plain(x)]
+    if len(rows) == len(values):
+        body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_ROWS])
         return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"
     numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
     if not numbers:
@@ -149,9 +151,9 @@ def _cell(value: Plain) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return escaped(f"{value:.6g}")
-    if isinstance(value, (list, tuple)) and value and isinstance(value[0], Mapping):
-        return _rows(value, {})  # pyright: ignore[reportArgumentType]
-    if isinstance(value, (list, tuple)):
+    if _entries(value):
+        return _rows(value, {})
+    if isinstance(value, list):
         return ", ".join(_cell(x) for x in value) or "none"
     if isinstance(value, Mapping):
         return ", ".join(f"{escaped(_words(k))} {_cell(v)}" for k, v in value.items())

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import xarray
     from _typeshed import DataclassInstance
 
-__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "labels_of", "part", "to_xarray"]
+__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "labels_of", "part", "plain", "to_xarray"]
 
 EACH = "*"
 """Stands for the `outer_axes` of the class that a field is in."""
@@ -95,25 +95,26 @@ def as_dict(result: eqx.Module) -> dict[str, Plain]:
     Complex numbers are pairs [real, imaginary]. Beside the fields stand the `status` and the `message`.
     """
     status = getattr(result, "status", None)
-    head = {} if status is None else {"status": _plain(status), "message": sentence(status)}
+    head = {} if status is None else {"status": plain(status), "message": sentence(status)}
     return {**head, **_plain_fields(result)}
 
 
-def _plain(value: object) -> Plain:
+def plain(value: object) -> Plain:
+    """A value as JSON holds it, see `as_dict`. **Raises** `TypeError` for one that it cannot."""
     if is_status(value):
         return status_names(value).tolist()
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _plain_fields(value)
     if is_named_tuple(value):
-        return {name: _plain(getattr(value, name)) for name in value._fields}
+        return {name: plain(getattr(value, name)) for name in value._fields}
     if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
+        return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
-        return _plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist())
     if isinstance(value, (tuple, list)):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, complex):
-        return [_plain(value.real), _plain(value.imag)]
+        return [plain(value.real), plain(value.imag)]
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if isinstance(value, float):
@@ -123,7 +124,7 @@ def _plain(value: object) -> Plain:
 
 def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
     found = {field.name: (field.metadata, getattr(value, field.name)) for field in dataclasses.fields(value)}
-    return {name: known["write"](part) if "write" in known else _plain(part) for name, (known, part) in found.items()}
+    return {name: known["write"](part) if "write" in known else plain(part) for name, (known, part) in found.items()}
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:

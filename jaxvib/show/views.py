@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import abc
-from typing import Any
 
 import numpy as np
 
 from jaxvib.draw.machine.parts import Part, Text, arrow, box, circle, damper, ground, spring
-from jaxvib.draw.style import COLORS, GUIDE
+from jaxvib.draw.style import COLORS, GUIDE, Look
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.show.layout import Tie, lanes
@@ -16,10 +15,10 @@ from jaxvib.show.wheel import Pose, Wheel, places_of, shown
 
 __all__ = ["View", "view_of"]
 
-_INK: dict[str, Any] = {"color": "#333333", "lw": 1.2, "zorder": 2.0}
-_BED: dict[str, Any] = {"color": "black", "lw": 1.4, "zorder": 1.0}
-_BODY: dict[str, Any] = {"fc": "#c9d7e8", "ec": "black", "lw": 1.3, "zorder": 2.5}
-_FORCE: dict[str, Any] = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
+_INK: Look = {"color": "#333333", "lw": 1.2, "zorder": 2.0}
+_BED: Look = {"color": "black", "lw": 1.4, "zorder": 1.0}
+_BODY: Look = {"fc": "#c9d7e8", "ec": "black", "lw": 1.3, "zorder": 2.5}
+_FORCE: Look = {"fc": COLORS[1], "ec": "none", "zorder": 5.0}
 
 
 def _tie(
@@ -219,7 +218,7 @@ class FrontView(View):
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """The mass, and the support's numbers, which hold both ways."""
         told = _said(float(np.max(self.bed_stiffness[1])), float(np.max(self.bed_damping[1])))
-        small: dict[str, Any] = {"fontsize": "small"}
+        small: Look = {"fontsize": "small"}
         mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
         found = [
             Text(0.55, -1.75, told, {**small, "va": "center"}),
@@ -291,7 +290,7 @@ class ShaftView(View):
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Mass and inertias, supports and stations with their places from the mass centre."""
-        small: dict[str, Any] = {"fontsize": "small"}
+        small: Look = {"fontsize": "small"}
         whole, turning = np.asarray(self.carrier.mass), self.carrier.gyroscopic
         inertia = f"M = {shown(float(whole[0, 0]), 'kg')}\nA = {shown(float(whole[2, 2]), 'kg m²')}"
         if turning is not None:

@@ -224,13 +224,19 @@ def _mass(model: LinearModel, loads: Weights) -> Array:
     return model.mass if loads == "fixed" else model.carrier.mass
 
 
+def _planes(carrier: Carrier) -> Array:
+    """The two directions (p, 2, nd) in which a whirl moves the port and, where the carrier has tilts, tilts it."""
+    return jnp.stack([carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt])
+
+
 def _sense_matrix(carrier: Carrier) -> Array:
     """A gyroscopic matrix (nd, nd) that tells whirls of one speed apart by their sense."""
-    rows = [carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt]
-    return sum(jnp.outer(r[0], r[1]) - jnp.outer(r[1], r[0]) for r in rows)  # pyright: ignore[reportReturnType]
+    planes = _planes(carrier)
+    turn = planes[:, 0].T @ planes[:, 1]
+    return turn - turn.T
 
 
 def _sense(carrier: Carrier, shapes: Array) -> Array:
     """Twice the area that shapes (nd, k) sweep in a turn at the port and of its tilts: positive with the rotor's sense."""
-    rows = [carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt]
-    return sum(jnp.imag((row[0] @ shapes) * jnp.conj(row[1] @ shapes)) for row in (r.astype(shapes.dtype) for r in rows))  # pyright: ignore[reportReturnType]
+    moved = _planes(carrier).astype(shapes.dtype) @ shapes
+    return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)

@@ -64,7 +64,7 @@ def on_a_cluster(
             raise InputError("scheduler", f"{problem} ({_first_line(error)}); {advice}") from error
         # Arrays that a worker unpacks before it is told to compute in double precision would lose half their digits.
         plain = dataclasses.replace(study, scene=jax.tree.map(np.asarray, study.scene))
-        precise, chunks = bool(jax.config.jax_enable_x64), iter(todo)  # pyright: ignore[reportAttributeAccessIssue]
+        precise, chunks = jnp.result_type(float) == np.float64, iter(todo)
         running, numbers = as_completed(loop=client.loop), {}
 
         def give_out() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from jaxvib.draw.style import Drawn
+    from jaxvib.draw.style import Drawn, Look
 
 __all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
 
@@ -137,7 +137,7 @@ def plot_map(
     region = tuple(steps.get(d, slice(n // 2, n // 2 + 1)) for d, n in zip(dims, opened.shape, strict=True))
     order = sorted(range(len(dims)), key=lambda k: (dims[k] in (up, across), dims[k] == across))
     shape = (ys.size, xs.size)
-    labels: dict[str, Any] = {"across": _axis_label(opened, across), "up": _axis_label(opened, up)}
+    labels: Look = {"across": _axis_label(opened, across), "up": _axis_label(opened, up)}
     labels["log"] = (_is_log(opened, across), _is_log(opened, up))
     if measure in (None, "regime", "mode") and _has_labels(opened):
         table = _labels(opened, region)

@@ -60,8 +60,14 @@ def _each(
         if plan is not None:
             state = put_start(initial_state(this, start, mode=mode, throw=False), spots, value)
             run = watched_run(this, state, plan)
-        found = [m.function(run) if isinstance(m, RunMeasure) else m.read(answers) for m in measures]  # pyright: ignore
-        return tuple(map(jnp.asarray, found)), jnp.asarray(True) if run is None else run.finite
+
+        def read(measure: Measure) -> Array:
+            if not isinstance(measure, RunMeasure):
+                return measure.read(answers)
+            assert run is not None
+            return measure.function(run)
+
+        return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
 
     return jax.lax.map(one, values, batch_size=LANES)
 

@@ -67,7 +67,7 @@ class Sweep(Result):
             import xarray
         except ImportError as error:
             raise InputError("data", "needs xarray; install it with: pip install 'jaxvib[sweep]'") from error
-        return xarray.open_zarr(self.store, chunks=None)  # pyright: ignore[reportArgumentType]
+        return xarray.open_dataset(self.store, engine="zarr")
 
     @property
     def scene(self) -> Scene:

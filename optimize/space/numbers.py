@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -38,10 +38,10 @@ class Place(NamedTuple):
 
     def leaf(self, scene: Scene) -> Array:
         """The whole array."""
-        found = scene
+        found: Any = scene
         for step in self.path:
-            found = found[step] if isinstance(step, int) else getattr(found, step)  # pyright: ignore[reportIndexIssue]
-        return found  # pyright: ignore[reportReturnType]
+            found = found[step] if isinstance(step, int) else getattr(found, step)
+        return found
 
     def read(self, scene: Scene) -> Array:
         """The numbers, (size,)."""

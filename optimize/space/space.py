@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import Literal, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -165,13 +166,17 @@ class DesignSpace(eqx.Module):
         """How many numbers are free."""
         return sum(place.size for place in self.places)
 
+    def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
+        """NumPy or jax.numpy, by whose array `like` is, and the bounds as its arrays."""
+        xp = np if isinstance(like, np.ndarray) else jnp
+        return xp, xp.asarray(self.low), xp.asarray(self.high)
+
     def numbers(self, z: Numbers) -> Numbers:
         """The free numbers (..., d), SI, of designs z (..., d) in [0, 1]; NumPy's arrays where z is one."""
-        xp = np if isinstance(z, np.ndarray) else jnp
-        low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
+        xp, low, high = self._bounds(z)
         log = np.asarray(self.logs)
         base = xp.where(log, low, 1.0)
-        return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)  # pyright: ignore
+        return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)
 
     def at(self, z: Array) -> Scene:
         """The scene of the design z (d,) in [0, 1]."""
@@ -193,13 +198,12 @@ class DesignSpace(eqx.Module):
 
     def shares(self, numbers: Numbers) -> Numbers:
         """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
-        xp = np if isinstance(numbers, np.ndarray) else jnp
-        low, high = (np.asarray(self.low), np.asarray(self.high)) if xp is np else (self.low, self.high)
+        xp, low, high = self._bounds(numbers)
         value, log, width = xp.clip(numbers, low, high), np.asarray(self.logs), high - low
         base = xp.where(log, low, 1.0)
         ratio = xp.where(log & (width > 0.0), high / base, 2.0)
         even = (value - low) / xp.where(width > 0.0, width, 1.0)
-        return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)  # pyright: ignore
+        return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)
 
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
         """The free numbers of a scene by name, in SI."""

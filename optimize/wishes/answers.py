@@ -83,7 +83,9 @@ class Answers:
         self.found: dict[Key, Array] = {}
         if modes is not None:
             self.modes = modes
-        self._kept: dict[Hashable, object] = {}
+        self._jams: dict[Key, Jam] = {}
+        self._orbits: dict[int, Orbit] = {}
+        self._runs: dict[Hashable, Run] = {}
 
     @cached_property
     def model(self) -> LinearModel:
@@ -101,11 +103,11 @@ class Answers:
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         key: Key = (self.path, ("jam", mode))
-        if key not in self._kept:
+        if key not in self._jams:
             jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.model, mode, self.known[key])
-            self._kept[key] = jam
+            self._jams[key] = jam
             self.found[key] = jam.omega
-        return self._kept[key]  # pyright: ignore[reportReturnType]
+        return self._jams[key]
 
     def folds(self, mode: int) -> tuple[Array, Array]:
         """Rotor speeds, rad/s, of the folds below and above a jam mode on the branch; where there is none, 0 or ten times the
@@ -123,8 +125,7 @@ class Answers:
 
     def orbit(self, mode: int) -> Orbit:
         """The exact motion that continues a jam mode, NaN where there is none."""
-        key = ("orbit", mode)
-        if key not in self._kept:
+        if mode not in self._orbits:
             jam = self.jam(mode)
             if self.known is None and not any(traced(leaf) for leaf in jax.tree.leaves(self.scene)):
                 orbit = jam_orbit(self.scene, mode=mode, throw=False)
@@ -134,8 +135,8 @@ class Answers:
                 orbit = jax.tree.map(
                     lambda leaf: jnp.where(away, jnp.nan, leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, orbit
                 )
-            self._kept[key] = orbit
-        return self._kept[key]  # pyright: ignore[reportReturnType]
+            self._orbits[mode] = orbit
+        return self._orbits[mode]
 
     def jam_run(self, mode: int) -> Run:
         """The full equations, integrated from a jam mode for 60 periods of the lowest natural frequency."""
@@ -144,7 +145,7 @@ class Answers:
 
     def keep_run(self, mode: int, run: Run) -> None:
         """Takes a run that has settled in a jam mode for `jam_run`."""
-        self._kept["jam", mode] = run
+        self._runs["jam", mode] = run
 
     def start_up(self, until: float, spin_up: float) -> Run:
         """The full equations from rest, the rotor brought up smoothly over the time `spin_up`, s, to the time `until`, s."""
@@ -154,11 +155,11 @@ class Answers:
         """A run; derivatives in forward mode."""
         import diffrax
 
-        if key not in self._kept:
+        if key not in self._runs:
             known = not any(traced(leaf) for leaf in jax.tree.leaves(self.scene))
             adjoint = None if known else diffrax.ForwardMode()
-            self._kept[key] = simulate(self.scene, until, estimate=False, adjoint=adjoint, throw=False, **options)
-        return self._kept[key]  # pyright: ignore[reportReturnType]
+            self._runs[key] = simulate(self.scene, until, estimate=False, adjoint=adjoint, throw=False, **options)
+        return self._runs[key]
 
     def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:
         """The scene, or scenes, of a case, and their path."""

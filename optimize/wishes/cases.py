@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 
 import jax
@@ -18,7 +18,7 @@ from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.space.numbers import Place, changed, places_of, value_of
 from optimize.wishes.answers import Answers, Key, Recorder
-from optimize.wishes.quantity import Quantity, Tier
+from optimize.wishes.quantity import Quantity
 
 __all__ = ["expected", "quantile", "under", "worst"]
 
@@ -79,21 +79,11 @@ class Sampled:
 
 @dataclass(frozen=True)
 class _OfPart(Quantity):
-    """A quantity made of one other, its `part`."""
-
-    part: Quantity | None = None
-
-    @property
-    def parts(self) -> tuple[Quantity, ...]:
-        assert self.part is not None
-        return (self.part,)
+    """A quantity made of one other."""
 
     @property
     def words(self) -> str:
         return self.name
-
-    def at_tier(self, tier: Tier) -> Quantity:
-        return replace(self, part=self.parts[0].at_tier(tier))
 
 
 @dataclass(frozen=True)
@@ -114,10 +104,6 @@ class Under(_OfPart):
         value = question(inner)
         answers.found.update(inner.found)
         return value
-
-    @property
-    def easy(self) -> Quantity:
-        return replace(self, part=self.parts[0].easy)
 
 
 @dataclass(frozen=True)
@@ -185,9 +171,8 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     if not isinstance(changes, Mapping) or not changes:
         raise InputError("changes", f"is {changes!r}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, value_of(key, value)) for key, value in changes.items())
-    return Under(
-        f"{quantity.words} ({name})", quantity.unit, mode=None, of=quantity.of, case=Changed(name, values), part=quantity
-    )
+    case = Changed(name, values)
+    return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
 
 
 def _require(quantity: object) -> None:
@@ -205,7 +190,7 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
     case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), seed)
     words = how if how != "quantile" else f"{level:.0%} quantile of"
     return Robust(
-        f"{words} {quantity.words}", quantity.unit, of=quantity.of, case=case, part=quantity, statistic=how, level=level
+        f"{words} {quantity.words}", quantity.unit, of=quantity.of, case=case, parts=(quantity,), statistic=how, level=level
     )
 
 

@@ -71,8 +71,13 @@ def _whose(of: Pair) -> str:
     return f" of platform {of}" if isinstance(of, int) else f" of platform {of[0]} against {of[1]}"
 
 
-def _pair(of: Pair) -> Pair:
-    return tuple(of) if isinstance(of, list) else of  # pyright: ignore[reportReturnType]
+def _pair(of: Pair | list[int]) -> Pair:
+    """A list, as design files give it, as a pair. **Raises** `InputError` for one that is none."""
+    if not isinstance(of, list):
+        return of
+    if len(of) != 2:
+        raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms")
+    return of[0], of[1]
 
 
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
@@ -118,15 +123,16 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     >>> (phase(mode=3) > "170 deg").words
     'phase between platforms 1 and 2, mode 3 at least 170 deg'
     """
-    of = _pair(of)  # pyright: ignore[reportAssignmentType]
-    if not isinstance(of, tuple) or len(of) != 2:
+    pair = _pair(of)
+    if not isinstance(pair, tuple) or len(pair) != 2:
         raise InputError("of", f"is {of!r}; a phase is that between two platforms, give a pair such as (1, 2)")
-    text = f"phase between platforms {of[0]} and {of[1]}"
-    return _asking("phase", "rad", _phase, mode, tier, text, of=of, settings=(of,), tiers=("leading", "exact"))
+    text = f"phase between platforms {pair[0]} and {pair[1]}"
+    return _asking("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 
 
 def _phase(answers: Answers, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
-    i, j = between(answers.scene, of)  # pyright: ignore[reportGeneralTypeIssues]
+    between(answers.scene, of)  # raises for platforms that are not there
+    i, j = of
     if tier == "leading":
         first = answers.jam(mode).displacement
     else:

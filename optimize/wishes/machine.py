@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,8 @@ __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squ
 _GRAVITY = 9.80665
 
 
-def _asking(name: str, unit: str, function: object, text: str, *settings: object) -> Quantity:
-    return Asking(name, unit, function, tiers=("leading",), text=text, settings=settings)  # pyright: ignore[reportArgumentType]
+def _asking(name: str, unit: str, function: Callable[..., Array], text: str, *settings: object) -> Quantity:
+    return Asking(name, unit, function, tiers=("leading",), text=text, settings=settings)
 
 
 def _platforms(scene: Scene, what: str) -> Platforms:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import jax.numpy as jnp
@@ -56,6 +56,8 @@ class Quantity:
     function: Callable[..., Array] | None = None
     mode: int | None = None
     of: Pair = None
+    parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
+    """The quantities that it is made of."""
 
     def __post_init__(self) -> None:
         if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
@@ -84,11 +86,6 @@ class Quantity:
         return self.name.replace("_", " ")
 
     @property
-    def parts(self) -> tuple[Quantity, ...]:
-        """The quantities that it is made of."""
-        return ()
-
-    @property
     def forward_only(self) -> bool:
         """Whether derivatives are had in forward mode only."""
         return any(part.forward_only for part in self.parts)
@@ -97,13 +94,13 @@ class Quantity:
         """The same quantity computed in another way, where it can be. **Raises** `InputError` for a tier that there is not."""
         if tier not in TIERS:
             raise InputError("tier", f"is {tier!r}; it must be one of {', '.join(TIERS)}")
-        return self
+        return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts)) if self.parts else self
 
     @property
     def easy(self) -> Quantity:
         """What is searched first in its place, since it takes less time and its best machines are near: to leading order,
         without tolerances."""
-        return self
+        return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
 
     def named(self, name: str) -> Quantity:
         """The same quantity under another name."""
@@ -204,7 +201,6 @@ class Combined(Quantity):
     """Arithmetic of quantities."""
 
     operation: str = "+"
-    parts: tuple[Quantity, ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
     constant: float = 0.0
 
     def read(self, answers: Answers) -> Array:
@@ -246,14 +242,6 @@ class Combined(Quantity):
                     many = numbers * by if self.operation == "*" else numbers / by
                     return jnp.where(by > 0.0, many, sign * self.read(answers))
         return super().pieces(answers, sign)
-
-    def at_tier(self, tier: Tier) -> Quantity:
-        super().at_tier(tier)
-        return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts))
-
-    @property
-    def easy(self) -> Quantity:
-        return replace(self, parts=tuple(part.easy for part in self.parts))
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,16 @@ def audit(
     from jaxvib.units import number
 
     share = float(number(accuracy.replace("%", "percent") if accuracy.endswith("%") else accuracy, "", "--accuracy"))
-    possible = None if put_in else ()
-    loaded = loaded_scene(scene, without)
-    asked = dict(mode=mode, until=until, start=start, possible=possible, tiers=tiers, repeats=repeats)
-    found = jv.audit(loaded, accuracy=share, **asked)  # pyright: ignore[reportArgumentType]
+    found = jv.audit(
+        loaded_scene(scene, without),
+        accuracy=share,
+        mode=mode,
+        until=until,
+        start=start,
+        possible=None if put_in else (),
+        tiers=tiers,
+        repeats=repeats,
+    )
     if found.effects:
         output.picture("audit.png", found.plot)
     output.done(found.as_dict(), lambda: audit_text(found), "audit", found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -55,7 +55,7 @@ def cost(
     output.done(cost_document(found), lambda: cost_table(found), "cost", found)
 
 
-def cost_document(cost: Cost) -> dict[str, Any]:
+def cost_document(cost: Cost) -> dict[str, object]:
     """All of a `Cost` as JSON has it."""
     from jaxvib.study.accuracy.cost import WANTED
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
+
+from jaxvib.draw.style import Look
 
 __all__ = ["Part", "Text", "arrow", "box", "circle", "damper", "ground", "put", "spring"]
 
@@ -20,7 +22,7 @@ class Part(NamedTuple):
     point of the rotor's `axis`, where it turns with the rotor."""
 
     points: np.ndarray
-    look: dict[str, Any]
+    look: Look
     filled: bool = False
     axis: Point | None = None
 
@@ -31,7 +33,7 @@ class Text(NamedTuple):
     x: float
     y: float
     text: str
-    look: dict[str, Any]
+    look: Look
 
 
 def _along(start: Point, end: Point, forward: np.ndarray, side: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
-from jaxvib.machine.loads import CircularLoads, Loads
+from jaxvib.machine.loads import CircularLoads, Loads, own_radius
 from jaxvib.units import Number, number, traced
 
 __all__ = ["LoadContact", "damping_ratio"]
@@ -71,8 +71,7 @@ class LoadContact(Effect):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads on one track that have a size."""
-        if getattr(loads, "own_radius", None) is None:
-            raise InputError("effects.load_contact", "needs loads that have a size: give balls or rollers their own_radius")
+        own_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
         if machine.structure().stations is not None:
@@ -93,7 +92,7 @@ class LoadContact(Effect):
     def _require_apart(self, loads: Loads, u: tuple[Array, ...]) -> None:
         place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
-        wide = 2.0 * np.asarray(loads.own_radius).reshape(-1, 1, 1)  # pyright: ignore[reportAttributeAccessIssue]
+        wide = 2.0 * np.asarray(own_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
         apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
         if np.min(apart) < _NEAREST:
@@ -147,8 +146,7 @@ class LoadContact(Effect):
         """mu, of the lightest loads where they differ."""
         across, up, *_ = loads.position(*loads.rest())
         arm = jnp.hypot(across[0], up[0])
-        own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
-        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own / arm) ** 2)
+        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own_radius(loads) / arm) ** 2)
 
 
 _NEAREST = 0.9
@@ -188,7 +186,7 @@ def _loss(ratio: Array) -> Array:
 def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
     """Distances surface to surface, negative where they overlap, between each load and the one so many further, for every such
     number: every pair once."""
-    own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+    own = own_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u
         ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])

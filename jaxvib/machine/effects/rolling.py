@@ -14,7 +14,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.effects.friction import sliding_sign
-from jaxvib.machine.loads import Loads
+from jaxvib.machine.loads import Loads, own_radius
 from jaxvib.units import Number, number
 
 __all__ = ["RollingFriction"]
@@ -71,9 +71,7 @@ class RollingFriction(Effect):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads that roll and press on a track."""
-        if getattr(loads, "own_radius", None) is None:
-            problem = f"needs loads that roll, with an own_radius; {loads.kind!r} have none here"
-            raise InputError("effects.rolling_friction", problem)
+        own_radius(loads, "effects.rolling_friction")
 
     def friction(
         self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
@@ -82,7 +80,7 @@ class RollingFriction(Effect):
         pressing = loads.pressing(u, rate, g)
         assert pressing is not None
         slip = (rate[0] - speed, *rate[1:])
-        scale = self.coefficient / loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+        scale = self.coefficient / own_radius(loads)
         if self.direction == "each":
             levers = [self._lever(loads, u, i, x) for i, x in enumerate(slip)]
         else:

@@ -12,7 +12,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, SlipLimit, Typical
-from jaxvib.machine.loads import Loads
+from jaxvib.machine.loads import Loads, own_radius
 from jaxvib.units import Number, number
 
 __all__ = ["FreeSpin", "Sliding"]
@@ -121,6 +121,4 @@ class Sliding(Effect):
 
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads that roll."""
-        if getattr(loads, "own_radius", None) is None:
-            problem = f"needs loads that roll, with an own_radius; {loads.kind!r} have none here"
-            raise InputError("effects.sliding", problem)
+        own_radius(loads, "effects.sliding")

@@ -51,8 +51,11 @@ class _Tolerance(WrappedController):
     controller: diffrax.AbstractStepSizeController
     blocks: tuple[int, ...] = eqx.field(static=True)
 
+    def __init__(self, controller: diffrax.AbstractStepSizeController, blocks: tuple[int, ...]):
+        self.controller, self.blocks = controller, blocks
+
     def wrap(self, direction: IntScalarLike) -> _Tolerance:
-        return _Tolerance(controller=self.controller.wrap(direction), blocks=self.blocks)  # pyright: ignore[reportCallIssue]
+        return _Tolerance(self.controller.wrap(direction), self.blocks)
 
     def init(
         self,
@@ -232,7 +235,7 @@ def _run(
         y0=units.pack(begin),
         args=args,
         saveat=diffrax.SaveAt(subs=saves),
-        controller=_Tolerance(controller=controller, blocks=(2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),  # pyright: ignore[reportCallIssue]
+        controller=_Tolerance(controller, (2 * nd, 2 * nd, scene.loads.count, scene.loads.count)),
         adjoint=adjoint,
         max_steps=max_steps,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -28,18 +29,21 @@ _GRADIENT_TOLERANCE = 1e-8
 _MOST_NOTED = 2**17
 """Steps that a run may take whose derivatives are asked for: the end of each is noted."""
 
+_supports = operator.attrgetter("machine.stiffness")
+"""The supports' stiffnesses of a scene."""
+
 _Way: TypeAlias = tuple[str, str, str, Callable[[Array], Array | np.ndarray]]
 """Tier, method and setting in words, and the gradient at stiffnesses."""
 
 
 def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: int) -> Cost:
     """The gradient of a jam's largest amplitude by the supports' stiffnesses, in every way there is; see `work_precision`."""
-    mode, shape = jam.mode, scene.machine.stiffness.shape  # pyright: ignore[reportAttributeAccessIssue]
-    stiffness = jnp.ravel(scene.machine.stiffness)  # pyright: ignore[reportAttributeAccessIssue]
+    mode, supports = jam.mode, _supports(scene)
+    stiffness = jnp.ravel(supports)
     few, more, most = (collocation_points(scene, points) for points in (16, 24, 32))
 
     def at(k: Array) -> Scene:
-        return eqx.tree_at(lambda s: s.machine.stiffness, scene, k.reshape(shape))
+        return eqx.tree_at(_supports, scene, k.reshape(supports.shape))
 
     def exact(k: Array, points: int = few) -> Array:
         return jnp.max(jam_orbit(at(k), mode=mode, points=points).amplitude)
@@ -75,8 +79,17 @@ def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: flo
     max_steps = min(enough_steps(scene, jnp.asarray(until)), _MOST_NOTED)
 
     def full(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
-        asked = dict(save="window", stepsize_controller=Tolerance(_GRADIENT_TOLERANCE), max_steps=max_steps, throw=False)
-        run = simulate(at(k), until, start="jam", mode=jam.mode, adjoint=adjoint, **asked)  # pyright: ignore[reportArgumentType]
+        run = simulate(
+            at(k),
+            until,
+            start="jam",
+            mode=jam.mode,
+            save="window",
+            stepsize_controller=Tolerance(_GRADIENT_TOLERANCE),
+            adjoint=adjoint,
+            max_steps=max_steps,
+            throw=False,
+        )
         return jnp.max(run.amplitude)
 
     value = eqx.filter_jit(full)

@@ -232,8 +232,17 @@ def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Call
         solver = SOLVERS[name]()
 
         def run(tolerance: float) -> Run:
-            asked = dict(solver=solver, stepsize_controller=Tolerance(tolerance), max_steps=steps, estimate=False, throw=False)
-            return simulate(scene, ends[tolerance], start=start, save="window", **asked)  # pyright: ignore[reportArgumentType]
+            return simulate(
+                scene,
+                ends[tolerance],
+                start=start,
+                save="window",
+                solver=solver,
+                stepsize_controller=Tolerance(tolerance),
+                max_steps=steps,
+                estimate=False,
+                throw=False,
+            )
 
         return [
             row_of("full", name, f"{tolerance:.0e}", lambda t=tolerance: run(t), error, ask.repeats, dtype)

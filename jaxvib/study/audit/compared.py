@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from typing import NamedTuple
@@ -10,10 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import StepControl, integrate
+from jaxvib.motion.run import Run
 from jaxvib.motion.start import initial_state
 from jaxvib.runtime.cache import compiled_anew
 from jaxvib.runtime.operations import operations
@@ -99,11 +102,16 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         start = initial_state(scene)  # there is no such jam: a run takes its time all the same
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
     control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MOST_STEPS, jnp.int32))
-    asked = (scene, end, start, None, control, None, 0, jnp.asarray(20.0, end.dtype), _MOST_STEPS, None)
-    anew = eqx.filter_jit(lambda *given: integrate.__wrapped__(*given))  # pyright: ignore[reportFunctionMemberAccess]
+    asked = (scene, end, start, control, jnp.asarray(20.0, end.dtype))
+
+    @jax.jit
+    def anew(scene: Scene, end: Array, start: State, control: StepControl, turns: Array) -> Run:
+        run = inspect.unwrap(integrate)(scene, end, start, None, control, None, 0, turns, _MOST_STEPS, None)
+        return eqx.filter(run, eqx.is_array)
+
     with compiled_anew():
         begun = time.process_time()  # which others that compute beside do not change
-        program = anew.lower(*asked).compile()  # pyright: ignore[reportFunctionMemberAccess]
+        program = anew.lower(*asked).compile()
         compiling = time.process_time() - begun
     _, seconds, _ = timed(lambda: program(*asked).omega, repeats)
     return seconds, compiling

@@ -103,5 +103,7 @@ def _made(build: Callable[..., T]) -> T:
 
 
 def _rotor(stations: Numbers) -> Machine:
-    sized = {"mass": 1.0, "transverse_inertia": 1.0, "polar_inertia": 1.0, "stiffness": (1.0, 1.0), "damping": (1.0, 1.0)}
-    return rotor(**sized, position=(0.5, -0.5), stations=stations)  # pyright: ignore[reportArgumentType]
+    two, ends = (1.0, 1.0), (0.5, -0.5)
+    return rotor(
+        mass=1.0, transverse_inertia=1.0, polar_inertia=1.0, stiffness=two, damping=two, position=ends, stations=stations
+    )

@@ -132,8 +132,8 @@ class RunQuestion(NamedTuple):
 
     def full(self, scene: Scene) -> Values:
         """By the full equations."""
-        asked = dict(save="window", turns=_WINDOW, estimate=False, throw=False)
-        run = simulate(scene, self.until, start=self.state(scene), **asked)  # pyright: ignore[reportArgumentType]
+        start = self.state(scene)
+        run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW, estimate=False, throw=False)
         return _read(scene, run, math.nan)
 
     @classmethod

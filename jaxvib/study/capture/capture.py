@@ -16,6 +16,7 @@ from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.integrate import added_rate
 from jaxvib.motion.run import Run
@@ -133,15 +134,15 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     **Arguments**: `speed` psi'/w, -1 for loads at rest in space; `shift` rad, one number or (count,), by which the loads lie
     further along the ring. They lie 2 atan(r/R) apart, as the paper has it.
 
-    **Returns** `State`.
+    **Returns** `State`. **Raises** `InputError` for loads that are none of a torus.
 
     >>> from jaxvib.study.capture.published_torus import published_torus
     >>> state = thrown_state(published_torus(2.5), -0.5)
     >>> [round(float(x), 4) for x in (state.angle[0][1], state.rate[0][0])]
     [0.1248, 70.0]
     """
-    loads = scene.loads
-    beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
+    loads = in_torus(scene.loads, "thrown_state")
+    beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
     turn = scene.drive.speed * (1.0 + jnp.asarray(speed))
@@ -192,9 +193,7 @@ def capture(
     Source: Strautmanis et al. 2018, section 3, where each speed has one start.
     """
     scene = checked(scene)
-    if len(scene.loads.rest()) != 2 or getattr(scene.loads, "own_radius", None) is None:
-        told = "capture asks for balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
-        raise InputError("loads.kind", f"is {scene.loads.kind!r}; {told}")
+    in_torus(scene.loads, "capture")
     if not scene.drive.constant:
         raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
     if resolution is not None and not 0.0 < resolution < 1.0:

@@ -16,7 +16,7 @@ from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.rotor import PlanarRotor, planar_rotor
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.torus import TorusBalls, torus_balls
+from jaxvib.machine.torus import TorusBalls, in_torus, torus_balls
 from jaxvib.units import Number, number
 
 __all__ = [
@@ -212,7 +212,7 @@ def printed_torus(scene: Scene) -> PrintedTorus:
     """
     gravity, imbalance, rolling = scene.effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
-    machine, loads = cast(PlanarRotor, scene.machine), cast(TorusBalls, scene.loads)
+    machine, loads = cast(PlanarRotor, scene.machine), in_torus(scene.loads, "the paper")
     one = jnp.ones_like(loads.gap)
     return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.gap, one)
 

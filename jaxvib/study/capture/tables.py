@@ -18,6 +18,7 @@ from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
@@ -66,7 +67,8 @@ def _alone(run: _Runs) -> tuple[Scene, State]:
 def _touching(run: _Runs) -> tuple[Scene, State]:
     scene, state = _alone(run)
     # At the paper's angle the balls would overlap by 0.2 % of their size.
-    ratio = scene.loads.own_radius / scene.loads.radius  # pyright: ignore[reportAttributeAccessIssue]
+    loads = in_torus(scene.loads, "the table")
+    ratio = loads.own_radius / loads.radius
     apart = 2.0 * (jnp.arcsin(ratio) - jnp.arctan(ratio))
     state = eqx.tree_at(lambda s: s.angle[0], state, state.angle[0] + jnp.asarray([0.0, 1.0]) * apart)
     return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, CONTACT)), state

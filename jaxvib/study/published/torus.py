@@ -15,8 +15,9 @@ from jaxvib.equations.dynamics import Dynamics, State, vector_field
 from jaxvib.equations.forces import normal_force
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.loads import balls
+from jaxvib.machine.loads import balls, own_radius
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.torus import in_torus
 from jaxvib.study.capture.published_torus import (
     TABLES,
     PrintedTorus,
@@ -86,7 +87,8 @@ def _speeds(tables: TorusTables) -> list[PublishedRow]:
 
 def _formulas() -> list[PublishedRow]:
     scene = published_torus(2.5, width=1e-3)  # a sign of sliding that is sharp
-    own, gap, speed = (float(x) for x in (scene.loads.own_radius, scene.loads.gap, scene.drive.speed))  # pyright: ignore
+    loads = in_torus(scene.loads, _PAPER)
+    own, gap, speed = float(loads.own_radius), float(loads.gap), float(scene.drive.speed)
     pair = balls(count=2, mass=0.05, radius=_RADIUS, drag=0.0, own_radius=own).offsets()
     side_by_side, apart = 2.0 * math.asin(own / _RADIUS), 2.0 * math.atan(own / _RADIUS)
     touch = (
@@ -157,14 +159,14 @@ def _lever(scene: Scene, state: State) -> PublishedRow:
     """What rolling friction takes from the climb, per normal force of each model: 1/(kappa rho) but for the "
     "rotor's answer."""
     friction = next(e for e in scene.effects if isinstance(e, RollingFriction))
-    ratio = float(friction.coefficient) / float(scene.loads.own_radius)  # pyright: ignore[reportAttributeAccessIssue]
+    ratio = float(friction.coefficient) / float(own_radius(scene.loads))
 
     def climb(model: PrintedTorus) -> float:
         smooth = eqx.tree_at(lambda p: p.friction, model, jnp.zeros_like(model.friction))
         return float(_up(model, state) - _up(smooth, state)) / (ratio * float(_printed_force(model, state)[0]))
 
     own = float(_up(vector_field(scene), state) - _up(vector_field(_left_out(scene, RollingFriction)), state))
-    mass = float(scene.loads.mass)  # pyright: ignore[reportAttributeAccessIssue]
+    mass = float(scene.loads.mass)
     derived = own * mass / (ratio * float(normal_force(scene, 0.0, state)[0]))
     note = (
         "(k/r) N acts at the ball's distance from the tube's centre, the gap R1 - r: divided by the inertia 7/5 "
@@ -196,7 +198,7 @@ def _pressing(scene: Scene, gap: float, speed: float) -> PublishedRow:
     angles = (jnp.asarray([0.4, 2.1]), jnp.asarray([0.3, 0.8]))
     state = State(jnp.asarray([2e-3, -1e-3]), jnp.zeros(2), angles, (jnp.full(2, speed), jnp.zeros(2)))
     model = printed_torus(scene)
-    mass = float(scene.loads.mass)  # pyright: ignore[reportAttributeAccessIssue]
+    mass = float(scene.loads.mass)
     printed = mass * float(_printed_force(model, state)[0])
     computed = float(normal_force(scene, 0.0, state)[0])
     ax, ay = np.asarray(vector_field(scene)(jnp.asarray(0.0), state).velocity)

@@ -34,10 +34,20 @@ __all__ = [
 ]
 
 
-def published(speed: float = 3.0, **more: object) -> Scene:
+def published(
+    speed: float = 3.0,
+    *,
+    damping: tuple[float, float] = (0.01, 0.01),
+    link_natural: float = 2 / 3,
+    link_damping: float = 0.01,
+    eps: float = 1e-3,
+    beta: float = 1.0,
+    count: int = 1,
+) -> Scene:
     """The machine of the antiphase paper, equation (40), one load; any of its numbers may be another."""
-    numbers = dict(natural=(1 / 3, 1 / 3), damping=(0.01, 0.01), link_natural=2 / 3, link_damping=0.01, rho=1.0)
-    return Dimensionless("antiphase", **{**numbers, "eps": 1e-3, "beta": 1.0, "speed": speed, **more}).scene()  # pyright: ignore
+    link, scale = dict(link_natural=link_natural, link_damping=link_damping), dict(eps=eps, beta=beta, speed=speed)
+    form = Dimensionless("antiphase", natural=(1 / 3, 1 / 3), damping=damping, rho=1.0, count=count, **link, **scale)
+    return form.scene()
 
 
 def mode_speeds(scene: Scene) -> Answer:

@@ -196,8 +196,16 @@ def _meaningless(scene: Scene) -> Answer:
     start = state_of(scene, np.array([2.5, 0.0, 0.0, 1.0]))
 
     def last(now: Scene) -> jax.Array:
-        asked = dict(start=start, save="window", max_steps=2**15, estimate=False, throw=False)
-        run = simulate(now, 200.0 * np.pi, adjoint=diffrax.ForwardMode(), **asked)  # pyright: ignore[reportArgumentType]
+        run = simulate(
+            now,
+            200.0 * np.pi,
+            start=start,
+            save="window",
+            estimate=False,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=2**15,
+            throw=False,
+        )
         return run.window.state.displacement[-1, 0]
 
     found = check_gradients(scene, last, free=("machine.damping",), routes=("forward",))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -55,17 +55,21 @@ def natural_sizes(p: Plain) -> np.ndarray:
     return np.array([length] * nd + [length * speed] * nd + [1.0] * n + [speed] * n + motor)
 
 
-class Event(NamedTuple):
+class Event(NamedTuple, Generic[Mode]):
     """What ends a stretch of motion: `at`(t, y) crosses 0 in the `direction` (1 up, -1 down); and the mode `then`."""
 
     at: Callable[[float, np.ndarray], float]
     direction: int
-    then: Callable[[float, np.ndarray], object]
+    then: Callable[[float, np.ndarray], Mode]
+    terminal = True  # to SciPy, which calls it
+
+    def __call__(self, t: float, y: np.ndarray) -> float:
+        return self.at(t, y)
 
 
 def by_events(
     field: Callable[[float, np.ndarray, Mode], np.ndarray],
-    events: Callable[[Mode], Sequence[Event]],
+    events: Callable[[Mode], Sequence[Event[Mode]]],
     mode: Mode,
     y: np.ndarray,
     until: float,
@@ -78,14 +82,6 @@ def by_events(
     begun, changes, largest = 0.0, 0, np.zeros(2)
     while begun < until:
         told = list(events(mode))
-
-        def guard(event: Event) -> Callable[[float, np.ndarray], float]:
-            def at(t: float, x: np.ndarray) -> float:
-                return event.at(t, x)
-
-            at.terminal, at.direction = True, event.direction  # pyright: ignore[reportFunctionMemberAccess]
-            return at
-
         found = solve_ivp(
             lambda t, x: field(t, x, mode),  # noqa: B023
             (begun, until),
@@ -93,7 +89,7 @@ def by_events(
             method="DOP853",
             rtol=rtol,
             atol=1e-2 * rtol * sizes,
-            events=[guard(event) for event in told],
+            events=told,
         )
         if found.status == -1 or changes > _MOST_CHANGES:
             raise ArithmeticError(found.message if found.status == -1 else "the reference changes its mode without end")
@@ -103,7 +99,7 @@ def by_events(
         y, begun = found.y[:, -1], float(found.t[-1])
         if found.status == 1:
             which = next(k for k, hits in enumerate(found.t_events) if hits.size)
-            mode = told[which].then(begun, y)  # pyright: ignore[reportAssignmentType]
+            mode = told[which].then(begun, y)
             changes += 1
     return Outcome(y, *map(float, largest)), changes
 

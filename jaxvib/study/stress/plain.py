@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import minimize_scalar, root_scalar
 
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
@@ -204,4 +204,4 @@ def light_modes(p: Plain, speed: float) -> np.ndarray:
 
 def root(function: Callable[[float], float], low: float, high: float) -> float:
     """Where a function is 0 between two points at which its signs differ, as exactly as it can be computed."""
-    return float(brentq(function, low, high, xtol=1e-300, rtol=1e-15))  # pyright: ignore[reportArgumentType]
+    return float(root_scalar(function, bracket=(low, high), method="brentq", xtol=1e-300, rtol=1e-15).root)
