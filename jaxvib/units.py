@@ -102,10 +102,7 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         except ValueError:
             pass
     if isinstance(value, (str, Quantity)):
-        wrong = InputError(
-            field,
-            f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}",
-        )
+        wrong = InputError(field, f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}")
         parts = _TEXT.fullmatch(value.strip()) if isinstance(value, str) else None
         if isinstance(value, str) and parts is None:
             raise wrong

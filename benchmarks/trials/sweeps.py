@@ -55,20 +55,14 @@ def machine() -> jv.Scene:
 
 def capture(store: pathlib.Path, size: int = 200, until: float = 1000.0, **more) -> jv.Sweep:
     """Rotor speed against the speed that the load starts with."""
-    axes = {
-        "drive.speed": {"from": 0.3, "to": 3.0, "count": size},
-        "start.rate": {"from": 0.0, "to": 2.0, "count": size},
-    }
+    axes = {"drive.speed": {"from": 0.3, "to": 3.0, "count": size}, "start.rate": {"from": 0.0, "to": 2.0, "count": size}}
     return jv.sweep(machine(), axes, READ, store, until=until, **more)
 
 
 def light(store: pathlib.Path, cases: int, **more) -> jv.Sweep:
     """Jams of light loads over sampled rotor speeds and drag, from half to twice the published one."""
     drag = float(machine().loads.drag)
-    axes = {
-        "drive.speed": {"from": 0.5, "to": 6.0},
-        "loads.drag": {"from": 0.5 * drag, "to": 2.0 * drag, "scale": "log"},
-    }
+    axes = {"drive.speed": {"from": 0.5, "to": 6.0}, "loads.drag": {"from": 0.5 * drag, "to": 2.0 * drag, "scale": "log"}}
     measure = [jam_frequency(mode=3), amplitude(mode=3, of=(1, 2))]
     return jv.sweep(machine(), axes, measure, store, samples=cases, chunk=8192, **more)
 

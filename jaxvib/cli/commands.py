@@ -24,11 +24,7 @@ _MACHINES = ("one-mass", "two-mass", "three-mass", "network", "planar-rotor", "r
 
 
 @app.command("new", context_settings={"token_normalize_func": lambda word: word.replace("_", "-").lower()})
-@click.argument(
-    "kind",
-    metavar="KIND",
-    type=click.Choice([*_MACHINES, "design", "measurement", "sweep"]),
-)
+@click.argument("kind", metavar="KIND", type=click.Choice([*_MACHINES, "design", "measurement", "sweep"]))
 @shared
 def new(kind: str, output: Output) -> None:
     """Print a commented scene file of a KIND of machine, or a file for `optimize`, `sweep` or `identify`.

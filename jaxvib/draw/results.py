@@ -79,12 +79,7 @@ def modes_chart(
 
 
 def shapes_chart(
-    frequency: np.ndarray,
-    shape: np.ndarray,
-    *,
-    names: Sequence[str],
-    unit: SpeedUnit = "rad/s",
-    ax: Axes | None = None,
+    frequency: np.ndarray, shape: np.ndarray, *, names: Sequence[str], unit: SpeedUnit = "rad/s", ax: Axes | None = None
 ) -> Drawn:
     """Mode shapes (k, nd) as bars, a group for each mode with its frequency (k,) rad/s, drawn in `unit`; `names` (nd,).
 

@@ -256,14 +256,7 @@ def require_side_by_side(count: int, radius: float, own_radius: float) -> None:
         raise InputError("loads.own_radius", f"is {own_radius:.6g} m; {problem}")
 
 
-def balls(
-    *,
-    count: int,
-    mass: Numbers,
-    radius: Number,
-    drag: Numbers,
-    own_radius: Number | None = None,
-) -> CircularLoads:
+def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_radius: Number | None = None) -> CircularLoads:
     """Balls that roll in an annular track, kappa = 7/5.
 
     **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
@@ -285,14 +278,7 @@ def balls(
     return _circular("ball", count, mass, radius, drag, None, own_radius)
 
 
-def rollers(
-    *,
-    count: int,
-    mass: Numbers,
-    radius: Number,
-    drag: Numbers,
-    own_radius: Number | None = None,
-) -> CircularLoads:
+def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_radius: Number | None = None) -> CircularLoads:
     """Cylindrical rollers that roll in an annular track, kappa = 3/2.
 
     **Arguments**: as `balls`.
@@ -308,14 +294,7 @@ def rollers(
     return _circular("roller", count, mass, radius, drag, None, own_radius)
 
 
-def pendulums(
-    *,
-    count: int,
-    mass: Numbers,
-    radius: Number,
-    drag: Numbers,
-    inertia: Numbers = 0.0,
-) -> CircularLoads:
+def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:
     """Pendulums hung on the shaft, kappa = 1 + J_C/(m R^2).
 
     **Arguments**: as `balls`, with `radius` the distance of the mass centre from the axis, and `inertia` J_C kg m^2 about

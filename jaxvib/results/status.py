@@ -12,15 +12,7 @@ import numpy as np
 from jaxvib.errors import ComputationError
 from jaxvib.runtime.compat import enumeration_names, enumeration_of, traced
 
-__all__ = [
-    "Computed",
-    "failure",
-    "is_status",
-    "member",
-    "sentence",
-    "status_name",
-    "status_names",
-]
+__all__ = ["Computed", "failure", "is_status", "member", "sentence", "status_name", "status_names"]
 
 
 Status = TypeVar("Status", bound=eqx.Enumeration)

@@ -158,10 +158,7 @@ def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray,
         np.pad(bend, ((0, 0), (0, 1), (0, 1))),
         np.concatenate([np.zeros((len(bend), d)), np.ones((len(bend), 1))], axis=1),
         (beside(held[0], 0.0), held[1]),
-        (
-            np.concatenate([beside(demands[0], 0.0), beside(slopes, -1.0)], axis=1),
-            np.concatenate([demands[1], values], axis=1),
-        ),
+        (np.concatenate([beside(demands[0], 0.0), beside(slopes, -1.0)], axis=1), np.concatenate([demands[1], values], axis=1)),
         (np.concatenate([box[0], -wide], axis=1), np.concatenate([box[1], wide], axis=1)),
         price,
     )

@@ -295,7 +295,6 @@ def _with_value(held: Held, scene: Scene) -> Held:
     value = float(held.quantity(scene))
     if not (np.isfinite(value) and value != 0.0):
         raise InputError(
-            f"hold.{held.quantity.name}",
-            f"is {value} in the scene the search begins with; give the value it shall be held at",
+            f"hold.{held.quantity.name}", f"is {value} in the scene the search begins with; give the value it shall be held at"
         )
     return Held(held.quantity, np.asarray(value))

@@ -243,11 +243,7 @@ def test_wrong_scene_files_exit_2_with_one_sentence(typed, tmp_path, change, say
         (("simulate", "machine.toml", "--until", "-1"), 2, "until is -1 s; it must be greater than 0"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam"), 2, "mode is missing"),
         (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "9"), 2, "numbered 1 to 5"),
-        (
-            ("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"),
-            1,
-            "does not exist at rotor speed",
-        ),
+        (("simulate", "machine.toml", "--until", "1s", "--start", "jam", "--mode", "1"), 1, "does not exist at rotor speed"),
         (("simulate", "machine.toml", "--until", "9s", "--max-steps", "50"), 1, "max_steps_reached"),
         (("simulate", "machine.toml", "--until", "1s", "--tolerance", "1e-30"), 2, "tolerance is 1e-30"),
         (("optimize", "machine.toml"), 2, "machine is no part of a design file: this is a scene file; `jaxvib new design`"),
@@ -294,14 +290,7 @@ def test_new_never_overwrites(typed):
 
 def test_installed_command_prints_json_alone(tmp_path):
     jv.save_scene(scene("one_mass", "rollers", speed=60.0), tmp_path / "machine.toml")
-    words = [
-        sys.executable,
-        "-c",
-        "from jaxvib.cli import main; main()",
-        "modes",
-        str(tmp_path / "machine.toml"),
-        "--json",
-    ]
+    words = [sys.executable, "-c", "from jaxvib.cli import main; main()", "modes", str(tmp_path / "machine.toml"), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["rotor_speed"] == 60.0
@@ -310,8 +299,7 @@ def test_installed_command_prints_json_alone(tmp_path):
 
 def test_import_leaves_jax_as_it_was_and_loads_no_command_line():
     code = (
-        "import sys, jax; before = dict(jax.config.values); import jaxvib, optimize; "
-        "assert dict(jax.config.values) == before; "
+        "import sys, jax; before = dict(jax.config.values); import jaxvib, optimize; assert dict(jax.config.values) == before; "
         "assert not any(m.startswith(('jaxvib.cli', 'click', 'pint')) for m in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

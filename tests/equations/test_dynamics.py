@@ -116,15 +116,7 @@ def test_three_mass_is_the_papers_equation_mended():
     n, h, nl, hl = (0.3, 0.4, 0.5), (0.01, 0.02, 0.03), (0.7, 0.6, 0.8), (0.01, 0.02, 0.04)
     rho1, rho3, eps, beta, speed = 1.3, 0.7, 0.05, 0.8, 3.0
     paper = jv.Dimensionless(
-        "criterion",
-        natural=n,
-        damping=h,
-        link_natural=nl,
-        link_damping=hl,
-        rho=(rho1, rho3),
-        eps=eps,
-        beta=beta,
-        speed=speed,
+        "criterion", natural=n, damping=h, link_natural=nl, link_damping=hl, rho=(rho1, rho3), eps=eps, beta=beta, speed=speed
     )
     rng = np.random.default_rng(2)
     v, dv, phi, dphi = rng.normal(size=3), rng.normal(size=3), rng.normal(size=1), rng.normal(size=1)
@@ -194,17 +186,7 @@ def test_time_loop_holds_no_library_call():
     s = scene("network", "pendulums", effects=(jv.Gravity(),))
     field = jv.vector_field(s)
     names = {e.primitive.name for e in jax.make_jaxpr(field)(0.0, random_state(s)).jaxpr.eqns}
-    banned = {
-        "lu",
-        "cholesky",
-        "eigh",
-        "triangular_solve",
-        "sort",
-        "scatter",
-        "scatter-add",
-        "pure_callback",
-        "dot_general",
-    }
+    banned = {"lu", "cholesky", "eigh", "triangular_solve", "sort", "scatter", "scatter-add", "pure_callback", "dot_general"}
     assert not names & banned
 
 
@@ -265,10 +247,7 @@ def test_two_directional_port_is_euler_lagrange(load):
     x = jnp.concatenate([state.displacement, state.angle[0]])
     v = jnp.concatenate([state.velocity, state.rate[0]])
     resistance = jnp.concatenate(
-        [
-            -(matrices[1] + 40.0 * matrices[3]) @ v[:3],
-            jnp.broadcast_to(s.loads.drag * r**2, (n,)) * (40.0 - v[3:]),
-        ]
+        [-(matrices[1] + 40.0 * matrices[3]) @ v[:3], jnp.broadcast_to(s.loads.drag * r**2, (n,)) * (40.0 - v[3:])]
     )
 
     @jax.jit

@@ -10,12 +10,7 @@ from jaxvib.equations.linear import linear_model
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
 ROTOR = dict(
-    mass=37.0,
-    transverse_inertia=0.479,
-    polar_inertia=0.093,
-    stiffness=(6e5, 5e5),
-    damping=400.0,
-    position=(0.165, -0.155),
+    mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=400.0, position=(0.165, -0.155)
 )
 
 

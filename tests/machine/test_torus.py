@@ -164,10 +164,7 @@ def test_small_motions_about_the_equator_have_the_frequency_that_steps_resolve()
         ),
         (
             lambda: jv.Scene(
-                scene().machine,
-                jv.balls(count=1, mass=1.0, radius=0.1, drag=0.0),
-                scene().drive,
-                (jv.Gravity(along="axis"),),
+                scene().machine, jv.balls(count=1, mass=1.0, radius=0.1, drag=0.0), scene().drive, (jv.Gravity(along="axis"),)
             ),
             "effects.gravity.along is 'axis'; it goes with loads that move along the rotor's axis",
         ),

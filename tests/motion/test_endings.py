@@ -43,10 +43,7 @@ def test_without_raising_a_missing_mode_says_no_start_and_shows_no_motion():
     s = published(eps=1e-3, speed=1.2).scene()
     with pytest.raises(jv.ComputationError, match="does not exist"):
         jv.simulate(s, 20.0, start="jam", mode=4)
-    for run in (
-        jv.simulate(s, 20.0, start="jam", mode=4, throw=False),
-        jv.envelope(s, 5.0, start="jam", mode=4, throw=False),
-    ):
+    for run in (jv.simulate(s, 20.0, start="jam", mode=4, throw=False), jv.envelope(s, 5.0, start="jam", mode=4, throw=False)):
         assert run.message == "the state to start from does not exist or is not finite"
         for leaf in jax.tree.leaves((run.window, run.trajectory, run.amplitude)):
             assert np.all(np.isnan(leaf))

@@ -140,10 +140,7 @@ def test_one_mass_amplitude_is_that_of_its_platform():
 
 def test_design_vector_and_scene_are_inverse():
     s = scene("three_mass", "pendulums")
-    space = DesignSpace(
-        s,
-        {"machine.mass": (1.0, 100.0), "loads.mass[2]": (0.1, 2.0), "drive.speed": ("600 rpm", "3000 rpm")},
-    )
+    space = DesignSpace(s, {"machine.mass": (1.0, 100.0), "loads.mass[2]": (0.1, 2.0), "drive.speed": ("600 rpm", "3000 rpm")})
     z = jnp.linspace(0.1, 0.9, space.size)
     np.testing.assert_allclose(space.where(space.at(z)), z, rtol=1e-12)
     np.testing.assert_allclose(space.at(space.where(s)).machine.mass, s.machine.mass, rtol=1e-12)
@@ -153,12 +150,7 @@ def test_design_vector_and_scene_are_inverse():
 
 def test_gradient_of_a_quantity_is_that_of_finite_differences():
     s = published(damping=0.01).scene()
-    for quantity in (
-        force_per_amplitude(mode=3),
-        foundation_force(mode=3),
-        jam_frequency(mode=3),
-        amplitude(mode=3, of=2),
-    ):
+    for quantity in (force_per_amplitude(mode=3), foundation_force(mode=3), jam_frequency(mode=3), amplitude(mode=3, of=2)):
 
         def value(k, quantity=quantity):
             return quantity(eqx.tree_at(lambda s: s.machine.stiffness, s, k))
@@ -192,10 +184,7 @@ def space_of(free, held=()):
         (lambda: hold(3.0), "must be a Quantity"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), 3.0), "must be a Quantity"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=9)), "numbered 1 to 5"),
-        (
-            lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=(1, 1))),
-            "pair of different platforms",
-        ),
+        (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=(1, 1))), "pair of different platforms"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), amplitude(mode=3, of=4)), "of 1 to 2"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), starts=0), "starts is 0"),
         (lambda: synthesize(space_of({"loads.drag": (1, 2)}), foundation_force(mode=3), rate=2.0), "rate is 2.0"),

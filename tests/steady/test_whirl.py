@@ -13,11 +13,7 @@ from jaxvib.study.maps.published_rotor import published_rotor
 
 @pytest.mark.parametrize(
     "variant, loads, forward",
-    [
-        ("printed", "none", (176.19, 278.26)),
-        ("printed", "fixed", (175.70, 273.34)),
-        ("uncoupled", "fixed", (176.51, 272.81)),
-    ],
+    [("printed", "none", (176.19, 278.26)), ("printed", "fixed", (175.70, 273.34)), ("uncoupled", "fixed", (176.51, 272.81))],
 )
 def test_critical_speeds_of_the_published_rotor(variant, loads, forward):
     """The paper prints 176.69 and 274.76, which no convention gives; these are what its data give."""

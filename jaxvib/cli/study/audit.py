@@ -26,11 +26,7 @@ if TYPE_CHECKING:
 @click.option("--put-in/--no-put-in", default=True, show_default=True, help="Put in the effects that the scene leaves out.")
 @click.option("--tiers/--no-tiers", default=True, show_default=True, help="Ask every tier.")
 @click.option(
-    "--repeats",
-    type=click.IntRange(min=0),
-    default=3,
-    show_default=True,
-    help="Timings; the fastest counts; 0: none.",
+    "--repeats", type=click.IntRange(min=0), default=3, show_default=True, help="Timings; the fastest counts; 0: none."
 )
 @click.option("--prices", "priced", is_flag=True, help="In place of SCENE: operations that effects, drives, coordinates add.")
 @WITHOUT

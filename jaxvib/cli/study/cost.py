@@ -44,12 +44,7 @@ def cost(
 ) -> None:
     """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
     found = jv.work_precision(
-        loaded_scene(scene, speed=speed),
-        quantity,
-        mode=mode,
-        until=until,
-        solvers=solvers or _SOLVERS,
-        repeats=repeats,
+        loaded_scene(scene, speed=speed), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
     )
     output.picture("cost.png", found.plot)
     output.done(cost_document(found), lambda: cost_table(found), "cost", found)

@@ -29,13 +29,7 @@ _QUIET = 10.0
 @click.option("--timeout", default="30 s", show_default=True, help="How long the scheduler and its workers have to answer.")
 @shared
 def sweep(
-    study: Path,
-    store: Path | None,
-    resume: bool,
-    workers: int | None,
-    scheduler: str | None,
-    timeout: str,
-    output: Output,
+    study: Path, store: Path | None, resume: bool, workers: int | None, scheduler: str | None, timeout: str, output: Output
 ) -> None:
     """Compute all cases of STUDY, a study file, into a store on disk; interrupted, the same command goes on where it stopped.
 

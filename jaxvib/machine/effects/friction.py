@@ -77,13 +77,7 @@ class DryFriction(Effect):
     reaction: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
-    def __init__(
-        self,
-        coefficient: Number,
-        diameter: Number,
-        reaction: Reaction = "exact",
-        width: Number = 0.01,
-    ):
+    def __init__(self, coefficient: Number, diameter: Number, reaction: Reaction = "exact", width: Number = 0.01):
         field = "effects.dry_friction"
         self.coefficient = number(coefficient, "", f"{field}.coefficient", low=0.0)
         self.diameter = number(diameter, "m", f"{field}.diameter", low=0.0)

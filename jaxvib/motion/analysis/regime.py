@@ -166,9 +166,7 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     name = RegimeName.where(steady, RegimeName.parted, RegimeName.unsettled)
     name = RegimeName.where(steady & one_speed & ~jnp.any(with_rotor), RegimeName.jammed, name)
     name = RegimeName.where(
-        steady & jnp.all(with_rotor),
-        RegimeName.where(unbalance < _BALANCED, RegimeName.balanced, RegimeName.unbalanced),
-        name,
+        steady & jnp.all(with_rotor), RegimeName.where(unbalance < _BALANCED, RegimeName.balanced, RegimeName.unbalanced), name
     )
     name = RegimeName.where(jnp.all(swings), RegimeName.swinging, name)
 

@@ -183,15 +183,7 @@ def envelope(
         known = start in ("rest", "spin_up") and mode is None
         state = None if known else initial_state(scene, start, mode=mode, throw=throw)
     run = _run(
-        scene,
-        end,
-        state,
-        solver,
-        chosen,
-        adjoint,
-        samples if save == "all" else 0,
-        turns,
-        count(max_steps, "max_steps"),
+        scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )
     if throw and not traced(run.steps):
         _raise_if_failed(run, max_steps)

@@ -28,14 +28,7 @@ from jaxvib.steady.balance.stability import BalancedStability
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = [
-    "BalanceStatus",
-    "BalancedStates",
-    "balanced_growth",
-    "balanced_intervals",
-    "balanced_stability",
-    "balanced_states",
-]
+__all__ = ["BalanceStatus", "BalancedStates", "balanced_growth", "balanced_intervals", "balanced_stability", "balanced_states"]
 
 _BATCH = 16
 """Rotor speeds whose monodromies are computed side by side."""
@@ -290,13 +283,7 @@ def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
 
 
 def balanced_intervals(
-    scene: Scene,
-    low: float,
-    high: float,
-    angles: ArrayLike | None = None,
-    *,
-    points: int = 200,
-    steps: int = 48,
+    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int = 48
 ) -> list[list[float]]:
     """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
 

@@ -212,10 +212,7 @@ def check_gradients(
     )
 
 
-_MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {
-    "forward": jax.jacfwd,
-    "reverse": jax.grad,
-}
+_MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 
 class _Number(NamedTuple):

@@ -200,11 +200,7 @@ def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cos
 
 
 def _integrated(
-    ask: _Ask,
-    read: Callable[[Result], Array],
-    error: Callable[[Array], float],
-    start: State,
-    length: Callable[[float], float],
+    ask: _Ask, read: Callable[[Result], Array], error: Callable[[Array], float], start: State, length: Callable[[float], float]
 ) -> tuple[list[CostRow], list[str]]:
     """The quantity at the end of averaged and full runs, of a `length` for each tolerance."""
     full, rows, left_out = _full(ask, start, length, lambda run: error(read(run))), [], []

@@ -127,10 +127,8 @@ def _formulas() -> list[PublishedRow]:
     computed = float(jnp.abs(damped.read(amplitude=answer)["amplitude"][1]))
     printed, corrected = (_platform_2(omega, (n1, n2), n12, (h1, h2), h12, rho, own) for own in (0, 1))
     note = (
-        "a33 = n2^2 + n12^2 - W^2, a34 = -2 W (h2 + h12): the exciter's platform stands on its own support, "
-        "whose numbers 2 "
-        f"are printed as 1; it matters where supports differ ({said}, h1 = {h1}, h2 = {h2}, h12 = {h12}, W = "
-        f"{omega}); proved "
+        "a33 = n2^2 + n12^2 - W^2, a34 = -2 W (h2 + h12): the exciter's platform stands on its own support, whose numbers 2 "
+        f"are printed as 1; it matters where supports differ ({said}, h1 = {h1}, h2 = {h2}, h12 = {h12}, W = {omega}); proved "
         "by the machine's equations, solved for the steady motion"
     )
     return [
@@ -144,8 +142,7 @@ def _formulas() -> list[PublishedRow]:
 def _platform_2(
     omega: float, natural: tuple[float, float], n12: float, damping: tuple[float, float], h12: float, rho: float, own: int
 ) -> float:
-    """Amplitude of platform 2 by the determinants (27) to (30), s = 1; `own` 0 with the support of platform 1 "
-    "in a33, a34."""
+    """Amplitude of platform 2 by the determinants (27) to (30), s = 1; `own` 0 with the support of platform 1 in a33, a34."""
     (n1, h1), (n, h) = (natural[0], damping[0]), (natural[own], damping[own])
     one = n1**2 + rho * n12**2 - omega**2 + 2j * omega * (h1 + rho * h12)
     two = n**2 + n12**2 - omega**2 + 2j * omega * (h + h12)

@@ -75,10 +75,9 @@ def _radial_load() -> list[PublishedRow]:
     printed = m_l * _JAM**2 - 2.0 * m_l * _ROTOR * (_ROTOR - _JAM)
     machine = f"m = {_MASS} kg, l = {_LENGTH} m, w = {_ROTOR:g} rad/s"
     frames = (
-        "N = m l f'^2: f' is the absolute angular velocity, so that l f'^2 is all of the acceleration along the "
-        "rod; the Coriolis "
-        "force belongs to a turning frame, in which the centrifugal force would have another speed. The printed load is "
-        f"negative in a jam ({machine}, f' = {_JAM} rad/s); proved by the radial load of the equations of motion"
+        "N = m l f'^2: f' is the absolute angular velocity, so that l f'^2 is all of the acceleration along the rod; the "
+        "Coriolis force belongs to a turning frame, in which the centrifugal force would have another speed. The printed load "
+        f"is negative in a jam ({machine}, f' = {_JAM} rad/s); proved by the radial load of the equations of motion"
     )
     share = max(
         abs(float(normal_force(heavy, 0.0, _state(_JAM, angle))[0]) / run_up - 1.0) for angle in (-0.5 * math.pi, 0.5 * math.pi)

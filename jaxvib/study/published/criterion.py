@@ -65,9 +65,8 @@ def _one_mass() -> list[PublishedRow]:
     damped_one = float(characteristic_speeds(damped).damped_resonances[0])
     said = f"h = {h}, q = {q}, s = 1"
     sign = (
-        "s_y = + s sin(q tau): with the printed minus, (4) has - s q^2 sin(q tau) on the right and the platform "
-        "answers the other "
-        f"way round; (11) and (14) go with plus ({said}); proved by the machine's receptance"
+        "s_y = + s sin(q tau): with the printed minus, (4) has - s q^2 sin(q tau) on the right and the platform answers the "
+        f"other way round; (11) and (14) go with plus ({said}); proved by the machine's receptance"
     )
     return [
         compared(_PAPER, "(12)", "resonance of one mass", 1.0, resonance, within=1e-9),
@@ -89,8 +88,7 @@ def _two_masses() -> list[PublishedRow]:
     static = q1**2 * q2**2 * between**2
     wrong = (a * b + (a + rho * c) * c) * (a + rho * c)
     first = (
-        "f(0) = [n1^2 n2^2 + n12^2 (n1^2 + rho n2^2)] (n1^2 + rho n12^2), as (32) gives at q = 0 and (34) has "
-        "it; the printed "
+        "f(0) = [n1^2 n2^2 + n12^2 (n1^2 + rho n2^2)] (n1^2 + rho n12^2), as (32) gives at q = 0 and (34) has it; the printed "
         f"first factor has n12 in place of n2 ({said}); proved by q1^2 q2^2 q~^2 of the machine"
     )
     q, damping, h12 = 0.8, (0.03, 0.02), 0.04
@@ -138,16 +136,14 @@ def _three_masses() -> list[PublishedRow]:
         return float(np.sqrt(np.max(np.linalg.eigvals(matrix).real)))
 
     link = (
-        f"the last term of platform 3 is n23^2 (y2 - rho3 y3), printed with rho1 y1 ({said}); proved by the "
-        f"machine's own highest "
-        "natural frequency, from stiffness and mass matrices that are symmetric"
+        f"the last term of platform 3 is n23^2 (y2 - rho3 y3), printed with rho1 y1 ({said}); proved by the machine's own "
+        "highest natural frequency, from stiffness and mass matrices that are symmetric"
     )
     top = float(natural_frequencies(scene)[2])
     c_note = f"the first factor is n1^2 + rho1 n12^2, printed with n13 ({said}); proved by q~1^2 q~2^2 of the machine"
     d_note = (
         "{n1^2 + rho1 (n12^2 + n13^2) - [n3^2 + rho3 (n23^2 + n13^2)]}^2 + 4 rho1 rho3 n13^4; printed with - "
-        "n3^2 and rho1 rho2, "
-        f"where rho2 is 1 ({said}); proved by (q~2^2 - q~1^2)^2 of the machine"
+        f"n3^2 and rho1 rho2, where rho2 is 1 ({said}); proved by (q~2^2 - q~1^2)^2 of the machine"
     )
     root = math.sqrt(good_d)
     sums = _row("(57), b", "q~1^2 + q~2^2", first + third, low**2 + high**2, note=said)

@@ -88,11 +88,9 @@ def _data() -> list[PublishedRow]:
     damping = np.asarray(own.carrier().damping)
     # The coordinates are y, z, theta, psi.
     note = (
-        "b3 = b_1 L1^2 + b_2 L2^2 of the two dampers that b1 = b_1 + b_2 and b2 = b_1 L1 - b_2 L2 ask for; the "
-        "printed number is "
-        f"one damper's share alone, with L1 and L2 exchanged ({swapped:.2f}); proved by the damping matrix of a "
-        f"rotor on these "
-        f"dampers, which has b1 = {damping[0, 0]:.2f} and b2 = {damping[0, 2]:.2f}"
+        "b3 = b_1 L1^2 + b_2 L2^2 of the two dampers that b1 = b_1 + b_2 and b2 = b_1 L1 - b_2 L2 ask for; the printed number "
+        f"is one damper's share alone, with L1 and L2 exchanged ({swapped:.2f}); proved by the damping matrix of a rotor on "
+        f"these dampers, which has b1 = {damping[0, 0]:.2f} and b2 = {damping[0, 2]:.2f}"
     )
     both = first * l1**2 + second * l2**2
     return [
@@ -137,9 +135,8 @@ def _jams() -> list[PublishedRow]:
     }
     low, high = 0.08 * math.sqrt(0.5e-3 / holds), 0.08 * math.sqrt(1.0e-3 / holds)
     length = (
-        "l = 0.08 m, a power of ten; what holds a jam grows as (m l)^2, so that the printed window of friction "
-        "holds 169.6 rad/s "
-        f"with lengths from {low:.3f} to {high:.3f} m, with 0.8 m only a friction a hundred times as large"
+        "l = 0.08 m, a power of ten; what holds a jam grows as (m l)^2, so that the printed window of friction holds 169.6 "
+        f"rad/s with lengths from {low:.3f} to {high:.3f} m, with 0.8 m only a friction a hundred times as large"
     )
     window = partial(_row, unit="N m s", within=2.5e-3, known=NOT_REPRODUCIBLE)
     return [

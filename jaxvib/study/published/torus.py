@@ -1,5 +1,4 @@
-"""What the torus paper prints: least initial speeds from which two balls reach the rotor's speed, and the "
-"equations for them."""
+"""What the torus paper prints: least initial speeds from which two balls reach the rotor's speed, and equations for them."""
 
 from __future__ import annotations
 
@@ -92,9 +91,8 @@ def _formulas() -> list[PublishedRow]:
     pair = balls(count=2, mass=0.05, radius=_RADIUS, drag=0.0, own_radius=own).offsets()
     side_by_side, apart = 2.0 * math.asin(own / _RADIUS), 2.0 * math.atan(own / _RADIUS)
     touch = (
-        "2 arcsin(r/R) is where two balls touch; from 2 arctan(r/R) they overlap by 0.2 % of their size; proved "
-        "by the angle at "
-        "which the package sets balls side by side"
+        "2 arcsin(r/R) is where two balls touch; from 2 arctan(r/R) they overlap by 0.2 % of their size; proved by the angle "
+        "at which the package sets balls side by side"
     )
     # Two balls at unlike angles; they turn with the rotor, so that only the climb up the tube rubs.
     still, smooth = jnp.zeros(2), _left_out(scene, RollingFriction)
@@ -109,11 +107,9 @@ def _formulas() -> list[PublishedRow]:
         )
     ]
     up = (
-        "the rotor's unbalance pulls a ball up the tube with cos(a) cos(psi), as the projection of (4), (5) onto "
-        "the tube gives; "
-        "printed with sin(psi); at 2 balls, gap 2.5, psi = 0.4, a = 0.3; proved by this package's equations, "
-        "derived from the "
-        "Lagrangian by automatic differentiation, with and without the unbalance"
+        "the rotor's unbalance pulls a ball up the tube with cos(a) cos(psi), as the projection of (4), (5) onto the tube "
+        "gives; printed with sin(psi); at 2 balls, gap 2.5, psi = 0.4, a = 0.3; proved by this package's equations, derived "
+        "from the Lagrangian by automatic differentiation, with and without the unbalance"
     )
     rows = [
         _row(
@@ -156,8 +152,7 @@ def _left_out(scene: Scene, kind: type) -> Scene:
 
 
 def _lever(scene: Scene, state: State) -> PublishedRow:
-    """What rolling friction takes from the climb, per normal force of each model: 1/(kappa rho) but for the "
-    "rotor's answer."""
+    """What rolling friction takes from the climb, per normal force of each model: 1/(kappa rho) but for the rotor's answer."""
     friction = next(e for e in scene.effects if isinstance(e, RollingFriction))
     ratio = float(friction.coefficient) / float(own_radius(scene.loads))
 
@@ -169,11 +164,9 @@ def _lever(scene: Scene, state: State) -> PublishedRow:
     mass = float(scene.loads.mass)
     derived = own * mass / (ratio * float(normal_force(scene, 0.0, state)[0]))
     note = (
-        "(k/r) N acts at the ball's distance from the tube's centre, the gap R1 - r: divided by the inertia 7/5 "
-        "(R1 - r)^2 that is "
-        "- 1/(7/5 (R1 - r)) of N; printed with R1 as the lever, six times as much; proved by the package's "
-        "equations with and "
-        "without rolling friction, per normal force"
+        "(k/r) N acts at the ball's distance from the tube's centre, the gap R1 - r: divided by the inertia 7/5 (R1 - r)^2 "
+        "that is - 1/(7/5 (R1 - r)) of N; printed with R1 as the lever, six times as much; proved by the package's equations "
+        "with and without rolling friction, per normal force"
     )
     return _row(
         "(8), (9), friction",
@@ -207,9 +200,8 @@ def _pressing(scene: Scene, gap: float, speed: float) -> PublishedRow:
     along = ax * jnp.cos(f) + ay * jnp.sin(f)
     corrected = mass * float(g * jnp.cos(a) + (arm * speed**2 - along) * jnp.sin(a))
     note = (
-        "N = g cos a + (B u^2 - x'' cos f - y'' sin f) sin a + eb a'^2: the printed one has R in place of B = R "
-        "+ (R1 - r) sin a "
-        "and lacks the rotor's acceleration; proved by the constraint force of the package's equations"
+        "N = g cos a + (B u^2 - x'' cos f - y'' sin f) sin a + eb a'^2: the printed one has R in place of B = R + (R1 - r) sin "
+        "a and lacks the rotor's acceleration; proved by the constraint force of the package's equations"
     )
     return _row(
         "(10)",

@@ -15,14 +15,7 @@ from jaxvib.machine.platforms import two_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.results.status import status_name
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.stress.asked import (
-    away,
-    compared_state,
-    final_state,
-    mode_speeds,
-    mode_speeds_again,
-    published,
-)
+from jaxvib.study.stress.asked import away, compared_state, final_state, mode_speeds, mode_speeds_again, published
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import run_out
 from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms

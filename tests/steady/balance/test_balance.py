@@ -77,11 +77,7 @@ def test_arrangements_cancel_a_rotors_imbalance(count, dimension, directions):
 
 @pytest.mark.parametrize(
     ("mass", "status", "sentence"),
-    [
-        ([0.3], "alone", "single load"),
-        ([0.3, 0.2], "outweighed", "larger"),
-        ([0.1, 0.1, 0.1, 0.4], "outweighed", "larger"),
-    ],
+    [([0.3], "alone", "single load"), ([0.3, 0.2], "outweighed", "larger"), ([0.1, 0.1, 0.1, 0.4], "outweighed", "larger")],
 )
 def test_loads_that_cannot_cancel_are_named(mass, status, sentence):
     s = loaded(count=len(mass), mass=mass)

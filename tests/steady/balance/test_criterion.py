@@ -155,13 +155,7 @@ def test_damping_moves_no_speed_out_of_the_range_of_resonances():
 
 @pytest.mark.parametrize(
     "s",
-    [
-        *(scene(name) for name in machines()),
-        network_of(6, damping=30.0),
-        rotor(0.093),
-        rotor(0.9),
-        rotor(0.0, (1e6, 2e6)),
-    ],
+    [*(scene(name) for name in machines()), network_of(6, damping=30.0), rotor(0.093), rotor(0.9), rotor(0.0, (1e6, 2e6))],
     ids=[*machines(), "heavily damped", "rotor", "disc", "anisotropic"],
 )
 def test_sign_of_the_functional_is_that_of_the_receptance(s):
@@ -274,11 +268,7 @@ def test_gradients_are_finite_at_degenerate_points():
 def test_mode_that_does_not_move_the_exciter_changes_no_sign():
     """Outer platforms in antiphase about the exciter: resonance and additional speed coincide, intervals join."""
     machine = jv.three_mass(
-        mass=(4.0, 3.0, 4.0),
-        stiffness=(4e4, 2e4, 4e4),
-        damping=(0, 0, 0),
-        link_stiffness=(1e3, 0, 1e3),
-        link_damping=(0, 0, 0),
+        mass=(4.0, 3.0, 4.0), stiffness=(4e4, 2e4, 4e4), damping=(0, 0, 0), link_stiffness=(1e3, 0, 1e3), link_damping=(0, 0, 0)
     )
     result = jv.criterion(jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0)))
     table = criterion_table(result)
@@ -323,12 +313,7 @@ def test_exciter_that_cannot_move_is_refused():
         jv.one_mass(mass=1.0, stiffness=float("inf"), damping=0.0)
     for exciter, field in ((2, "exciter stands on y2, which"), (1, "stiffness is so high at y2 that it")):
         machine = jv.two_mass(
-            mass=(4.0, 3.0),
-            stiffness=(1e4, 1e20),
-            damping=(3.0, 3.0),
-            link_stiffness=2e4,
-            link_damping=1.0,
-            exciter=exciter,
+            mass=(4.0, 3.0), stiffness=(1e4, 1e20), damping=(3.0, 3.0), link_stiffness=2e4, link_damping=1.0, exciter=exciter
         )
         with pytest.raises(jv.InputError, match=rf"machine\.{field} cannot move"):
             jv.criterion(eqx.tree_at(lambda x: x.machine, scene("two_mass"), machine))
