@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["ComputationError", "InputError"]
+from collections.abc import Iterable
+
+__all__ = ["ComputationError", "InputError", "require_one_of"]
 
 
 class InputError(ValueError):
@@ -24,6 +26,18 @@ class InputError(ValueError):
         super().__init__(f"{field} {problem}")
         self.field = field
         self.problem = problem
+
+
+def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str = "is") -> None:
+    """**Raises** `InputError` for a value that is none of the `allowed`.
+
+    >>> require_one_of("left", ("above", "below"), "effects.stop.side")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: effects.stop.side is 'left'; allowed: above, below
+    """
+    if value not in (allowed := tuple(allowed)):
+        raise InputError(field, f"{verb} {value!r}; allowed: {', '.join(allowed)}")
 
 
 class ComputationError(RuntimeError):

@@ -2,37 +2,23 @@
 
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto
-from optimize.quantities import (
-    Quantity,
+from optimize.space import DesignSpace, Held, hold
+from optimize.synthesize import Outcome, Synthesis, synthesize
+from optimize.wishes.aims import maximize, minimize, negative
+from optimize.wishes.cases import expected, quantile, under, worst
+from optimize.wishes.jams import (
     amplitude,
-    expected,
     fold_margin,
     force_per_amplitude,
     foundation_force,
     jam_frequency,
-    largest,
     largest_multiplier,
-    least,
-    maximize,
-    minimize,
-    negative,
-    peak_force,
     phase,
     power,
-    product,
-    quantile,
-    settling_time,
-    spring_cost,
-    static_deflection,
-    support_frequency_squared,
-    total,
-    total_mass,
-    under,
-    worst,
 )
-from optimize.space import DesignSpace, Held, hold
-from optimize.synthesize import Outcome, Synthesis, synthesize
-from optimize.wishes.quantity import Demand
+from optimize.wishes.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
+from optimize.wishes.motion import peak_force, settling_time
+from optimize.wishes.quantity import Demand, Quantity, largest, least
 
 __all__ = [
     "Demand",

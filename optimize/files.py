@@ -10,38 +10,22 @@ from typing import Any
 from jaxvib.errors import InputError
 from jaxvib.machine.files import called, closest, load_scene, out_of_place, read_toml
 from jaxvib.units import count, number
-from optimize import quantities
-from optimize.quantities import Quantity
 from optimize.result import Synthesis
 from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
-from optimize.wishes.quantity import Demand
+from optimize.wishes import jams, machine, motion
+from optimize.wishes.cases import expected, worst
+from optimize.wishes.quantity import Demand, Quantity
 
 __all__ = ["TEMPLATE", "Design", "load_design", "quantity_from_table"]
 
 _QUANTITIES = {
-    name: getattr(quantities, name)
-    for name in (
-        "amplitude",
-        "phase",
-        "foundation_force",
-        "force_per_amplitude",
-        "jam_frequency",
-        "fold_margin",
-        "largest_multiplier",
-        "power",
-        "support_frequency_squared",
-        "total",
-        "product",
-        "total_mass",
-        "static_deflection",
-        "spring_cost",
-        "peak_force",
-        "settling_time",
-    )
+    name: getattr(module, name) for module in (jams, machine, motion) for name in module.__all__ if name != "between"
 }
-_STATISTICS = {"expected": quantities.expected, "worst": quantities.worst}
+"""What files may ask for, by name."""
+
+_STATISTICS = {"expected": expected, "worst": worst}
 _SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", "search"]
 
 

@@ -19,7 +19,6 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
 from jaxvib.units import count
-from optimize.quantities import amplitude, force_per_amplitude, foundation_force, jam_frequency
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Found, Options, Searcher, choose, require_searcher
 from optimize.search.polish import FEASIBLE
@@ -27,8 +26,8 @@ from optimize.search.problem import Problem, made, problem_of, reported
 from optimize.search.sense import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
 from optimize.wishes.answers import Answers
-from optimize.wishes.jams import between
-from optimize.wishes.quantity import Demand, Pair, Quantity, Tier, walk
+from optimize.wishes.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
+from optimize.wishes.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
@@ -178,8 +177,7 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
 def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Demand]) -> tuple[Demand, ...]:
     if not isinstance(space, DesignSpace):
         raise InputError("space", f"is {space!r}; it must be a DesignSpace")
-    if not isinstance(objective, Quantity):
-        raise InputError("objective", f"is {objective!r}; it must be a Quantity, for example force_per_amplitude(mode=3)")
+    require_quantity(objective, "objective")
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):

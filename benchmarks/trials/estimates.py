@@ -148,7 +148,9 @@ def table(rows: list[dict]) -> str:
             ratio = np.array([error / estimate for error, estimate in done])
             kept = np.array([r["accuracy_error"] / r["accuracy"] for r in some if r["accuracy_status"] == "done"])
             lines.append(
-                f"{kind:20s}{dtype:9s}{ratio.size:5d}{np.mean(ratio > 1.0):8.1%}{np.max(ratio, initial=0.0):7.2g}{np.mean(kept > 1.0) if kept.size else 0.0:8.1%}{np.max(kept, initial=0.0):7.2g}{1.0 - kept.size / len(some):8.1%}{1.0 / np.median(ratio) if np.any(ratio) else 0.0:8.3g}"
+                f"{kind:20s}{dtype:9s}{ratio.size:5d}{np.mean(ratio > 1.0):8.1%}{np.max(ratio, initial=0.0):7.2g}"
+                f"{np.mean(kept > 1.0) if kept.size else 0.0:8.1%}{np.max(kept, initial=0.0):7.2g}"
+                f"{1.0 - kept.size / len(some):8.1%}{1.0 / np.median(ratio) if np.any(ratio) else 0.0:8.3g}"
             )
     return "\n".join(lines)
 

@@ -99,9 +99,7 @@ def simulate(
         progress_meter=ProgressBar() if sys.stderr.isatty() and _long(loaded, until) else None,
     )
     output.picture("history.png", lambda: run.plot(unit=unit))
-    data = output.file("run.npz")
-    if data is not None:
-        run.save(data)
+    output.keep("run.npz", run)
     output.csv(csv, run, "time")
     output.done(run_document(run), run.summary, "simulate", run)
 

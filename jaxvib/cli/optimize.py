@@ -63,20 +63,15 @@ def optimize(
             progress=lambda what, share: bar.update(task, description=what, completed=share),
             **options,
         )
-    for name, save in (
-        ("search.npz", lambda path: best.save(path)),
-        ("found.toml", lambda path: jv.save_scene(best.scene, path)),
-    ):
-        path = output.file(name)
-        if path is not None:
-            save(path)
+    output.keep("search.npz", best)
+    path = output.file("found.toml")
+    if path is not None:
+        jv.save_scene(best.scene, path)
     output.picture("before_after.png", best.plot)
     output.picture("convergence.png", best.plot_convergence)
     if best.run is not None:
         output.picture("history.png", best.run.plot)
-        data = output.file("run.npz")
-        if data is not None:
-            best.run.save(data)
+        output.keep("run.npz", best.run)
     output.done(_document(best), lambda: _text(best), "optimize", best)
 
 

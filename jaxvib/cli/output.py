@@ -59,6 +59,12 @@ class Output:
         self.files.append(str(self.folder / name))
         return self.folder / name
 
+    def keep(self, name: str, result: Result) -> None:
+        """Saves a result to a file of that name, where a folder was asked for."""
+        path = self.file(name)
+        if path is not None:
+            result.save(path)
+
     def made(self, name: str) -> Path:
         """The path of a file that is what the command is for: in the folder, in the current one where none was asked for."""
         path = (self.folder or Path()) / name

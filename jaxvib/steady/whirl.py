@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import LinearModel, linear_model
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -219,8 +219,7 @@ def _held(stiffness: np.ndarray) -> bool:
 
 
 def _mass(model: LinearModel, loads: Weights) -> Array:
-    if loads not in ("fixed", "none"):
-        raise InputError("loads", f"is {loads!r}; allowed: fixed, none")
+    require_one_of(loads, ("fixed", "none"), "loads")
     return model.mass if loads == "fixed" else model.carrier.mass
 
 

@@ -16,7 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import closest
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.lanes import WatchedRun
-from optimize.quantities import Quantity
+from optimize.wishes.quantity import Quantity
 
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "identity", "measure_of"]
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
@@ -21,8 +21,7 @@ from jaxvib.sweeps.program import planned, shapes
 from jaxvib.sweeps.samples import SAMPLINGS
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
-from optimize.quantities import Quantity
-from optimize.wishes.quantity import TIERS, Tier
+from optimize.wishes.quantity import TIERS, Quantity, Tier
 
 __all__ = ["TEMPLATE", "Measures", "load_study", "study"]
 
@@ -58,8 +57,7 @@ def study(
     require_apart(scene, found)
     drawn = [axis.name for axis in found if axis.values is None]
     count(samples, "samples", low=0)
-    if sampling not in SAMPLINGS:
-        raise InputError("sampling", f"is {sampling!r}; it must be one of {', '.join(SAMPLINGS)}")
+    require_one_of(sampling, SAMPLINGS, "sampling")
     count(seed, "seed", low=0)
     if drawn and not samples:
         raise InputError(f"axes.{drawn[0]}", "is a range without count, so that it is sampled; give samples, or a count")
@@ -72,8 +70,7 @@ def study(
             raise InputError(f"measure.{name}", "is a name that something else has or that is none; give it another one")
     runs = [m for m in measures if isinstance(m, RunMeasure)]
     chosen = tier or ("time" if runs else "leading")
-    if chosen not in TIERS:
-        raise InputError("tier", f"is {chosen!r}; it must be one of {', '.join(TIERS)}")
+    require_one_of(chosen, TIERS, "tier")
     measures = tuple(m.at_tier(tier) if tier and isinstance(m, Quantity) else m for m in measures)
     spots = tuple(axis.spot for axis in found)
     plan = None

@@ -16,7 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
 from optimize.space.numbers import Place, changed, names_of, places_of
 from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Quantity
+from optimize.wishes.quantity import Quantity, require_quantity
 
 __all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
 
@@ -47,8 +47,7 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
     'jam_frequency'
     """
-    if not isinstance(quantity, Quantity):
-        raise InputError("hold", f"is {quantity!r}; it must be a Quantity, for example jam_frequency(mode=3)")
+    require_quantity(quantity, "hold")
     if value is None:
         return Held(quantity, None)
     held = float(number(value, quantity.unit, f"hold.{quantity.name}"))

@@ -18,7 +18,7 @@ from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.space.numbers import Place, changed, places_of, value_of
 from optimize.wishes.answers import Answers, Key, Recorder
-from optimize.wishes.quantity import Quantity
+from optimize.wishes.quantity import Quantity, require_quantity
 
 __all__ = ["expected", "quantile", "under", "worst"]
 
@@ -167,7 +167,7 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words
     'foundation force, mode 3 (loaded)'
     """
-    _require(quantity)
+    require_quantity(quantity, "quantity")
     if not isinstance(changes, Mapping) or not changes:
         raise InputError("changes", f"is {changes!r}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, value_of(key, value)) for key, value in changes.items())
@@ -175,13 +175,8 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
 
 
-def _require(quantity: object) -> None:
-    if not isinstance(quantity, Quantity):
-        raise InputError("quantity", f"is {quantity!r}; it must be a Quantity, for example foundation_force(mode=3)")
-
-
 def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
-    _require(quantity)
+    require_quantity(quantity, "quantity")
     if not isinstance(tolerances, Mapping) or not tolerances:
         raise InputError("tolerances", f"is {tolerances!r}; give a dictionary such as {{'machine.stiffness': 0.05}}")
     for name, value in tolerances.items():

@@ -15,7 +15,8 @@ from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.units import FIELD_UNITS, Number, count
 from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Asking, Quantity, Tier, number_in
+from optimize.wishes.given import number_in
+from optimize.wishes.quantity import Asking, Quantity, Tier
 
 __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squared", "total", "total_mass"]
 

@@ -9,7 +9,8 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.units import Number
 from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Asking, Quantity, Tier, number_in
+from optimize.wishes.given import number_in
+from optimize.wishes.quantity import Asking, Quantity, Tier
 
 __all__ = ["peak_force", "settling_time"]
 

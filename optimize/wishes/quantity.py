@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeAlias
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
@@ -18,7 +18,7 @@ from jaxvib.units import Number
 from optimize.wishes.answers import Answers
 from optimize.wishes.given import arguments, number_in, same_unit
 
-__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "number_in", "walk"]
+__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "require_quantity", "walk"]
 
 Pair = int | tuple[int, int] | None
 """Whose amplitude: a platform's own, or that of one platform relative to another; None: see `between`."""
@@ -92,8 +92,7 @@ class Quantity:
 
     def at_tier(self, tier: Tier) -> Quantity:
         """The same quantity computed in another way, where it can be. **Raises** `InputError` for a tier that there is not."""
-        if tier not in TIERS:
-            raise InputError("tier", f"is {tier!r}; it must be one of {', '.join(TIERS)}")
+        require_one_of(tier, TIERS, "tier")
         return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts)) if self.parts else self
 
     @property
@@ -161,8 +160,7 @@ class Asking(Quantity):
     """What gives its `pieces`: a function of the answers, the sign, the tier and the settings."""
 
     def __post_init__(self) -> None:
-        if self.tier not in TIERS:
-            raise InputError("tier", f"is {self.tier!r}; it must be one of {', '.join(TIERS)}")
+        require_one_of(self.tier, TIERS, "tier")
         if self.tier not in self.tiers:
             raise InputError("tier", f"is {self.tier!r}; {self.words} is computed as: {', '.join(self.tiers)}")
 
@@ -379,6 +377,12 @@ def largest(*quantities: Quantity) -> Quantity:
 def least(*quantities: Quantity) -> Quantity:
     """The least of some quantities of the same unit, see `largest`."""
     return _extreme("least", quantities)
+
+
+def require_quantity(value: object, field: str) -> None:
+    """**Raises** `InputError` for what is no quantity."""
+    if not isinstance(value, Quantity):
+        raise InputError(field, f"is {value!r}; it must be a Quantity, for example foundation_force(mode=3)")
 
 
 def walk(quantity: Quantity) -> Iterator[Quantity]:

@@ -9,22 +9,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.app import run
 from jaxvib.machine.files import TEMPLATES
-
-
-@pytest.fixture
-def typed(capsys, tmp_path, monkeypatch):
-    """Runs a command line in an empty folder that holds machine.toml; gives exit code, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
-    jv.save_scene(scene("two_mass", speed=150.0), tmp_path / "machine.toml")
-
-    def type_(*words):
-        code = run(list(words))
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return type_
 
 
 @pytest.mark.parametrize("kind", TEMPLATES)

@@ -6,23 +6,15 @@ import numpy as np
 import pytest
 from swings import ROD, T, noisy, scipy_swing
 
-from jaxvib.cli.app import run
-
 
 @pytest.fixture
-def typed(capsys, tmp_path, monkeypatch):
+def typed(type_, tmp_path, monkeypatch):
     """Runs a command line in a folder with a record in degrees and its measurement file; gives exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     t = T
     clean, _ = scipy_swing(ROD, t, 0.3, 0.0, 1.5e-3)
     angle = np.rad2deg(noisy(clean, 1e-3, 0))
     np.savetxt("swing.csv", np.stack([t, angle], axis=1), delimiter=",", header="time (s), angle (deg)", comments="")
-
-    def type_(*words):
-        code = run(list(words))
-        out, err = capsys.readouterr()
-        return code, out, err
-
     (tmp_path / "m.toml").write_text(type_("new", "measurement")[1].replace("dry = true", "dry = false"))
     return type_
 

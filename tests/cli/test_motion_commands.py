@@ -9,7 +9,6 @@ import time
 
 import numpy as np
 import pytest
-from scenes import scene
 
 import jaxvib as jv
 from jaxvib.cli.app import _HOMES, app, run
@@ -19,20 +18,6 @@ from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
 from jaxvib.study.stress.run import PRECISIONS
 
 DATA = pathlib.Path(__file__).parents[1] / "data"
-
-
-@pytest.fixture
-def typed(capsys, tmp_path, monkeypatch):
-    """Runs a command line in an empty folder that holds machine.toml; gives exit code, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
-    jv.save_scene(scene("two_mass", speed=150.0), tmp_path / "machine.toml")
-
-    def type_(*words):
-        code = run(list(words))
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return type_
 
 
 def read(path):

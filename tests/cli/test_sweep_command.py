@@ -7,7 +7,6 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.cli.app import run
 from jaxvib.cli.study import sweep as command
 
 STUDY = """
@@ -26,7 +25,7 @@ OWN = "def heaviness(scene):\n    return scene.machine.mass[0] * scene.drive.spe
 
 
 @pytest.fixture
-def typed(capsys, tmp_path, monkeypatch):
+def typed(type_, tmp_path, monkeypatch):
     """Runs a command line in a folder that holds machine.toml and study.toml; gives exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -34,12 +33,6 @@ def typed(capsys, tmp_path, monkeypatch):
     jv.save_scene(scene("one_mass", speed=60.0), tmp_path / "machine.toml")
     (tmp_path / "own_quantity.py").write_text(OWN)
     (tmp_path / "study.toml").write_text(STUDY)
-
-    def type_(*words):
-        code = run(list(words))
-        out, err = capsys.readouterr()
-        return code, out, err
-
     return type_
 
 

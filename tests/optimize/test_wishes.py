@@ -154,7 +154,7 @@ def test_quantities_in_time():
         (lambda: foundation_force(mode=3) * "three", "is no number with a unit"),
         (lambda: foundation_force(mode=3) + None, "give a quantity, a finite number or text"),
         (lambda: foundation_force(mode=3) ** "2", "give a plain number"),
-        (lambda: amplitude(mode=3, tier="exakt"), "must be one of leading, exact, time"),
+        (lambda: amplitude(mode=3, tier="exakt"), "tier is 'exakt'; allowed: leading, exact, time"),
         (lambda: phase(mode=3, tier="time"), "is computed as: leading, exact"),
         (lambda: phase(mode=3, of=1), "give a pair such as"),
         (lambda: largest(), "give one quantity or several"),

@@ -37,9 +37,7 @@ def run_ups(
     loaded = jv.load_scene(scene)
     found = jv.run_ups(loaded, until, drag=each, starts=starts, seed=seed, batch=batch, stepsize_controller=steps)
     output.picture("run_ups.png", found.plot)
-    data = output.file("run_ups.npz")
-    if data is not None:
-        found.save(data)
+    output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
     rows = [
         {

@@ -49,9 +49,7 @@ def settle(
     steps = chosen_steps(tolerance, None)
     run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
     output.picture("history.png", run.plot)
-    data = output.file("run.npz")
-    if data is not None:
-        run.save(data)
+    output.keep("run.npz", run)
     output.done(run_document(run), run.summary, "settle", run)
 
 
@@ -82,9 +80,7 @@ def envelope(
     steps = None if tolerance is None else jv.Tolerance(tolerance)
     run = jv.envelope(loaded, until, start=begin, mode=mode, spin_up=spin_up, stepsize_controller=steps)
     output.picture("envelope.png", run.plot)
-    data = output.file("envelope.npz")
-    if data is not None:
-        run.save(data)
+    output.keep("envelope.npz", run)
     output.csv(csv, run, "time")
     document = {**measured_document(run, loaded), "ripple": run.ripple.tolist()}
     output.done(document, run.summary, "envelope", run)

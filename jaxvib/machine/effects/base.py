@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.loads import Loads, Pressing
 from jaxvib.units import Number, number
@@ -254,8 +254,7 @@ class Gravity(Effect):
 
     def __init__(self, g: Number = 9.81, along: Literal["up", "axis"] = "up"):
         self.g = number(g, "m/s^2", "effects.gravity.g", low=0.0)
-        if along not in _AXES:
-            raise InputError("effects.gravity.along", f"is {along!r}; allowed: {', '.join(_AXES)}")
+        require_one_of(along, _AXES, "effects.gravity.along")
         self.along = along
         self.kind = "gravity"
 

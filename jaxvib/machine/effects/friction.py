@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.loads import CircularLoads, Loads
@@ -82,8 +82,7 @@ class DryFriction(Effect):
         self.coefficient = number(coefficient, "", f"{field}.coefficient", low=0.0)
         self.diameter = number(diameter, "m", f"{field}.diameter", low=0.0)
         self.width = number(width, "rad/s", f"{field}.width", low=0.0, open_low=True)
-        if reaction not in get_args(Reaction):
-            raise InputError(f"{field}.reaction", f"is {reaction!r}; allowed: {', '.join(get_args(Reaction))}")
+        require_one_of(reaction, get_args(Reaction), f"{field}.reaction")
         self.reaction = reaction
         self.kind = "dry_friction"
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.effects.friction import sliding_sign
@@ -59,8 +59,7 @@ class RollingFriction(Effect):
         field = "effects.rolling_friction"
         self.coefficient = number(coefficient, "m", f"{field}.coefficient", low=0.0)
         self.width = number(width, "m/s", f"{field}.width", low=0.0, open_low=True)
-        if direction not in get_args(Direction):
-            raise InputError(f"{field}.direction", f"is {direction!r}; allowed: {', '.join(get_args(Direction))}")
+        require_one_of(direction, get_args(Direction), f"{field}.direction")
         self.direction = direction
         self.kind = "rolling_friction"
 

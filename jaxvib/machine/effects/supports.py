@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.loads import Loads
@@ -133,8 +133,7 @@ class Stop(_Support):
         self.stiffness = number(stiffness, "N/m", "effects.stop.stiffness", low=0.0)
         self.gap = number(gap, "m", "effects.stop.gap", low=0.0)
         self.damping = number(damping, "N s/m", "effects.stop.damping", low=0.0)
-        if side not in ("above", "below", "both"):
-            raise InputError("effects.stop.side", f"is {side!r}; allowed: above, below, both")
+        require_one_of(side, ("above", "below", "both"), "effects.stop.side")
         self.side = side
         self.platform, self.position = _where(self.kind, platform, position)
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
@@ -99,8 +99,7 @@ def work_precision(
 
     Source: ours; the tiers have theirs, see `jam_modes`, `jam_orbit`, `envelope`, `simulate`.
     """
-    if quantity not in QUANTITIES:
-        raise InputError("quantity", f"is {quantity!r}; it must be one of {', '.join(QUANTITIES)}")
+    require_one_of(quantity, QUANTITIES, "quantity")
     unknown = [name for name in solvers if name not in SOLVERS]
     if unknown or not solvers:
         raise InputError("solvers", f"are {list(solvers)!r}; name some of {', '.join(SOLVERS)}")

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.errors import InputError
+from jaxvib.errors import require_one_of
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
@@ -224,8 +224,7 @@ def published_tables(
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
     for name in models:
-        if name not in MODELS:
-            raise InputError("models", f"has {name!r}; allowed: {', '.join(MODELS)}")
+        require_one_of(name, MODELS, "models", "has")
     points = [
         (row.damping, row.stiffness, row.friction, *pair) for row in rows for pair in zip(row.gap, row.speed, strict=True)
     ]

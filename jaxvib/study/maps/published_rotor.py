@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import require_one_of
 from jaxvib.machine.drive import RunUp
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.loads import pendulums
@@ -51,8 +51,7 @@ def published_rotor(mu: float = 9.2e-4, variant: str = "printed", *, eccentricit
 
     Source: Artyunin 2013, section IV; the length 0.08 m of the pendulums is printed as "L1=L2=0,8".
     """
-    if variant not in VARIANTS:
-        raise InputError("variant", f"is {variant!r}; allowed: {', '.join(VARIANTS)}")
+    require_one_of(variant, VARIANTS, "variant")
     (k1, k2), (l1, l2) = _STIFFNESS, _POSITION
     machine = rotor(
         mass=37.0,

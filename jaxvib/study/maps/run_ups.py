@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -64,8 +64,7 @@ class RunUps(Result):
 
         **Raises** `InputError` for another word.
         """
-        if kind not in (*REGIMES, _FAILED):
-            raise InputError("kind", f"is {kind!r}; allowed: {', '.join((*REGIMES, _FAILED))}")
+        require_one_of(kind, (*REGIMES, _FAILED), "kind")
         return np.mean(self.kind == kind, axis=1)
 
     def summary(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, require_one_of
 from jaxvib.study.published.antiphase import antiphase_paper
 from jaxvib.study.published.bearing import bearing_paper
 from jaxvib.study.published.criterion import criterion_paper
@@ -71,8 +71,7 @@ def reproduce(
     if isinstance(papers, str):
         raise InputError("papers", f"is {papers!r}; give a list of names, such as [{papers!r}]")
     for name in papers:
-        if name not in PAPERS:
-            raise InputError("papers", f"has {name!r}; allowed: {', '.join(PAPERS)}")
+        require_one_of(name, PAPERS, "papers", "has")
     rows = []
     for name in papers or PAPERS:
         if report is not None:

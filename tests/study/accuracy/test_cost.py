@@ -110,7 +110,7 @@ def test_the_cheapest_is_the_fastest_that_is_exact_enough():
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        (dict(quantity="mass"), "quantity is 'mass'; it must be one of amplitude"),
+        (dict(quantity="mass"), "quantity is 'mass'; allowed: amplitude"),
         (dict(solvers=["Euler"]), r"solvers are \['Euler'\]; name some of default, Tsit5, Dopri8"),
         (dict(solvers=[]), r"solvers are \[\]; name some of default"),
         (dict(until=-1.0), "until is -1"),
