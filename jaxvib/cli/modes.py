@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, UNIT, WITHOUT, Output, app, loaded_scene, shared, table
-from jaxvib.cli.output import CSV
+from jaxvib.cli.output import CSV, fields_of
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -68,22 +68,19 @@ def modes(
     growth = dict(zip(found.mode.tolist(), growth_apart(loaded, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
-        "rotor_speed": float(loaded.drive.speed),
-        "resonances": found.resonances.tolist(),
+        "rotor_speed": loaded.drive.speed,
+        "resonances": found.resonances,
         "judged": JUDGED,
         "modes": [
             {
-                "mode": int(jam.mode),
-                "omega": float(jam.omega),
-                "stable": bool(jam.stable),
+                **fields_of(jam, "mode", "omega", "stable"),
                 "growth_apart": growth[int(jam.mode)],
                 "status": jam.message,
-                "amplitude": jam.amplitude.tolist(),
-                "foundation_force": float(jam.foundation_force),
+                **fields_of(jam, "amplitude", "foundation_force"),
             }
             for jam in jams
         ],
-        "folds": [{"omega": float(found.folds.omega[k]), "rotor_speed": float(found.folds.rotor_speed[k])} for k in folds],
+        "folds": [{"omega": found.folds.omega[k], "rotor_speed": found.folds.rotor_speed[k]} for k in folds],
     }
 
     def text() -> str:
@@ -140,17 +137,13 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
     output.picture("phases.png", lambda: found.plot(unit=unit))
     jams = [found.select(k) for k in range(found.omega.shape[0])]
     document = {
-        "rotor_speed": float(scene.drive.speed),
+        "rotor_speed": scene.drive.speed,
         "judged": "by the growth of small disturbances, for light loads of which each moves for itself",
         "phase_jams": [
             {
-                "omega": float(jam.omega),
-                "stable": bool(jam.stable),
-                "growth": float(jam.growth),
+                **fields_of(jam, "omega", "stable", "growth"),
                 "pattern": jam.pattern_label,
-                "phase": jam.phase.tolist(),
-                "amplitude": jam.amplitude.tolist(),
-                "foundation_force": float(jam.foundation_force),
+                **fields_of(jam, "phase", "amplitude", "foundation_force"),
             }
             for jam in jams
         ],
@@ -192,22 +185,18 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
     output.picture("branches.png", lambda: diagram.plot(unit=unit))
     output.csv(csv, diagram, "point")
     document = {
-        "rotor_speed": float(scene.drive.speed),
-        "resonances": light.resonances.tolist(),
+        "rotor_speed": scene.drive.speed,
+        "resonances": light.resonances,
         "judged": "by the multipliers of the full equations",
         "modes": [
             {
                 "mode": k,
-                "omega": float(jam.omega),
-                "stable": bool(jam.stable),
-                "amplitude": jam.amplitude.tolist(),
-                "foundation_force": float(jam.foundation_force),
-                "multiplier": float(jam.multiplier),
+                **fields_of(jam, "omega", "stable", "amplitude", "foundation_force", "multiplier"),
                 "status": jam.message,
             }
             for k, jam in known.items()
         ],
-        "special": [{"omega": p.omega, "rotor_speed": p.rotor_speed, "kind": p.kind} for p in diagram.special],
+        "special": [fields_of(p, "omega", "rotor_speed", "kind") for p in diagram.special],
         "missing": [{"mode": k, "status": jam.message} for k, jam in jams.items() if k not in known],
     }
 

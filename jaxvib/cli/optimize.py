@@ -10,6 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from optimize import Synthesis
@@ -83,16 +84,8 @@ def _document(best: Synthesis) -> dict:
         "before": best.before.as_dict(),
         "after": best.after.as_dict(),
         "verified": None if best.verified is None else best.verified.as_dict(),
-        "unverified": best.unverified,
-        "starts": best.starts,
-        "drawn": best.drawn,
-        "converged": best.converged,
-        "same": best.same,
-        "kkt": best.kkt,
-        "table": [row._asdict() for row in best.table],
-        "limits": [limit._asdict() for limit in best.limits],
-        "influences": [each._asdict() for each in best.influences],
-        "machines": [{**each._asdict(), "numbers": list(each.numbers)} for each in best.machines],
+        **fields_of(best, "unverified", "starts", "drawn", "converged", "same", "kkt"),
+        **fields_of(best, "table", "limits", "influences", "machines"),
     }
 
 

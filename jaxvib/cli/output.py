@@ -18,10 +18,15 @@ if TYPE_CHECKING:
     from jaxvib.results.fields import Plain
     from jaxvib.results.result import Result
 
-__all__ = ["CSV", "Output"]
+__all__ = ["CSV", "Output", "fields_of"]
 
 CSV = click.option("--csv", type=click.Path(path_type=Path, dir_okay=False), help="Write the curves into this CSV file.")
 """The option of commands that have curves."""
+
+
+def fields_of(result: object, *names: str) -> dict[str, object]:
+    """Numbers of a result by their names, for a document."""
+    return {name: getattr(result, name) for name in names}
 
 
 class Output:

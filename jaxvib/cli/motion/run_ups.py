@@ -43,8 +43,8 @@ def run_ups(
         {
             "drag": float(drag),
             "shares": {kind: float(found.fraction(kind)[k]) for kind in kinds},
-            "kind": found.kind[k].tolist(),
-            "omega": found.omega[k].tolist(),
+            "kind": found.kind[k],
+            "omega": found.omega[k],
         }
         for k, drag in enumerate(found.drag)
     ]

@@ -82,7 +82,7 @@ def envelope(
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "time")
-    document = {**measured_document(run, loaded), "ripple": run.ripple.tolist()}
+    document = {**measured_document(run, loaded), "ripple": run.ripple}
     output.done(document, run.summary, "envelope", run)
 
 

@@ -10,6 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import WITHOUT, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def stability_map(
         {
             "value": float(value),
             "stable_share": float(found.stable[k].mean()),
-            "special": [{"kind": p.kind, "omega": p.omega, "rotor_speed": p.rotor_speed} for p in found.special[k]],
+            "special": [fields_of(p, "kind", "omega", "rotor_speed") for p in found.special[k]],
         }
         for k, value in enumerate(found.value)
     ]

@@ -54,7 +54,7 @@ def audit(
         if scene is not None:
             raise InputError("--prices", "goes without a scene; leave one of them out")
         rows = prices()
-        output.done({"prices": [row._asdict() for row in rows]}, lambda: _prices_table(rows), "prices")
+        output.done({"prices": rows}, lambda: _prices_table(rows), "prices")
         return
     if scene is None:
         raise InputError("SCENE", "is missing; give the path of a scene file, or --prices")

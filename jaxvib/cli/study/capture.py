@@ -10,6 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,5 +80,5 @@ def capture(
         head = ["initial speed, in the rotor's", "share captured", "standard error"]
         return table("starts captured", head, rows) + "\n" + found.summary()
 
-    document = {**found.as_dict(), "fraction": found.fraction.tolist(), "standard_error": found.standard_error.tolist()}
+    document = {**found.as_dict(), **fields_of(found, "fraction", "standard_error")}
     output.done(document, text, "capture", found)

@@ -9,6 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, Output, app, loaded_scene, shared, table
+from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from jaxvib.study.accuracy.cost import Cost, CostRow
@@ -54,14 +55,9 @@ def cost_document(cost: Cost) -> dict[str, object]:
     """All of a `Cost` as JSON has it."""
     from jaxvib.study.accuracy.cost import WANTED
 
-    best = {f"{error:.0e}": cost.cheapest(error) for error in WANTED}
     return {
-        "quantity": cost.quantity,
-        "reference": cost.reference,
-        "reference_error": cost.reference_error,
-        "rows": [row._asdict() for row in cost.rows],
-        "left_out": list(cost.left_out),
-        "cheapest": {error: None if row is None else row._asdict() for error, row in best.items()},
+        **fields_of(cost, "quantity", "reference", "reference_error", "rows", "left_out"),
+        "cheapest": {f"{error:.0e}": cost.cheapest(error) for error in WANTED},
     }
 
 

@@ -10,6 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
+from jaxvib.cli.output import fields_of
 
 if TYPE_CHECKING:
     from jaxvib.machine.files import Tables
@@ -69,27 +70,14 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
     document = {
         "status": found.status_name,
         "message": found.message,
-        "notes": list(found.notes),
-        "viscous": found.viscous._asdict(),
-        "dry": None if found.dry is None else found.dry._asdict(),
-        "correlation": found.correlation,
+        **fields_of(found, "notes", "viscous", "dry", "correlation"),
         "decrement": None
         if ten is None
-        else {
-            "viscous": ten.viscous._asdict(),
-            "scatter": ten.scatter,
-            "drift": ten.drift,
-            "period": ten.period,
-            "periods": ten.periods,
-            "pairs": len(ten.estimates),
-        },
-        "frequency": found.frequency._asdict(),
-        "offset": found.offset._asdict(),
-        "inertia": float(pendulum.total_inertia),
+        else {**fields_of(ten, "viscous", "scatter", "drift", "period", "periods"), "pairs": len(ten.estimates)},
+        **fields_of(found, "frequency", "offset"),
+        "inertia": pendulum.total_inertia,
         "inertia_by_frequency": found.inertia,
-        "noise": found.noise,
-        "pattern": found.pattern,
-        "stopped_at": found.stopped_at,
+        **fields_of(found, "noise", "pattern", "stopped_at"),
         "samples": swing.samples,
         "instrument": instrument,
     }
