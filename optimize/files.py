@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import called, closest, load_scene, out_of_place, read_toml
+from jaxvib.machine.files import Tables, called, closest, load_scene, out_of_place, read_toml
 from jaxvib.units import count, number
 from optimize.result import Synthesis
 from optimize.search.find import require_searcher
@@ -35,7 +35,7 @@ class Design:
 
     space: DesignSpace
     objective: Quantity
-    search: dict[str, Any] = field(default_factory=dict)
+    search: Tables = field(default_factory=dict)
     subject_to: tuple[Demand, ...] = ()
 
     def run(self, **more: Any) -> Synthesis:
@@ -111,7 +111,7 @@ def load_design(path: str | Path) -> Design:
     return Design(space, objective, search, demands)
 
 
-def _demands(table: Any, section: str) -> list[Demand]:
+def _demands(table: object, section: str) -> list[Demand]:
     quantity, more = quantity_from_table(table, section, ("at_most", "at_least"))
     if not more:
         raise InputError(section, "has no limit; give at_most or at_least, or both")
@@ -119,7 +119,7 @@ def _demands(table: Any, section: str) -> list[Demand]:
     return [made[name](limit) for name, limit in more.items()]
 
 
-def quantity_from_table(table: Any, section: str, more: tuple[str, ...]) -> tuple[Quantity, dict[str, Any]]:
+def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> tuple[Quantity, Tables]:
     """A quantity from a table of a file, the part `section` of it, and the values of the fields `more` that are not its own.
 
     **Raises** `InputError` for an unknown quantity, and for values that are not allowed.

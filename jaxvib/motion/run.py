@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -186,7 +186,7 @@ _FIRST_STATUSES = ("done", "max_steps_reached", "not_finite", "no_step", "not_ac
 """The names of statuses in the order of their numbers in the first format."""
 
 
-def from_first_format(archive: Mapping[str, Any]) -> Run:
+def from_first_format(archive: Mapping[str, np.ndarray]) -> Run:
     """The run in an archive that has no layout, but its arrays numbered in the order of the fields."""
     scene = scene_from_toml(str(archive["scene"]))
     leaves = (jnp.asarray(archive[f"leaf{k}"]) for k in itertools.count())

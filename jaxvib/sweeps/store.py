@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
 from jaxvib.sweeps.axes import SAMPLE
@@ -62,10 +63,10 @@ class Store:
             raise InputError("store", f"is {str(path)!r}; there is no such store")
         try:
             self.group = zarr.open_group(path, mode="r+" if writable else "r", zarr_format=3)
-            self.attributes: dict[str, Any] = dict(self.group.attrs)
+            self.attributes: Tables = dict(self.group.attrs)
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {str(path)!r}, which is no store of a sweep; name another one")
-            self.record: dict[str, Any] = self.attributes["study"]
+            self.record: Tables = self.attributes["study"]
             # Where a chunk has no answer at all its file is written too: one that is missing is a damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
@@ -192,8 +193,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
 
     grid = study.grid
     sampled = [axis for axis in grid.axes if axis.values is None]
-    fixed: dict[str, Any] = {"compressors": ZstdCodec(level=1, checksum=True)}
-    attributes: dict[str, Any] = {
+    attributes: Tables = {
         "jaxvib_sweep": _FORMAT,
         "study": study.record,
         "versions": versions(),
@@ -205,7 +205,9 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
         attributes["coordinates"] = " ".join(coordinates)
     group = zarr.create_group(path, zarr_format=3, attributes=attributes)
 
-    def add(name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: Any, **more: Any) -> Any:
+    def add(
+        name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: object, **more: Plain
+    ) -> Any:
         told = {key: value for key, value in more.items() if key != "fill" and value}
         return group.create_array(
             name,
@@ -215,7 +217,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
             dimension_names=dims,
             fill_value=more["fill"],
             attributes=told,
-            **fixed,
+            compressors=ZstdCodec(level=1, checksum=True),
         )
 
     for axis in grid.axes:

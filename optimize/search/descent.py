@@ -73,7 +73,8 @@ def _along(vector: Array, held: Array, free: Array) -> Array:
     return vector - _least(rows, rows @ vector)
 
 
-def _begin(point: Any, multipliers: Array) -> _Lane:
+@cached
+def _begun(point: Any, multipliers: Array) -> _Lane:
     lane = jax.vmap(_ADAM.init)(point.z)
     n = point.z.shape[0]
     one = jnp.ones(n)
@@ -128,11 +129,6 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
 def _ahead(known: Array, reach: Array, step: Array) -> Array:
     moved = known + reach @ step
     return jnp.where(jnp.isfinite(moved) & (jnp.abs(moved / known - 1.0) < 0.2), moved, known)
-
-
-@cached
-def _begun(point: Point, multipliers: Array) -> _Lane:
-    return _begin(point, multipliers)
 
 
 @cached

@@ -20,7 +20,7 @@ from jax import Array
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.jams.jam import JamModes, jam_modes
 from optimize.space.space import DesignSpace, Held
 from optimize.wishes.answers import Answers, Key, Recorder, guesses
 from optimize.wishes.quantity import Asking, Demand, Quantity, walk
@@ -194,7 +194,7 @@ def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
     """The load speed of each key for a batch of scenes, from whole branches."""
 
     def one(scene: Scene) -> tuple[Array, ...]:
-        paths: dict[tuple, Any] = {}
+        paths: dict[tuple, JamModes] = {}
         for path, _ in keys:
             if path not in paths:
                 at, several = scene, False
@@ -247,7 +247,7 @@ class _Shapes(NamedTuple):
     """What a scene is but for its numbers."""
 
     tree: Any
-    leaves: tuple[tuple[tuple[int, ...], Any], ...]
+    leaves: tuple[tuple[tuple[int, ...], np.dtype], ...]
 
     @classmethod
     def of(cls, scene: Scene) -> _Shapes:

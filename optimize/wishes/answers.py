@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
-from functools import cached_property
-from typing import Any, Protocol
+from collections.abc import Callable, Hashable, Mapping
+from functools import cached_property, partial
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -141,7 +141,8 @@ class Answers:
     def jam_run(self, mode: int) -> Run:
         """The full equations, integrated from a jam mode for 60 periods of the lowest natural frequency."""
         lowest = jnp.min(jax.lax.stop_gradient(natural_frequencies(self.scene)))
-        return self._run(("jam", mode), 60.0 * 2.0 * jnp.pi / lowest, start="jam", mode=mode, save="window")
+        until = 60.0 * 2.0 * jnp.pi / lowest
+        return self._run(("jam", mode), partial(simulate, self.scene, until, start="jam", mode=mode, save="window"))
 
     def keep_run(self, mode: int, run: Run) -> None:
         """Takes a run that has settled in a jam mode for `jam_run`."""
@@ -149,16 +150,17 @@ class Answers:
 
     def start_up(self, until: float, spin_up: float) -> Run:
         """The full equations from rest, the rotor brought up smoothly over the time `spin_up`, s, to the time `until`, s."""
-        return self._run(("start_up", until, spin_up), until, start="spin_up", spin_up=spin_up, samples=_SAMPLES)
+        ask = partial(simulate, self.scene, until, start="spin_up", spin_up=spin_up, samples=_SAMPLES)
+        return self._run(("start_up", until, spin_up), ask)
 
-    def _run(self, key: Hashable, until: Array | float, **options: Any) -> Run:
+    def _run(self, key: Hashable, ask: Callable[..., Run]) -> Run:
         """A run; derivatives in forward mode."""
         import diffrax
 
         if key not in self._runs:
             known = not any(traced(leaf) for leaf in jax.tree.leaves(self.scene))
             adjoint = None if known else diffrax.ForwardMode()
-            self._runs[key] = simulate(self.scene, until, estimate=False, adjoint=adjoint, throw=False, **options)
+            self._runs[key] = ask(estimate=False, adjoint=adjoint, throw=False)
         return self._runs[key]
 
     def under(self, case: Case) -> tuple[Scene, tuple[Case, ...]]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 from jaxvib.units import Number, number
 
 __all__ = ["arguments", "number_in", "same_unit"]
 
 
-def arguments(function: Callable[..., Any]) -> int:
+def arguments(function: Callable[..., object]) -> int:
     """How many arguments a function must be given; 1 where nobody says."""
     try:
         given = inspect.signature(function).parameters.values()

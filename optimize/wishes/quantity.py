@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import jax.numpy as jnp
 from jax import Array
@@ -153,7 +153,7 @@ class Asking(Quantity):
     """A quantity that knows what to ask: its function gets the `Answers`, the tier and the `settings`."""
 
     tier: Tier = "leading"
-    settings: tuple[Any, ...] = ()
+    settings: tuple[object, ...] = ()
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
     parted: Callable[..., Array] | None = None

@@ -57,7 +57,7 @@ class Film(FuncAnimation):
     second.
     """
 
-    def __init__(self, figure: Figure, update: Callable[[int], Any], moving: Sequence[Artist], count: int, fps: float):
+    def __init__(self, figure: Figure, update: Callable[[int], object], moving: Sequence[Artist], count: int, fps: float):
         super().__init__(figure, lambda k: [update(k), moving][1], frames=count, interval=1000.0 / fps, blit=False)
         self._draw_was_started = True  # what was never shown need not be warned of
         self.figure, self._update, self._moving, self.count, self.fps = figure, update, list(moving), count, fps
