@@ -75,7 +75,7 @@ def runs(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: int) -> C
     if lanes == 1:
         call = jax.jit(lambda s: ended(s, start, steps, step, False))
         return lambda: call(s)
-    speeds = s.drive.speed * jnp.linspace(0.9, 1.1, lanes)  # pyright: ignore[reportAttributeAccessIssue]
+    speeds = s.drive.speed * jnp.linspace(0.9, 1.1, lanes)
     many = jax.jit(jax.vmap(lambda speed: ended(eqx.tree_at(lambda s: s.drive.speed, s, speed), start, steps, step, True)))
     return lambda: many(speeds)
 
@@ -165,7 +165,7 @@ def gradients(quick: bool) -> None:
         )
         return found.window.state.displacement[-1, 0]
 
-    speed: Array = s.drive.speed  # pyright: ignore[reportAttributeAccessIssue]
+    speed: Array = s.drive.speed
     exact = float(jax.jit(jax.jacfwd(lambda x: final(x, diffrax.ForwardMode())))(speed))
     base = None
     for name, off in (("as it is", NONE), ("step replay: steps chosen anew", checkpointed)):

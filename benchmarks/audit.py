@@ -62,7 +62,7 @@ def bearing() -> list[tuple[float, float, float]]:
     """Of the published rotor's pendulums, turning evenly at some speeds on a shaft that does not move: the speed, the largest
     change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), per cent."""
     machine = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
-    length = float(published_rotor().loads.radius)  # pyright: ignore[reportAttributeAccessIssue]
+    length = float(published_rotor().loads.radius)
     loads = jv.pendulums(count=1, mass=0.05, radius=length, drag=0.0)
     heavy, light = (jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects) for effects in ((jv.Gravity(),), ()))
 

@@ -65,7 +65,7 @@ def twice(ask: Callable[[], object]) -> tuple[object, float, float]:
 
 
 def ratio(found: object) -> float:
-    k = found.scene.machine.stiffness  # pyright: ignore
+    k = found.scene.machine.stiffness
     return float(np.sqrt(k[1] / k[0]))
 
 
@@ -113,7 +113,7 @@ def _pressed(scene: jv.Scene) -> complex:
     """F/d: the force of the springs and dampers on the bed over y1 - y2, complex amplitudes."""
     jam = jv.jam_modes(scene).select(3)
     y, machine = np.asarray(jam.displacement), scene.machine
-    supports = np.asarray(machine.stiffness) + 1j * float(jam.omega) * np.asarray(machine.damping)  # pyright: ignore
+    supports = np.asarray(machine.stiffness) + 1j * float(jam.omega) * np.asarray(machine.damping)
     return complex(supports @ y / (y[0] - y[1]))
 
 

@@ -70,7 +70,7 @@ def slopes(kind: Callable[..., Any], **options: Any) -> Call:
         return run.window.state.displacement[-1, 0]
 
     call = jax.jit(kind(end))
-    k: jax.Array = scene.machine.stiffness  # pyright: ignore[reportAttributeAccessIssue]
+    k: jax.Array = scene.machine.stiffness
     return lambda: call(k)
 
 

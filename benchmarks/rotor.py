@@ -203,7 +203,7 @@ def main() -> None:
 
         def run(tol: float = tolerance) -> Any:
             found = jv.simulate(scene, end, start=start, stepsize_controller=jv.Tolerance(tol), samples=2, estimate=False)
-            return jax.block_until_ready(found.trajectory.state.angle[0][-1])  # pyright: ignore[reportOptionalMemberAccess]
+            return jax.block_until_ready(found.trajectory.state.angle[0][-1])
 
         compiling, seconds, angle = timed(run)
         error = float(jnp.max(jnp.abs(angle - reference)))

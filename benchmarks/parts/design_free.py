@@ -88,7 +88,7 @@ def gradient_cost(free: int, repeat: int = 200) -> tuple[float, float]:
             begun = time.process_time()
             for _ in range(repeat):
                 out = function(jnp.asarray(z))
-            jax.block_until_ready(out)  # pyright: ignore
+            jax.block_until_ready(out)
             least = min(least, (time.process_time() - begun) / repeat)
         return least
 
