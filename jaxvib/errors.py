@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
 
-__all__ = ["ComputationError", "InputError", "require_one_of"]
+__all__ = ["ComputationError", "InputError", "require_one_of", "written"]
 
 
 class InputError(ValueError):
@@ -38,6 +40,15 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
     """
     if value not in (allowed := tuple(allowed)):
         raise InputError(field, f"{verb} {value!r}; allowed: {', '.join(allowed)}")
+
+
+@contextlib.contextmanager
+def written(path: Path) -> Iterator[None]:
+    """**Raises** `InputError` where what stands inside cannot write the file."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
 
 
 class ComputationError(RuntimeError):

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
 from jaxvib.machine.effects.registry import EFFECTS
@@ -142,10 +142,8 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
     True
     """
     path = Path(path)
-    try:
+    with written(path):
         path.write_text(scene_to_toml(scene), encoding="utf-8")
-    except OSError as error:
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
     return path
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, written
 from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, escaped, parameters, results, worth
 from jaxvib.results.fields import Plain
@@ -97,10 +97,8 @@ def html_report(
         scene = own
     drawn = [(kind, result.plot())] if figures is None else figures
     page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
-    try:
+    with written(path):
         path.write_text(page.html(), encoding="utf-8")
-    except OSError as error:
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
     return path
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, written
 from jaxvib.results.fields import Labels, columns, labels_of
 
 __all__ = ["write_csv"]
@@ -51,13 +51,10 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     if not rows:
         raise InputError("axis", f"is {axis!r}; {type(result).__name__} holds nothing along it")
     path = Path(path)
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(heads)
-            writer.writerows([_shown(x) for x in row] for row in zip(*rows, strict=True))
-    except OSError as error:
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
+    with written(path), path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(heads)
+        writer.writerows([_shown(x) for x in row] for row in zip(*rows, strict=True))
     return path
 
 

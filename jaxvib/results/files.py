@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, written
 from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
@@ -45,10 +45,8 @@ def save(result: eqx.Module, path: str | Path) -> Path:
     layout = json.dumps(_encoded(result, arrays))
     path = Path(path)
     path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-    try:
+    with written(path):
         np.savez(path, **{_LAYOUT: np.asarray(layout)}, **arrays)  # pyright: ignore[reportArgumentType]
-    except OSError as error:
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
     return path
 
 

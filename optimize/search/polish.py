@@ -78,12 +78,18 @@ def restored(
         if shares is not None:
             apart, tilts = unlike(point, shares, np.maximum(np.abs(point.values[:, 0]), 1e-300))
             slopes, values = np.concatenate([slopes, tilts], axis=1), np.concatenate([values, apart], axis=1)
-        wanted = -least_norm(slopes, values)
-        stopped = ((point.z <= 0.0) & (wanted < 0.0)) | ((point.z >= 1.0) & (wanted > 0.0))
-        step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
-        z = np.clip(point.z + np.clip(step, -0.3, 0.3), 0.0, 1.0)
+        z = _moved(point.z, slopes, values, most=0.3)
         point = evaluate(problem, z, point.ahead(z))
     return point
+
+
+def _moved(z: np.ndarray, slopes: np.ndarray, values: np.ndarray, most: float = np.inf) -> np.ndarray:
+    """The designs z (s, d) moved the shortest way to where `values` (s, m) with these `slopes` (s, m, d) would be 0, inside the
+    bounds, no number by more than `most`."""
+    wanted = -least_norm(slopes, values)
+    stopped = ((z <= 0.0) & (wanted < 0.0)) | ((z >= 1.0) & (wanted > 0.0))
+    step = -least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values)
+    return np.clip(z + np.clip(step, -most, most), 0.0, 1.0)
 
 
 class Starts(NamedTuple):
@@ -134,9 +140,7 @@ def _onto_held(problem: Problem, point: Point) -> Point:
         finite = point.exists()
         slopes = np.where(finite[:, None, None], point.slopes, 0.0)[:, 1 : 1 + m]
         values = np.where(finite[:, None], point.values, 0.0)[:, 1 : 1 + m]
-        wanted = -least_norm(slopes, values)
-        stopped = ((point.z <= 0.0) & (wanted < 0.0)) | ((point.z >= 1.0) & (wanted > 0.0))
-        z = np.clip(point.z - least_norm(slopes * np.where(stopped, 0.0, 1.0)[:, None, :], values), 0.0, 1.0)
+        z = _moved(point.z, slopes, values)
         point = evaluate(problem, z, point.ahead(z))
     return point
 

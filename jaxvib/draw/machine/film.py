@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxvib.errors import InputError
+from jaxvib.errors import written
 
 __all__ = ["Film"]
 
@@ -90,14 +90,11 @@ class Film(FuncAnimation):
         if path.suffix.lower() not in (".gif", ".html", ".htm") or rest or options:
             super().save(str(filename), *rest, **options)
             return
-        try:
+        with written(path):
             if path.suffix.lower() == ".gif":
                 self._gif(path)
             else:
                 path.write_text(self._page(path.stem), encoding="utf-8")
-        except OSError as error:
-            problem = f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file"
-            raise InputError("path", problem) from error
 
     def _gif(self, path: Path) -> None:
         first, *others = self._few_colours()
