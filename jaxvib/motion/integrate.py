@@ -132,7 +132,7 @@ def integrate(
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
     single, together = wrap_angles(scene, state.displacement.dtype)
     field = vector_field(scene)
-    motion = PackedSystem(field, state, wrapped=single and solver is None, together=together)
+    motion = PackedSystem(field, state, wrapped=single and solver is None, together=together, solver=solver)
     if solver is None:
         solver = motion.method()
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest

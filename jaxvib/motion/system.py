@@ -1,4 +1,5 @@
-"""A vector field and a state in the form in which they are integrated fastest: as single numbers, where it is small."""
+"""A vector field and a state in the form in which they are integrated fastest: its equations on single numbers, where it is
+small."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import State
-from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.ode.dopri8 import UnrolledDopri8, ravel
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, RealScalarLike
@@ -24,7 +25,7 @@ from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 __all__ = ["PackedSystem"]
 
 Held: TypeAlias = PyTree[Array]
-"""What the integrator holds: a state or a tuple of its numbers; where angles are wrapped a pair, that and the turns done."""
+"""What the integrator holds: the numbers of a state; where angles are wrapped a pair, those and the turns done."""
 
 _TURN = 2.0 * math.pi
 
@@ -33,27 +34,39 @@ _MOST_WRITTEN = 8
 
 
 class PackedSystem(eqx.Module):
-    """Translates between a `State` and what the integrator holds: a tuple of numbers, or the state itself where it is large.
+    """Translates between a `State` and what the integrator holds: a vector of its numbers, or a tuple of them.
+
+    The method whose stages are written out takes a tuple, which it keeps where a processor computes; any other takes a vector,
+    of which diffrax saves, compares and carries one array in place of many.
 
     Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
     single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
 
     **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
-    the same turns, so that their differences stay.
+    the same turns, so that their differences stay; the `solver` that integrates them, if it is not `method`.
 
-    **Attributes**: `program` the equations on numbers, None where the state is held itself; `size` how many numbers it has;
-    `args` the arguments of `term`.
+    **Attributes**: `program` the equations on numbers, None where there are too many; `size` how many numbers the state has;
+    `apart` whether they are held one by one; `args` the arguments of `term`.
     """
 
     args: Args
     program: ClosedJaxpr | None = eqx.field(static=True)
     size: int = eqx.field(static=True)
+    apart: bool = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
     together: bool = eqx.field(static=True)
 
-    def __init__(self, field: Callable[[Array, State], State], state: State, *, wrapped: bool = False, together: bool = False):
+    def __init__(
+        self,
+        field: Callable[[Array, State], State],
+        state: State,
+        *,
+        wrapped: bool = False,
+        together: bool = False,
+        solver: diffrax.AbstractSolver | None = None,
+    ):
         self.wrapped, self.together = wrapped, together
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
@@ -64,10 +77,13 @@ class PackedSystem(eqx.Module):
         if self.is_scalarized:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
             self.args = scalars_of(field)
+        self.apart = self.is_scalarized and (
+            self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
+        )
 
     @property
     def is_scalarized(self) -> bool:
-        """Whether the state is held as single numbers."""
+        """Whether the equations are those on single numbers."""
         return self.program is not None
 
     @property
@@ -83,63 +99,47 @@ class PackedSystem(eqx.Module):
 
     def pack(self, state: State) -> Held:
         """A state (or a tree like it) as the integrator holds it."""
-        y = tuple(scalars_of(state)) if self.is_scalarized else state
-        return (y, jax.tree.map(jnp.zeros_like, self._angles(y))) if self.wrapped else y
+        y = tuple(scalars_of(state)) if self.apart else ravel(state)
+        return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
     def unpack(self, held: Held) -> State:
         """States along a leading axis, from what the integrator held then; wrapped angles count from the first one's turn."""
         if not self.wrapped:
             return self._state(held)
         y, turns = held
-        return self._state(self._turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
+        return self._state(_turned(y, jax.tree.map(lambda n: n - n[:1], turns), 1.0))
 
     def _wrap(self, held: Held) -> Held:
         """Takes whole turns out of the angles and counts them."""
         y, turns = held
-        angles = self._angles(y)
-        first = jnp.ravel(angles[0])[0]
-        done = [
-            jnp.round((first if self.together and k < len(angles) - self._rotors else x) / _TURN) for k, x in enumerate(angles)
-        ]
-        done = [jnp.broadcast_to(n, x.shape) for n, x in zip(done, angles, strict=True)]
-        return self._turned(y, done, -1.0), [n + more for n, more in zip(turns, done, strict=True)]
+        angles, loads = self._angles()
+        first = y[int(np.argmax(angles))]
 
-    @property
-    def _rotors(self) -> int:
-        return int(jax.tree.unflatten(self.like, self.shapes).rotor is not None)
+        def whole(x: Array, is_angle: np.ndarray, is_load: np.ndarray) -> Array:
+            return jnp.where(is_angle, jnp.round(jnp.where(is_load & self.together, first, x) / _TURN), 0.0)
 
-    def _places(self) -> list[int]:
-        """Where the angles are among the leaves of what is held."""
+        masks = (tuple(angles), tuple(loads)) if self.apart else (angles, loads)
+        done = jax.tree.map(whole, y, *masks)
+        return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
+
+    def _angles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the numbers are angles, and which of these the loads'."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
-        numbered = jax.tree.unflatten(
-            self.like, [range(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
+        places = jax.tree.unflatten(
+            self.like, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]
         )
-        leaves = jax.tree.unflatten(self.like, range(len(self.shapes)))
-        chosen = numbered if self.is_scalarized else jax.tree.map(lambda k: [k], leaves)
-        rotor = [] if chosen.rotor is None else [chosen.rotor[0]]
-        return [place for places in (*chosen.angle, *rotor) for place in places]
-
-    def _angles(self, y: Held) -> list[Array]:
-        leaves = jax.tree.leaves(y)
-        return [leaves[place] for place in self._places()]
-
-    def _turned(self, y: Held, turns: list[Array], sign: float) -> Held:
-        """Angles changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
-        leaves, rest = jax.tree.flatten(y)
-        for place, n in zip(self._places(), turns, strict=True):
-            high = np.asarray(_TURN, leaves[place].dtype)
-            low = np.asarray(_TURN - float(high), leaves[place].dtype)
-            leaves[place] = (leaves[place] + sign * n * high) + sign * n * low
-        return jax.tree.unflatten(rest, leaves)
+        loads = np.isin(np.arange(self.size), np.concatenate(places.angle))
+        rotor = [] if places.rotor is None else places.rotor[0]
+        return loads | np.isin(np.arange(self.size), rotor), loads
 
     def _state(self, y: Held) -> State:
-        if not self.is_scalarized:
-            return y
-        rows = iter(y)
-        parts = []
-        for shape in self.shapes:
-            entries = [next(rows) for _ in np.ndindex(*shape)]
-            parts.append(jnp.stack(entries, axis=-1).reshape(*entries[0].shape, *shape))
+        """States along a leading axis."""
+        rows = jnp.stack(y, axis=-1) if self.apart else y
+        ends = np.cumsum([math.prod(shape) for shape in self.shapes])
+        parts = [
+            rows[..., end - math.prod(shape) : end].reshape(*rows.shape[:-1], *shape)
+            for end, shape in zip(ends, self.shapes, strict=True)
+        ]
         return jax.tree.unflatten(self.like, parts)
 
     def _rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
@@ -150,5 +150,18 @@ class PackedSystem(eqx.Module):
 
     def _plain_rates(self, t: RealScalarLike, y: Held, args: Args) -> Held:
         if self.program is None:
-            return args(t, y)
-        return tuple(jaxpr_as_fun(self.program)(jnp.asarray(t, y[0].dtype), *y, *args))
+            return ravel(args(t, self._state(y)))
+        numbers = y if self.apart else jnp.unstack(y)
+        rates = jaxpr_as_fun(self.program)(jnp.asarray(t, numbers[0].dtype), *numbers, *args)
+        return tuple(rates) if self.apart else jnp.stack(rates)
+
+
+def _turned(y: Held, turns: Held, sign: float) -> Held:
+    """Numbers changed by whole turns, 2 pi in two parts: the rounding of 2 pi would add up to a drift."""
+
+    def turned(x: Array, n: Array) -> Array:
+        high = np.asarray(_TURN, x.dtype)
+        low = np.asarray(_TURN - float(high), x.dtype)
+        return (x + sign * n * high) + sign * n * low
+
+    return jax.tree.map(turned, y, turns)

@@ -45,9 +45,23 @@ def test_equations_are_the_same_on_numbers(name):
 def test_equations_of_many_operations_stay_on_arrays():
     s = case("friction, exact, dc")
     state = rotor_state(s, 5)
-    motion = PackedSystem(jv.vector_field(s), state)
+    motion, t = PackedSystem(jv.vector_field(s), state), jnp.asarray(0.7)
     assert not motion.is_scalarized
-    assert motion.pack(state) is state
+    ours = motion.unpack(motion.term.vf(t, motion.pack(state), motion.args)[None])
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jv.vector_field(s)(t, state)), strict=True):
+        np.testing.assert_array_equal(a[0], b)
+
+
+@pytest.mark.parametrize("name", ["friction, exact, dc", "imbalance, dc", "contact"])
+@pytest.mark.parametrize("solver", [None, UnrolledDopri8(), LoopDopri8()])
+def test_a_state_comes_back_as_it_was(name, solver):
+    """From a vector, from a tuple of numbers, with angles that are wrapped and with such that are not."""
+    state = rotor_state(case(name), 5)
+    for wrapped in (False, True):
+        motion = PackedSystem(jv.vector_field(case(name)), state, wrapped=wrapped, solver=solver)
+        assert motion.apart == (isinstance(solver, UnrolledDopri8) and motion.is_scalarized)
+        back = motion.unpack(jax.tree.map(lambda x: x[None], motion.pack(state)))
+        jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), back, state)
 
 
 def test_wrapping_counts_every_turn():
