@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, jammed_loads, require_effects
+from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, require_effects
 from jaxvib.machine.effects.base import Effect, total_gravity
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -30,7 +30,7 @@ class CollectedModel(eqx.Module):
     angle ahead of the body's own; `half_turn` see `has_half_turn`.
     """
 
-    linear: LinearModel
+    linear: JammedModel
     loads: CircularLoads
     effects: tuple[Effect, ...]
     unbalance: Array
@@ -88,17 +88,16 @@ class CollectedModel(eqx.Module):
         return by_angle, by_rate, jnp.stack(by_a)
 
 
-def collected_model(linear: LinearModel) -> CollectedModel:
+def collected_model(scene: Scene) -> CollectedModel:
     """The scene's collected loads as bodies on its carrier. **Raises** `InputError` as `require_collected`."""
-    loads = require_collected(linear.scene)
+    loads, linear = require_collected(scene), jammed_model(scene)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
     if loads.alike:
-        unbalance, whole, drag = loads.unbalance()[None], loads.count * inertia[None], loads.drag_sum()[None]
+        unbalance, whole, drag = linear.unbalance[None], loads.count * inertia[None], linear.drag[None]
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
         unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
-    half_turn = has_half_turn(linear.scene)
-    return CollectedModel(linear, loads, linear.scene.effects, unbalance, whole, drag, loads.offsets(), half_turn)
+    return CollectedModel(linear, loads, scene.effects, unbalance, whole, drag, loads.offsets(), has_half_turn(scene))
 
 
 def require_collected(scene: Scene) -> CircularLoads:

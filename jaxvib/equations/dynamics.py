@@ -17,7 +17,7 @@ from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, Friction, SlipLimit, total_gravity
 from jaxvib.machine.loads import Loads, Twisting
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import small_inverse, times
+from jaxvib.numerics.linalg import small_inverse, small_solve, times
 
 __all__ = ["Dynamics", "Spin", "State", "vector_field"]
 
@@ -367,7 +367,7 @@ def vector_field(scene: Scene) -> Dynamics:
     parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for _, rows in places)]
     if carrier.gyroscopic is not None:
         parts.append(carrier.gyroscopic)
-    solved = jnp.linalg.solve(carrier.mass, jnp.concatenate(parts, axis=1))
+    solved = small_solve(carrier.mass, jnp.concatenate(parts, axis=1))
     stiffness, damping, push, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
     return Dynamics(
         stiffness=stiffness,

@@ -18,9 +18,11 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 
 __all__ = [
+    "JammedModel",
     "LinearModel",
     "circular_loads",
     "jammed_loads",
+    "jammed_model",
     "linear_model",
     "natural_frequencies",
     "peak_force",
@@ -62,14 +64,6 @@ class LinearModel(eqx.Module):
         damping = self.damping(omega if speed is None else speed)
         return jax.lax.complex(self.carrier.stiffness - omega**2 * self.mass, omega * damping)
 
-    def displacement(self, omega: Array, speed: Array | None = None) -> Array:
-        """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
-        if self.carrier.gyroscopic is not None and speed is None:
-            problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
-            raise InputError("machine.kind", f"is {self.scene.machine.kind!r}; {problem}")
-        force = jammed_loads(self.scene).unbalance() * omega**2 * self.direction
-        return small_solve(self.dynamic_stiffness(omega, speed), force)
-
     def modes(self) -> tuple[Array, Array]:
         """Undamped natural frequencies (nd,) rad/s, ascending, and mass-normalised mode shapes (nd, nd), a column a mode."""
         square, inverse = relative_to(self.mass, self.carrier.stiffness)
@@ -87,6 +81,36 @@ def linear_model(scene: Scene) -> LinearModel:
         rows = jax.vmap(carrier.port_at)(carrier.stations)
         mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
     return LinearModel(scene, carrier, mass)
+
+
+class JammedModel(LinearModel):
+    """A linear model whose loads are jammed: checked, and what is the same at all load speeds computed, once a question.
+
+    **Attributes**, besides those of `LinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2, N m s;
+    `push` (nd,) complex, the `direction` of their force.
+    """
+
+    unbalance: Array
+    drag: Array
+    push: Array
+
+    @property
+    def loads(self) -> CircularLoads:
+        """The scene's loads."""
+        return cast(CircularLoads, self.scene.loads)
+
+    def displacement(self, omega: Array, speed: Array | None = None) -> Array:
+        """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
+        if self.carrier.gyroscopic is not None and speed is None:
+            problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
+            raise InputError("machine.kind", f"is {self.scene.machine.kind!r}; {problem}")
+        return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.push)
+
+
+def jammed_model(scene: Scene) -> JammedModel:
+    """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
+    loads, model = jammed_loads(scene), linear_model(scene)
+    return JammedModel(scene, model.carrier, model.mass, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
 def natural_frequencies(scene: Scene) -> Array:
@@ -126,7 +150,7 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
 
     Source: Filimonikhin et al. 2022, section 4; the antiphase paper, equations (25)-(29).
     """
-    return linear_model(scene).displacement(omega, speed)
+    return jammed_model(scene).displacement(omega, speed)
 
 
 def turning(carrier: Carrier) -> Array:

@@ -46,17 +46,18 @@ class Platforms(Machine):
     def carrier(self) -> Carrier:
         """The linear structure of the platforms; one port, one direction (up)."""
         n = self.mass.shape[0]
-        ends = np.zeros((len(self.links), n))
-        for row, (i, j) in enumerate(self.links):
+        # A row for each support, whose other end is the bed, and for each link.
+        ends = np.concatenate([np.eye(n), np.zeros((len(self.links), n))]).astype(self.mass.dtype)
+        for row, (i, j) in enumerate(self.links, n):
             ends[row, i - 1], ends[row, j - 1] = 1.0, -1.0
 
         def assembled(support: Array, link: Array) -> Array:
-            return jnp.diag(support) + jnp.einsum("la,l,lb->ab", ends.astype(link.dtype), link, ends.astype(link.dtype))
+            return (ends.T * jnp.concatenate([support, link])[None]) @ ends
 
         port = np.zeros((1, n))
         port[0, self.exciter - 1] = 1.0
         return Carrier(
-            mass=jnp.diag(self.mass),
+            mass=self.mass[None] * np.eye(n, dtype=self.mass.dtype),
             damping=assembled(self.damping, self.link_damping),
             stiffness=assembled(self.stiffness, self.link_stiffness),
             gyroscopic=None,

@@ -48,11 +48,10 @@ def each_coordinate(unit: State, number: int) -> State:
     return State(unit.displacement, unit.velocity, unit.angle * number, unit.rate * number, unit.rotor, spin)
 
 
-def _controller(scene: Scene, motion: PackedSystem, state: State, control: StepControl) -> diffrax.AbstractStepSizeController:
+def _controller(motion: PackedSystem, state: State, natural: State, control: StepControl) -> diffrax.AbstractStepSizeController:
     if control.steps is not None:
         return diffrax.ConstantStepSize()
     assert control.tolerance is not None
-    natural = natural_units(scene)
     # The error of an angle is absolute: relative to its ever-growing value, it would let a long run lose its phase.
     rotor = None if state.rotor is None else (jnp.zeros(()), jnp.ones(()))
     one, number = jnp.ones(()), len(state.angle)
@@ -123,7 +122,7 @@ def integrate(
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
-    fastest, slowest = fastest_and_slowest(scene)
+    (fastest, slowest), unit = fastest_and_slowest(scene), natural_units(scene)
     longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
@@ -142,7 +141,7 @@ def integrate(
         if controller.tolerance is not None:
             # As the error of a step of order 8 asks; two runs, one to a larger tolerance, then make other steps from the first.
             first = 0.4 * controller.tolerance ** (1.0 / 9.0) / fastest
-        controller = _controller(scene, motion, state, controller)
+        controller = _controller(motion, state, unit, controller)
     solution = solve(
         motion.term,
         solver,
@@ -160,12 +159,12 @@ def integrate(
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
     whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if samples else None
-    seen = (measure(scene, field, times, states), window, whole)
+    seen = (measure(scene, field, times, states, unit), window, whole)
     measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
     ended = solution.result == diffrax.RESULTS.successful
-    bounded = jnp.where(ended, is_finite(states), ~_grew(scene, state, last))
+    bounded = jnp.where(ended, is_finite(states), ~_grew(unit, state, last))
     steps = solution.stats["num_steps"]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
@@ -189,9 +188,8 @@ def _is_together(angle: Array) -> Array:
     return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
 
 
-def _grew(scene: Scene, first: State, last: State) -> Array:
+def _grew(unit: State, first: State, last: State) -> Array:
     """Whether the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
-    unit = natural_units(scene)
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)

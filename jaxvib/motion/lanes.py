@@ -13,6 +13,7 @@ from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory
 from jaxvib.motion.analysis.regime import Regime, regime
+from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y as Held
@@ -108,5 +109,5 @@ def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
     window = trajectory(scene, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
-    found = measure(scene, field, times, states), regime(scene, window)
+    found = measure(scene, field, times, states, natural_units(scene)), regime(scene, window)
     return WatchedRun(scene, window, *found, speed, jnp.asarray(length, dtype), is_finite(states))

@@ -7,12 +7,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, overload
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -138,8 +137,8 @@ def branches(
 
 @cached
 def _branches(scene: Scene, top: Array, points: int, per_side: int) -> Branches:
-    model = linear_model(scene)
-    crowded, resonances = fold_points(jax.lax.stop_gradient(model), per_side)
+    model = jammed_model(scene)
+    crowded, resonances = fold_points(model, per_side)
     # As many points as asked for: those of the crowded grid, thinned evenly and pressed into the range.
     inside = jnp.interp(jnp.linspace(0.0, 1.0, points), jnp.linspace(0.0, 1.0, crowded.shape[0]), crowded)
     share = jnp.linspace(0.0, 1.0, points)

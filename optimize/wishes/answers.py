@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, linear_model, natural_frequencies
+from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
@@ -93,6 +93,11 @@ class Answers:
         return linear_model(self.scene)
 
     @cached_property
+    def jammed(self) -> JammedModel:
+        """The same with what jams of all speeds share."""
+        return jammed_model(self.scene)
+
+    @cached_property
     def modes(self) -> JamModes:
         """All jam modes."""
         return jam_modes(self.scene)
@@ -104,7 +109,7 @@ class Answers:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
-            jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.model, mode, self.known[key])
+            jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.jammed, mode, self.known[key])
             self._jams[key] = jam
             self.found[key] = jam.omega
         return self._jams[key]
@@ -117,7 +122,7 @@ class Answers:
             key: Key = (self.path, (side, mode))
             near = guesses(self.modes, (side, mode)) if self.known is None else self.known[key]
             there = jnp.isfinite(near)
-            omega, speed = follow_fold(self.model, jnp.where(there, near, 1.0))
+            omega, speed = follow_fold(self.jammed, jnp.where(there, near, 1.0))
             self.found[key] = jnp.where(there, omega, near)
             slower = (side == "below") == (mode % 2 == 1)
             speeds.append(jnp.where(there, speed, 0.0 if slower else _NO_FOLD * self.scene.drive.speed))

@@ -12,7 +12,6 @@ from jax import Array
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import foundation_force
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
@@ -91,18 +90,18 @@ def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
     return Trajectory(times, states, force, angle, speed)
 
 
-def measure(scene: Scene, field: Field, times: Array, states: State) -> Measured:
+def measure(scene: Scene, field: Field, times: Array, states: State, unit: State) -> Measured:
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the rates the equations of motion give, not on the samples.
     `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
-    `jax.tree_util.Partial`, and no plain function.
+    `jax.tree_util.Partial`, and no plain function. `unit`: the scene's `natural_units`.
     """
     early, late, whole = _spans(scene, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
     speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
-    top = jnp.maximum(jnp.max(whole[:nd]), LEAST * natural_units(scene).displacement)
+    top = jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
     drift = jnp.max(jnp.abs(late - early)[:nd]) / top
     omega = jnp.mean(speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)

@@ -28,7 +28,8 @@ def natural_units(scene: Scene) -> State:
     """
     carrier, loads = scene.machine.carrier(), scene.loads
     across, up, *_ = loads.position(*loads.rest())
-    unbalance = jnp.mean(loads.mass) * jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
+    unbalance = jnp.mean(loads.mass) * arm
     unbalances = [loads.count * unbalance]
     for effect in scene.effects:
         own = effect.imbalance(jnp.zeros_like(unbalance))
@@ -38,7 +39,6 @@ def natural_units(scene: Scene) -> State:
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
     rotor = None if scene.drive.ideal else (one, speed)
-    arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
     twist = speed if any(effect.frees_twist for effect in scene.effects) else None
     slip = (speed * arm,) if any(effect.slip_limit is not None for effect in scene.effects) else None
     spin = None if twist is None and slip is None else Spin(twist, slip)

@@ -13,12 +13,13 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
-from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model
+from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
 
-__all__ = ["Folds", "jam_rotor_speed", "rotor_speed_at"]
+__all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "rotor_speed_at"]
 
 _POINTS = 64
 """Grid points on each side of each pole, where folds are looked for."""
@@ -57,43 +58,57 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
     Source: the antiphase paper, equations (31), (35).
     """
-    return rotor_speed_at(linear_model(scene), omega, speed)
+    return rotor_speed_at(jammed_model(scene), omega, speed)
 
 
-def rotor_speed_at(model: LinearModel, omega: Array, speed: Array | None = None) -> Array:
+def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None) -> Array:
     """`jam_rotor_speed` of a scene that is assembled already."""
-    scene, loads = model.scene, jammed_loads(model.scene)
-    forward = -(omega**2) * jnp.sum(jnp.conj(model.direction) * model.displacement(omega, speed))
-    torque = -mean_torque(loads.unbalance(), jnp.ones_like(forward), forward)
-    free = omega + torque / loads.drag_sum()
-    if not any(effect.has_friction for effect in scene.effects):
-        return free
+    return _balance(model, omega, speed)[0]
+
+
+def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
+    """`rotor_speed_at`, and the amplitudes of the carrier there."""
+    displacement = model.displacement(omega, speed)
+    forward = -(omega**2) * jnp.sum(jnp.conj(model.push) * displacement)
+    torque = -mean_torque(model.unbalance, jnp.ones_like(forward), forward)
+    free = omega + torque / model.drag
+    effects = model.scene.effects
+    if not any(effect.has_friction for effect in effects):
+        return free, displacement
 
     def residual(n: Array) -> Array:
-        return loads.drag_sum() * (n - omega) + light_friction(loads, scene.effects, omega, n) - torque
+        return model.drag * (n - omega) + light_friction(model.loads, effects, omega, n) - torque
 
-    return bracketed_root(residual, omega, free)
+    return bracketed_root(residual, omega, free), displacement
 
 
-def branch_slope(model: LinearModel, omega: Array) -> Array:
+def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Array]:
+    """The rotor's speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
+    return jax.jvp(lambda w: _balance(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
+
+
+def branch_slope(model: JammedModel, omega: Array) -> Array:
     """dn/dOmega along the branch."""
-    return jax.jvp(lambda w: rotor_speed_at(model, w), (omega,), (jnp.ones_like(omega),))[1]
+    return branch_tangent(model, omega)[1]
 
 
 class Pieces(NamedTuple):
-    """Monotone pieces of a branch: load speeds at their ends and mode numbers, (2 nd + 1,) each; resonances and folds."""
+    """Monotone pieces of a branch: load speeds at their ends, the rotor's speeds there and mode numbers, (2 nd + 1,) each;
+    resonances and folds."""
 
     low: Array
     high: Array
+    speed_low: Array
+    speed_high: Array
     mode: Array
     resonances: Array
     folds: Folds
 
 
-def branch_pieces(model: LinearModel) -> Pieces:
+def branch_pieces(model: JammedModel) -> Pieces:
     """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(model)
-    grid, resonances = fold_points(frozen, _POINTS)
+    grid, resonances = fold_points(model, _POINTS)
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(lambda w: branch_slope(frozen, w), grid, 2 * nd)
     falling = slopes < 0.0
@@ -102,20 +117,20 @@ def branch_pieces(model: LinearModel) -> Pieces:
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
     omega = jax.vmap(partial(bracketed_root, lambda w: branch_slope(model, w)))(*ends)
-    speeds = jax.vmap(lambda w: rotor_speed_at(model, w))(omega)
+    end = jnp.maximum(grid[-1:], 2.0 * frozen.scene.drive.speed)
+    speeds = jax.vmap(lambda w: rotor_speed_at(model, w))(jnp.concatenate([omega, end]))
+    speeds, speed_end = speeds[:-1], jax.lax.stop_gradient(speeds[-1:])
     main = without_ripples(jax.lax.stop_gradient(speeds), jnp.sum(found), 2 * nd)
     omega, speeds, found = omega[main], speeds[main], found[main]
-    end = jnp.maximum(grid[-1], 2.0 * frozen.scene.drive.speed)
     folds = Folds(
         omega=jnp.where(found, omega, jnp.nan),
         rotor_speed=jnp.where(found, speeds, jnp.nan),
         exists=found,
     )
-    cuts = jax.lax.stop_gradient(jnp.where(found, omega, end))
-    low = jnp.concatenate([jnp.zeros_like(cuts[:1]), cuts])
-    high = jnp.concatenate([cuts, jnp.reshape(end, (1,))])
-
-    return Pieces(low, high, piece_modes(cuts, found, resonances), resonances, folds)
+    cuts, turns = jax.lax.stop_gradient((jnp.where(found, omega, end), jnp.where(found, speeds, speed_end)))
+    zero, mode = jnp.zeros_like(end), piece_modes(cuts, found, resonances)
+    low, high = jnp.concatenate([zero, cuts]), jnp.concatenate([cuts, end])
+    return Pieces(low, high, jnp.concatenate([zero, turns]), jnp.concatenate([turns, speed_end]), mode, resonances, folds)
 
 
 def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
@@ -143,29 +158,33 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
     A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
     """
     index = jnp.arange(2 * most)
-    keep = index
-    for _ in range(most // 2):
+
+    def fewer(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        keep, count = carry
         known = speeds[keep]
         span = jnp.abs(jnp.log(known[1:] / known[:-1]))
         least = jnp.argmin(jnp.where(index[1:] < count, span, jnp.inf))
         skip = (count > most) & (index >= least)
         keep = keep[jnp.where(skip, jnp.minimum(index + 2, 2 * most - 1), index)]
-        count = jnp.where(count > most, count - 2, count)
-    return keep[:most]
+        return keep, jnp.where(count > most, count - 2, count)
+
+    return jax.lax.fori_loop(0, most // 2, fewer, (index, count))[0][:most]
 
 
 def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
-    """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances.
+    """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances,
+    of which alone there are derivatives.
 
     Folds lie between some of these points. They crowd about the poles s of det(K + s^2 M + s C) = 0, not about undamped
     resonances: a strong damper between two platforms locks them into one, whose sharp peak is at neither's resonance.
     """
     resonances, _ = model.modes()
-    poles = _poles(model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
-    top = jnp.maximum(jnp.max(resonances), jnp.max(jnp.abs(poles)))
+    matrices = (model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
+    poles, fixed = _poles(*jax.lax.stop_gradient(matrices)), jax.lax.stop_gradient(resonances)
+    top = jnp.maximum(jnp.max(fixed), jnp.max(jnp.abs(poles)))
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
-    low = 1e-3 * jnp.min(jnp.where(resonances > 0.0, resonances, top))
+    low = 1e-3 * jnp.min(jnp.where(fixed > 0.0, fixed, top))
     s = jnp.linspace(0.0, 1.0, per_side)[None, :]
 
     def crowded(reach: Array) -> Array:
@@ -181,7 +200,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
     """The 2 nd complex s with det(K + s C + s^2 M) = 0."""
     n = mass.shape[0]
-    solved = jnp.linalg.solve(mass, jnp.concatenate([stiffness, damping], axis=1))
+    solved = small_solve(mass, jnp.concatenate([stiffness, damping], axis=1))
     shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
     return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
 

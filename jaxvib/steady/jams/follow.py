@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel
+from jaxvib.equations.linear import JammedModel
 from jaxvib.steady.jams.folds import branch_slope, rotor_speed_at
 from jaxvib.steady.jams.jam import Jam, jam_at
 
@@ -19,7 +19,7 @@ _STEPS = 6
 """Of Newton's method; it converges quadratically from a near machine, and what has not converged is NaN."""
 
 
-def follow_jam(model: LinearModel, mode: int, near: Array) -> Jam:
+def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
     """The jam mode of that number whose load speed is near `near` (scalar, rad/s), at the scene's rotor speed n.
 
     Newton's method on (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`: beside a resonance at w_r the left side is
@@ -31,10 +31,10 @@ def follow_jam(model: LinearModel, mode: int, near: Array) -> Jam:
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
-    >>> from jaxvib.equations.linear import linear_model
+    >>> from jaxvib.equations.linear import jammed_model
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
-    >>> round(float(follow_jam(linear_model(form.scene()), 3, 0.95).omega), 4)
+    >>> round(float(follow_jam(jammed_model(form.scene()), 3, 0.95).omega), 4)
     0.9721
     """
     speed = model.scene.drive.speed
@@ -55,7 +55,7 @@ def follow_jam(model: LinearModel, mode: int, near: Array) -> Jam:
     return eqx.tree_at(lambda j: j.stable, jam, there & jam.stable)
 
 
-def follow_fold(model: LinearModel, near: Array) -> tuple[Array, Array]:
+def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
     """Load speed and rotor speed, rad/s, of the fold near the load speed `near` (scalar, rad/s), see `Folds`.
 
     Newton's method on n'(w)/(n(w) - w)^2 = 0, which is close to linear about a resonance. **Returns** NaN where it has not

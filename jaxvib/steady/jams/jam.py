@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import LinearModel, jammed_loads, linear_model, peak_force
+from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -19,7 +19,7 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import Folds, branch_pieces, branch_slope, rotor_speed_at
+from jaxvib.steady.jams.folds import Folds, Pieces, branch_pieces, branch_tangent, rotor_speed_at
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
@@ -202,9 +202,9 @@ def jam_modes(scene: Scene) -> JamModes:
 
 @cached
 def _jam_modes(scene: Scene) -> JamModes:
-    n, model = scene.drive.speed, linear_model(scene)
+    n, model = scene.drive.speed, jammed_model(scene)
     pieces = branch_pieces(model)
-    omega, exists = jax.vmap(lambda lo, hi: _solve_on_piece(model, lo, hi))(pieces.low, pieces.high)
+    omega, exists = _solved_on_pieces(model, pieces)
 
     numbers = jnp.arange(1, 2 * pieces.resonances.shape[0] + 2)
     hits = (pieces.mode[None, :] == numbers[:, None]) & exists[None, :]
@@ -231,18 +231,23 @@ def _jam_modes(scene: Scene) -> JamModes:
 
     jams = jax.vmap(jam)(numbers, omega, there, close)
     fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
-    return JamModes(**fields, resonances=model.modes()[0], folds=pieces.folds)
+    return JamModes(**fields, resonances=pieces.resonances, folds=pieces.folds)
 
 
-def jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, at_fold: Array) -> Jam:
+def jam_at(
+    model: JammedModel, number: Array, omega: Array, rotor_speed: Array | None = None, at_fold: Array | None = None
+) -> Jam:
     """The jam of mode `number` whose loads turn at `omega` rad/s, at a rotor speed (rad/s) at which it exists, all scalars;
-    `at_fold` whether it lies at its fold. Its status is never `absent`: who asks knows that it is there."""
-    displacement = model.displacement(omega)
+    `at_fold` whether it lies at its fold. Unless they are said these are the branch's rotor speed, and whether that hardly
+    changes there. Its status is never `absent`: who asks knows that it is there."""
+    speed, slope, displacement = branch_tangent(model, omega)
+    rotor_speed = speed if rotor_speed is None else rotor_speed
+    at_fold = jnp.abs(slope) < jnp.sqrt(jnp.finfo(omega.dtype).eps) if at_fold is None else at_fold
     # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
-    radius = jammed_loads(model.scene).unbalance() / jnp.min(jnp.diagonal(model.mass))
+    radius = model.unbalance / jnp.min(jnp.diagonal(model.mass))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)
-    slope = jnp.where(bounded, branch_slope(model, omega), jnp.nan)
+    slope = jnp.where(bounded, slope, jnp.nan)
     status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
     held = _held(model, omega, rotor_speed, displacement)
     status = JamStatus.where(held, status, JamStatus.apart)
@@ -260,40 +265,30 @@ def jam_at(model: LinearModel, number: Array, omega: Array, rotor_speed: Array, 
     )
 
 
-def _held(model: LinearModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
+def _held(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
     """Whether the vibration, which is largest where loads are together, has the torque S w^2 |e^H B Y| / 2 >= b_W R^2 (n - w)
     that each load needs at some phase; loads that are alike share what there is."""
-    loads = jammed_loads(model.scene)
+    loads = model.loads
     if loads.alike:
         return True
-    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.direction.conj() * displacement)) / 2.0
+    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.push.conj() * displacement)) / 2.0
     need = loads.drag * loads.radius**2 * (rotor_speed - omega)
     return jnp.all(~(most < (1.0 - 1e-6) * need))
 
 
-def branch_points(model: LinearModel, omega: Array) -> tuple[Jam, Folds]:
+def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
     """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
     pieces = branch_pieces(model)
     cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
     numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
-
-    def jam(number: Array, w: Array) -> Jam:
-        flat = jnp.abs(branch_slope(model, w)) < jnp.sqrt(jnp.finfo(w.dtype).eps)
-        return jam_at(model, number, w, rotor_speed_at(model, w), flat)
-
-    jams = jax.vmap(jam)(numbers, omega)
+    jams = jax.vmap(lambda number, w: jam_at(model, number, w))(numbers, omega)
     return jams, pieces.folds
 
 
-def _solve_on_piece(model: LinearModel, low: Array, high: Array) -> tuple[Array, Array]:
-    """The load speed on a monotone piece at which the branch has the scene's rotor speed, and whether there is one."""
-
+def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
+    """The load speeds on the monotone pieces at which the branch has the scene's rotor speed, and whether there is one."""
     target = model.scene.drive.speed
-
-    def gap(w: Array) -> Array:
-        return rotor_speed_at(model, w) - target
-
-    gap_low, gap_high = jax.vmap(gap)(jnp.stack([jnp.where(low > 0.0, low, high), high]))
-    gap_low = jnp.where(low > 0.0, gap_low, -target)
-    exists = (high > low) & (gap_low * gap_high <= 0.0)
-    return bracketed_root(gap, low, high, (gap_low, gap_high)), exists
+    gaps = pieces.speed_low - target, pieces.speed_high - target
+    exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)
+    roots = jax.vmap(lambda *ends: bracketed_root(lambda w: rotor_speed_at(model, w) - target, *ends))
+    return roots(pieces.low, pieces.high, gaps), exists

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import collected_model, has_half_turn
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -185,15 +185,15 @@ def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 @cached
 def _fold_points(scene: Scene) -> tuple[Array, Array]:
-    return fold_points(linear_model(scene), 64)
+    return fold_points(jammed_model(scene), 64)
 
 
 @cached
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
-    model = linear_model(scene)
-    start = jax.vmap(lambda w: light_rotor_speed(model, w))(omega)
-    steps = jnp.max(jax.vmap(lambda w, n: steps_for(model, w, n))(omega, start))
-    orbit, growth = orbits(collected_model(model), omega, start, "omega", many, steps, accuracy)
+    model = collected_model(scene)
+    start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
+    steps = jnp.max(steps_for(model.linear, omega, start))
+    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy)
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 

@@ -41,7 +41,7 @@ class Floquet(NamedTuple):
 
 
 def steps_for(model: LinearModel, omega: Array, speed: Array) -> Array:
-    """How many integration steps a turn of the grid asks for at the load speed `omega` and the rotor's `speed` (rad/s)."""
+    """How many integration steps a turn of the grid asks for at load speeds `omega` and the rotor's `speed` (rad/s)."""
     carrier = model.carrier
     half = jnp.linalg.inv(jnp.linalg.cholesky(model.mass))
     decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))

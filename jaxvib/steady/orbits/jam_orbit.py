@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import collected_model, has_half_turn
-from jaxvib.equations.linear import jammed_loads, linear_model
+from jaxvib.equations.linear import jammed_loads, jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -167,17 +167,17 @@ def jam_orbit(
 
 @cached
 def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
-    return light_rotor_speed(linear_model(scene), omega)
+    return light_rotor_speed(jammed_model(scene), omega)
 
 
 @cached
 def _steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
-    return steps_for(linear_model(scene), omega, speed)
+    return steps_for(jammed_model(scene), omega, speed)
 
 
 @cached
 def _fold_points(scene: Scene) -> tuple[Array, Array]:
-    return fold_points(linear_model(scene), _SEARCH)
+    return fold_points(jammed_model(scene), _SEARCH)
 
 
 @cached
@@ -194,7 +194,7 @@ def _orbit(
     settle: bool = False,
 ) -> Orbit:
     """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
-    model, deviation = collected_model(linear_model(scene)), None
+    model, deviation = collected_model(scene), None
     if settle:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
@@ -280,7 +280,7 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
     none."""
-    model = collected_model(linear_model(scene))
+    model = collected_model(scene)
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
-from jaxvib.equations.linear import LinearModel
+from jaxvib.equations.linear import JammedModel
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
@@ -161,7 +161,7 @@ class Orbit(Result):
         return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
 
 
-def light_rotor_speed(model: LinearModel, omega: Array) -> Array:
+def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
     """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
 
     Where the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:

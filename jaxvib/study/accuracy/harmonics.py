@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import collected_model, has_half_turn
-from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -91,7 +90,7 @@ def harmonic_convergence(
 
 @cached
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    model = collected_model(linear_model(scene))
+    model = collected_model(scene)
     grid = grid_of(points, model.half_turn)
 
     def one(w: Array) -> tuple[Array, Array]:

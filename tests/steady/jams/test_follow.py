@@ -7,14 +7,14 @@ import numpy as np
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.equations.linear import linear_model
+from jaxvib.equations.linear import jammed_model
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
 
 SCENE = scene("two_mass", speed=120.0)
 
 
 def stiffer(k):
-    return linear_model(eqx.tree_at(lambda s: s.machine.stiffness, SCENE, k))
+    return jammed_model(eqx.tree_at(lambda s: s.machine.stiffness, SCENE, k))
 
 
 def test_followed_jams_are_those_of_the_whole_branch():
@@ -37,8 +37,8 @@ def test_followed_jams_are_those_of_the_whole_branch():
 
 def test_what_is_not_that_mode_is_nan():
     falling = jv.jam_modes(SCENE).omega[3]
-    assert np.isnan(follow_jam(linear_model(SCENE), 3, falling).omega)  # mode 4 falls, mode 3 rises
-    assert np.isnan(follow_jam(linear_model(SCENE), 3, jnp.asarray(1.0)).foundation_force)
+    assert np.isnan(follow_jam(jammed_model(SCENE), 3, falling).omega)  # mode 4 falls, mode 3 rises
+    assert np.isnan(follow_jam(jammed_model(SCENE), 3, jnp.asarray(1.0)).foundation_force)
 
 
 def test_followed_folds_are_those_of_the_whole_branch():
