@@ -65,13 +65,13 @@ __all__ = [
 _CIRCLE = (1.0, -1.0j)
 
 
-def mean_torque(unbalance: Array, turn: Array, acceleration: Array) -> Array:
-    """-(S/2) Im(conj(e^{i psi}) a), N m: the mean torque of a vibration on a load.
+def mean_torque(unbalance: Array, felt: Array) -> Array:
+    """-(S/2) Im(e^{-i psi} a), N m: the mean torque of a vibration on a load.
 
-    **Arguments**: `unbalance` S = m R, kg m; `turn` e^{i psi}, the load's phase; `acceleration` a = e^H B A, m/s^2, the forward
-    circular part of the acceleration of the point that carries it. Arrays of one shape.
+    **Arguments**: `unbalance` S = m R, kg m; `felt` e^{-i psi} a, m/s^2: with a = e^H B A, the forward circular part of the
+    acceleration of the point that carries the load, as the load at its phase psi feels it. Arrays of one shape.
     """
-    return -unbalance * (jnp.conj(turn) * acceleration).imag / 2.0
+    return -unbalance * felt.imag / 2.0
 
 
 class Amplitudes(eqx.Module):
@@ -132,7 +132,7 @@ class Averaged(eqx.Module):
         mirrored = _product(mobility, jnp.sum(share * (at**2)[None, None, :], axis=-1))
         felt = _with_conjugate(alone, mirrored, times(listen, unforced) + times(mobility, pushes(free)))
         felt = jnp.sum(levers * felt[:, None], axis=0)
-        rate = free + mean_torque(self.unbalance, at, felt) / self.inertia
+        rate = free + mean_torque(self.unbalance, jnp.conj(at) * felt) / self.inertia
         acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
         turn = 1j * jnp.mean(state.rate)
         return Amplitudes(

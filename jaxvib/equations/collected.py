@@ -78,11 +78,14 @@ class CollectedModel(eqx.Module):
             return self.loads.count * of_each(phi, rate, speed, a[:, None])
         return jnp.sum(of_each(*self.each_load(phi, rate), speed, a[:, None]), axis=0, keepdims=True)
 
-    def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of `torque` by angle and by rate of each body (G, M) and by the port's acceleration (np, G, M)."""
+    def torque_slopes(self, phi: Points, rate: Array, speed: Array, a: Array) -> tuple[Array, Array, Array | None]:
+        """Derivatives of `torque` by angle and by rate of each body (G, M) and by the port's acceleration (np, G, M), None
+        without friction, which alone feels it."""
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]
         by_rate = jax.jvp(lambda r: self.torque(angle, r, speed, a), (rate,), (jnp.ones_like(rate),))[1]
+        if not any(effect.has_friction for effect in self.effects):
+            return by_angle, by_rate, None
         axes = (jnp.zeros_like(a).at[k].set(1.0) for k in range(a.shape[0]))
         by_a = [jax.jvp(lambda x: self.torque(angle, rate, speed, x), (a,), (axis,))[1] for axis in axes]
         return by_angle, by_rate, jnp.stack(by_a)

@@ -41,7 +41,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
             steps, a, fa, b, fb, share, best, least = carry
             x = a + share * (b - a)
             fx = g(x)
-            best, least = jnp.where(size(fx) < least, x, best), jnp.minimum(size(fx), least)
+            found = size(fx)
+            best, least = jnp.where(found < least, x, best), jnp.minimum(found, least)
             same = (fx > 0.0) == (fa > 0.0)
             c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
             b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
@@ -52,8 +53,8 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
         f_low, f_high = jax.vmap(g)(jnp.stack([low, high])) if ends is None else ends
         # The compiler may compute g(x) anew for every use, each rounded its own way; at the root the sign of the one can differ
         # from that of the other and the bracket is lost: then the point where |g| was least is the root.
-        best = jnp.where(size(f_low) < size(f_high), low, high)
-        least = jnp.minimum(size(f_low), size(f_high))
+        at_low, at_high = size(f_low), size(f_high)
+        best, least = jnp.where(at_low < at_high, low, high), jnp.minimum(at_low, at_high)
         start = (jnp.asarray(0), low, f_low, high, f_high, jnp.full_like(low, 0.5), best, least)
         return jax.lax.while_loop(open_, step, start)[6]
 

@@ -69,8 +69,8 @@ def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None)
 def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
     """`rotor_speed_at`, and the amplitudes of the carrier there."""
     displacement = model.displacement(omega, speed)
-    forward = -(omega**2) * jnp.sum(jnp.conj(model.push) * displacement)
-    torque = -mean_torque(model.unbalance, jnp.ones_like(forward), forward)
+    # The drag's torque is opposite to that of the acceleration -w^2 Y.
+    torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.push) * displacement))
     free = omega + torque / model.drag
     effects = model.scene.effects
     if not any(effect.has_friction for effect in effects):
@@ -110,7 +110,7 @@ def branch_pieces(model: JammedModel) -> Pieces:
     frozen = jax.lax.stop_gradient(model)
     grid, resonances = fold_points(model, _POINTS)
     nd = resonances.shape[0]
-    grid, slopes = _with_close_folds(lambda w: branch_slope(frozen, w), grid, 2 * nd)
+    grid, slopes = _with_close_folds(jax.vmap(lambda w: branch_slope(frozen, w)), grid, 2 * nd)
     falling = slopes < 0.0
     (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
@@ -205,31 +205,28 @@ def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
     return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
 
 
-def _with_close_folds(slope: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
-    """The grid and the slope at it, with points added where that comes closest to 0 and turns back: two folds may hide in one
+def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
+    """The grid and the `slopes` at it, with points added where they come closest to 0 and turn back: two folds may hide in one
     interval."""
-    value = jax.vmap(slope)(grid)
+    value = slopes(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
     dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
     (at,) = jnp.nonzero(dips, size=most, fill_value=0)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
-    def lowest(low: Array, high: Array, at: Array, value: Array) -> tuple[Array, Array]:
-        side = jnp.sign(value)
+    side, lowest = jnp.sign(value[at + 1]), jnp.abs(value[at + 1])
 
-        def narrow(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-            a, b, best, least = carry
-            x, y = b - step * (b - a), a + step * (b - a)
-            at_x, at_y = side * jax.vmap(slope)(jnp.stack([x, y]))
-            left = at_x < at_y
-            lower, where = jnp.where(left, at_x, at_y), jnp.where(left, x, y)
-            best, least = jnp.where(lower < least, where, best), jnp.where(lower < least, lower, least)
-            return jnp.where(left, a, x), jnp.where(left, y, b), best, least
+    def narrow(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        a, b, best, least = carry
+        x, y = b - step * (b - a), a + step * (b - a)
+        at_x, at_y = jnp.split(slopes(jnp.concatenate([x, y])), 2)
+        left = side * at_x < side * at_y
+        lower, where = side * jnp.where(left, at_x, at_y), jnp.where(left, x, y)
+        best, least = jnp.where(lower < least, where, best), jnp.where(lower < least, lower, least)
+        return jnp.where(left, a, x), jnp.where(left, y, b), best, least
 
-        best, least = jax.lax.fori_loop(0, 16, narrow, (low, high, at, side * value))[2:]
-        return best, side * least
-
-    added, there = jax.vmap(lowest)(grid[at], grid[at + 2], grid[at + 1], value[at + 1])
-    order = jnp.argsort(jnp.concatenate([grid, added]))
-    return jnp.concatenate([grid, added])[order], jnp.concatenate([value, there])[order]
+    added, least = jax.lax.fori_loop(0, 16, narrow, (grid[at], grid[at + 2], grid[at + 1], lowest))[2:]
+    points, values = jnp.concatenate([grid, added]), jnp.concatenate([value, side * least])
+    order = jnp.argsort(points)
+    return points[order], values[order]

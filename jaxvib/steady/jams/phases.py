@@ -152,7 +152,7 @@ def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
 def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
     """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
     turn = jnp.exp(1j * phase)
-    return mean_torque(parts.unbalance, turn, -(omega**4) * (influence @ (parts.unbalance * turn)))
+    return mean_torque(parts.unbalance, -(omega**4) * jnp.conj(turn) * (influence @ (parts.unbalance * turn)))
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:

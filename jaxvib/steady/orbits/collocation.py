@@ -93,7 +93,7 @@ def _jacobian(
     )
     shake = model.unbalance[None, :, None] * balance.moving
     # Dry friction answers to the acceleration that the others cause as well.
-    answers = (shake - by_acceleration) / unit[None]
+    answers = (shake if by_acceleration is None else shake - by_acceleration) / unit[None]
     coupling = jnp.einsum("agi,abij,bhj->gihj", answers, _feedback(grid, answer), shake)
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 

@@ -12,6 +12,7 @@ from jax import Array
 from jaxvib.equations.collected import CollectedModel, has_half_turn
 from jaxvib.equations.linear import LinearModel
 from jaxvib.numerics.fourier import Grid
+from jaxvib.numerics.linalg import small_solve
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 
@@ -82,12 +83,12 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     """
     carrier, mass = model.linear.carrier, model.linear.mass
     nd, count = mass.shape[0], model.inertia.shape[0]
-    inverse = jnp.linalg.inv(mass)
-    stiffness, damping = inverse @ carrier.stiffness, inverse @ carrier.damping
-    gyroscopic = None if carrier.gyroscopic is None else inverse @ carrier.gyroscopic
+    parts = [carrier.stiffness, carrier.damping, *([] if carrier.gyroscopic is None else [carrier.gyroscopic])]
+    solved = small_solve(mass, jnp.concatenate([*parts, carrier.port.T], axis=1))
+    stiffness, damping, *gyroscopic = (solved[:, k * nd : (k + 1) * nd] for k in range(len(parts)))
     total = jnp.sum(model.unbalance)
     share = model.unbalance / total
-    shift = inverse @ carrier.port.T * total
+    shift = solved[:, len(parts) * nd :] * total
     length = jnp.max(jnp.abs(shift))
     shift = shift / length
     port = carrier.port * length
@@ -100,10 +101,10 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     h = turn / steps
 
     def coefficients(theta: Array) -> _Coefficients:
-        deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, theta, k) for k in range(3))
+        deviation, deviation1, deviation2 = _signals(grid.deviation_orders, harmonics.deviation, theta, 3)
         phi, rate = theta[None, :, None] + deviation, 1.0 + deviation1
         point, moving = model.circle(phi)
-        acceleration = _signal(grid.orders, harmonics.acceleration, theta, 0)
+        (acceleration,) = _signals(grid.orders, harmonics.acceleration, theta, 1)
         slopes = jax.vmap(lambda p, r, w, n, a: model.torque_slopes(p, w * r, n, a), in_axes=-1, out_axes=-1)
         by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
         stiff = by_angle + model.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
@@ -111,12 +112,13 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
         s = share[None, :, None, None]
         unit = model.inertia[:, None, None] * omega[None, None] ** 2
         by_rate = by_rate * omega[None, None] / unit
-        giving = s * moving - by_acceleration / total
+        giving = s * moving
+        giving = giving if by_acceleration is None else giving - by_acceleration / total
         return _Coefficients(s * moving, giving, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
 
     def damped(q1: Array, w: Array, n: Array) -> Array:
         answer = _times(damping, q1) / w
-        return answer if gyroscopic is None else answer + n * _times(gyroscopic, q1) / w
+        return answer + n * _times(gyroscopic[0], q1) / w if gyroscopic else answer
 
     def full(c: _Coefficients, x: Array) -> Array:
         q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[2 * nd : 2 * nd + count], x[2 * nd + count :]
@@ -145,18 +147,17 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     begin = tuple(start(n) for n in sizes)
 
     def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        at = coefficients((k + nodes) * h)
+        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in coefficients((k + nodes) * h)))
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
-        def stage(i: Array, rates: tuple[Array, ...]) -> tuple[Array, ...]:
-            c = _Coefficients(*(part[..., i, :] for part in at))
-            return tuple(
-                rate.at[i].set(field(c, x + h * jnp.tensordot(rows[i], rate, 1)))
-                for field, x, rate in zip(fields, state, rates, strict=True)
-            )
+        def stage(rates: tuple[Array, ...], now: tuple[Array, Array, _Coefficients]) -> tuple[tuple[Array, ...], None]:
+            i, row, c = now
+            changes = (field(c, x + h * jnp.tensordot(row, y, 1)) for field, x, y in zip(fields, state, rates, strict=True))
+            put = jax.lax.dynamic_update_index_in_dim
+            return tuple(put(rate, change, i, 0) for rate, change in zip(rates, changes, strict=True)), None
 
         rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
-        rates = jax.lax.fori_loop(0, len(_NODES), stage, rates)
+        rates, _ = jax.lax.scan(stage, rates, (jnp.arange(len(_NODES)), rows, at))
         return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
 
     nodes, rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_NODES, _ROWS, _WEIGHTS))
@@ -166,8 +167,8 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
 
     # A shift in time: q' and phi' along the orbit itself.
     zero = jnp.zeros((1,), dtype=omega.dtype)
-    at, at1 = (_signal(grid.orders, harmonics.displacement, zero, k) / length for k in range(2))
-    deviation, deviation1, deviation2 = (_signal(grid.deviation_orders, harmonics.deviation, zero, k) for k in range(3))
+    at, at1 = _signals(grid.orders, harmonics.displacement, zero, 2) / length
+    deviation, deviation1, deviation2 = _signals(grid.deviation_orders, harmonics.deviation, zero, 3)
     _, moving = model.circle(deviation)
     along = jnp.concatenate([
         at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + deviation1)[None], axis=1)),
@@ -181,19 +182,20 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     return Floquet(roots, inner, trivial)
 
 
-def _signal(orders: np.ndarray, harmonics: Array, theta: Array, derivative: int) -> Array:
-    """A derivative of Re sum_k c_k exp(i k theta) at the angles theta (n,); c (..., K, P) gives (..., n, P)."""
-    k = jnp.asarray(orders, dtype=theta.dtype)
-    wave = (1j * k[None]) ** derivative * jnp.exp(1j * theta[:, None] * k[None])
-    return jnp.einsum("nk,...kp->...np", wave.real, harmonics.real) - jnp.einsum("nk,...kp->...np", wave.imag, harmonics.imag)
+def _signals(orders: np.ndarray, harmonics: Array, theta: Array, number: int) -> Array:
+    """Re sum_k c_k exp(i k theta) and its first derivatives, so many in all, at the angles theta (n,); c (m, K, P) gives
+    (number, m, n, P)."""
+    factors = (1j * orders) ** np.arange(number)[:, None, None]
+    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * theta[None, :, None] * np.asarray(orders, theta.dtype)[None, None])
+    waves, parts = jnp.concatenate([wave.real, -wave.imag], -1), jnp.concatenate([harmonics.real, harmonics.imag], -2)
+    return jnp.einsum("dnk,mkp->dmnp", waves, parts)
 
 
 def _times(matrix: Array, vectors: Array) -> Array:
-    """Matrix (a, b) times (b, columns, P); written out where it is small, so that it melts into what surrounds it."""
-    a, b = matrix.shape
-    if a * b > 16:
+    """Matrix (a, b) times (b, ..., P); where it is small as a sum, which melts into what surrounds it."""
+    if matrix.size > 16:
         return jnp.tensordot(matrix, vectors, 1)
-    return jnp.stack([sum(matrix[i, k] * vectors[k] for k in range(b)) for i in range(a)])
+    return jnp.sum(matrix.reshape(*matrix.shape, *[1] * (vectors.ndim - 1)) * vectors[None], axis=1)
 
 
 def _small_solve(weight: Array, right: Array) -> Array:

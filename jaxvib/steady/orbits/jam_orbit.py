@@ -135,8 +135,10 @@ def jam_orbit(
     tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
     still = jax.lax.stop_gradient(value)
     # Reverse-mode derivatives ask for a number of steps that is part of the program.
-    steps = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
-    static = 2 ** int(np.ceil(np.log2(float(steps)))) if concrete else 64
+    static = steps = 64
+    if concrete:
+        steps = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
+        static = 2 ** int(np.ceil(np.log2(float(steps))))
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
     many, found, settle = tried[0], None, False
 

@@ -261,10 +261,12 @@ def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmo
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
+    nd = harmonics.displacement.shape[0]
+    swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
     # Directions of the force on the bed are put together as those of a vector.
-    force = jnp.sqrt(jnp.sum(_swing(grid.orders, harmonics.force) ** 2))
+    force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     push = _least_push(model, grid, motion, harmonics)
-    return (*branch, _swing(grid.orders, harmonics.displacement), force, motion.rotor_speed * drive, push)
+    return (*branch, swings[:nd], force, motion.rotor_speed * drive, push)
 
 
 def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
