@@ -1,12 +1,15 @@
 """How much of a changed equation do the tests see?
 
     python benchmarks/trials/mutants.py --count 300 --out out/mutants
+    python benchmarks/trials/mutants.py --count 100 --only optimize ode
 
 A mutant is the package with one change in one line: a sign, a factor, an index, a comparison, a sine in place of a cosine, a
-smaller in place of a larger. Mutants are drawn from `jaxvib/equations`, `steady`, `motion` and `ode` and from `optimize`, from
-every file in proportion to the changes it allows and at least one, by a seed. Each is given to the tests that reach its line,
-those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual time; the first
-test that fails ends it. Which test reaches which line is measured once, each test file in a process of its own (`coverage`).
+smaller in place of a larger. Mutants are drawn from `jaxvib/equations`, `steady`, `motion` and `ode` and from `optimize`, or
+from `--only` some of these with their tests alone, from every file in proportion to the changes it allows and at least one, by
+a seed and the file's name: a change of one file leaves the mutants of others as they were. Each is given to the tests that
+reach its line, those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual
+time; the first test that fails ends it. Which test reaches which line is measured once, each test file in a process of its own
+(`coverage`).
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
 What survived is printed with its change, to be explained or killed by a new test. All that is known is kept in `--out`, so
@@ -29,11 +32,11 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDERS = ("jaxvib/equations", "jaxvib/steady", "jaxvib/motion", "jaxvib/ode", "optimize")
-TESTS = ("equations", "steady", "motion", "ode", "optimize")
+TESTS = tuple(folder.removeprefix("jaxvib/") for folder in FOLDERS)
 
 OPERATORS: dict[type, type] = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.MatMult: ast.Mult}
 COMPARISONS: dict[type, type] = {
@@ -153,10 +156,10 @@ def _with(node: ast.AST, **fields) -> ast.expr:
     return changed
 
 
-def drawn(count: int, seed: int, reached: dict[str, set[int]]) -> tuple[list[Mutant], dict[str, int]]:
+def drawn(count: int, seed: int, reached: dict[str, set[int]], only: Sequence[str]) -> tuple[list[Mutant], dict[str, int]]:
     """`count` mutants on lines that a test reaches, and how many changes there are on reached and on other lines."""
-    chance = random.Random(seed)
-    files = sorted(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
+    folders = [folder for folder, name in zip(FOLDERS, TESTS, strict=True) if name in only]
+    files = sorted(file for folder in folders for file in (ROOT / folder).rglob("*.py"))
     possible, total = {}, collections.Counter()
     for path in files:
         file = str(path.relative_to(ROOT))
@@ -165,21 +168,21 @@ def drawn(count: int, seed: int, reached: dict[str, set[int]]) -> tuple[list[Mut
         total["reached"] += len(inside)
         total["not reached"] += len(found) - len(inside)
         if inside:
-            possible[file] = chance.sample(inside, len(inside))
+            possible[file] = random.Random(f"{seed} {file}").sample(inside, len(inside))
     share = {file: max(1, round(count * len(found) / total["reached"])) for file, found in possible.items()}
     taken = [one for file, found in possible.items() for one in found[: share[file]]]
-    chance.shuffle(taken)
+    random.Random(seed).shuffle(taken)
     return taken, dict(total)
 
 
 # --- which test reaches which line ---
 
 
-def reach(out: pathlib.Path, workers: int) -> dict[str, dict]:
+def reach(out: pathlib.Path, workers: int, only: Sequence[str]) -> dict[str, dict]:
     """For each test file its seconds and the lines it reaches in each file of the package."""
     kept = out / "reach.json"
     known = json.loads(kept.read_text()) if kept.exists() else {}
-    tests = sorted(str(path.relative_to(ROOT)) for folder in TESTS for path in (ROOT / "tests" / folder).rglob("test_*.py"))
+    tests = sorted(str(path.relative_to(ROOT)) for folder in only for path in (ROOT / "tests" / folder).rglob("test_*.py"))
 
     def one(test: str) -> None:
         data = out / f"{pathlib.Path(test).stem}.coverage"
@@ -260,18 +263,19 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="which ones (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
     parser.add_argument("--seconds", type=float, default=180.0, help="tests a mutant is given, by their usual time (180)")
+    parser.add_argument("--only", nargs="+", choices=TESTS, default=TESTS, help="folders to draw from (all)")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of what is known")
     asked = parser.parse_args()
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
-    known = reach(out, asked.workers)
+    known = reach(out, asked.workers, asked.only)
     reached = collections.defaultdict(set)
     for entry in known.values():
         for file, lines in entry["lines"].items():
             reached[file].update(lines)
-    taken, total = drawn(asked.count, asked.seed, reached)
+    taken, total = drawn(asked.count, asked.seed, reached, asked.only)
     kept = out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
     if asked.again:
