@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published
-from two_springs import FIRST, FREE, NEAREST, SCENE, SUM
+from two_springs import FIRST, FREE, NEAREST, SCENE, SUM, plain
 
 import jaxvib as jv
 from optimize import (
@@ -26,37 +26,10 @@ from optimize import (
     synthesize,
     worst,
 )
-from optimize.search.quadratic import elastic
 
 
 def found(space, objective, **more):
     return synthesize(space, objective, **{"starts": 4, "iterations": 25, "polishing": 12, "verify": False, **more})
-
-
-def test_quadratic_programs_meet_their_conditions():
-    random = np.random.default_rng(0)
-    s, d, me, mi = 40, 4, 1, 3
-    root = random.normal(size=(s, d, d))
-    bend = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(d)
-    slope = 3.0 * random.normal(size=(s, d))
-    held, demands = (random.normal(size=(s, m, d)) for m in (me, mi))
-    off, excess = 0.1 * random.normal(size=(s, me)), random.normal(size=(s, mi)) - 0.5
-    low, high = -np.ones((s, d)), np.ones((s, d))
-    price = np.full(s, 1e4)
-    one = elastic(bend, slope, (held, off), (demands, excess), (low, high), price)
-    p = one.p
-    gradient = np.einsum("sij,sj->si", bend, p) + slope + one.bounds
-    gradient += np.einsum("sm,smd->sd", one.held, held) + np.einsum("sm,smd->sd", one.demands, demands)
-    np.testing.assert_allclose(gradient, 0.0, atol=1e-7 * price[0])
-    left = np.einsum("smd,sd->sm", demands, p) + excess
-    possible = np.max(np.abs(one.held), axis=1) < 5e3
-    assert possible.sum() > 30
-    np.testing.assert_allclose(np.einsum("smd,sd->sm", held, p)[possible], -off[possible], atol=1e-7)
-    # Demands that nearly contradict each other have multipliers near the price, known to fewer digits.
-    kept = possible & (np.max(one.demands, axis=1) < 1e2)
-    assert kept.sum() > 20 and np.all(left[kept] < 1e-7)
-    np.testing.assert_allclose((one.demands * left)[kept], 0.0, atol=1e-6 * price[0])
-    assert np.all(one.demands >= 0.0) and np.all(p >= low) and np.all(p <= high)
 
 
 def test_multipliers_are_those_computed_by_hand():
@@ -90,11 +63,6 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     assert "not met" in "\n".join(best.said())
     with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
         found(space, NEAREST, subject_to=demands)
-
-
-def plain(name, function):
-    """A quantity of the two stiffnesses x, y in 1e4 N/m."""
-    return Quantity(name, "", lambda s: function(*(s.machine.stiffness / 1e4)))
 
 
 def both_ways(name, function):
