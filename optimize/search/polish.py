@@ -209,7 +209,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             moved = np.zeros_like(still)
             moved[index] = better & still[index]
         history.append(point.values[:, 0])
-        tell((k + 1) / max(steps, 1), point)
+        tell(min(k + 1, steps) / max(steps, 1), point)
     return Polished(point, np.asarray(history), left, violation(problem, point), optimality(problem, point))
 
 

@@ -3,10 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from two_springs import FIRST, FREE, NEAREST, SCENE, SUM
+from two_springs import FIRST, FREE, NEAREST, SCENE, SUM, plain
 
 import jaxvib as jv
-from optimize import DesignSpace, Quantity, hold, synthesize
+from jaxvib.steady.jams.jam import jam_modes
+from optimize import DesignSpace, Quantity, hold, jam_frequency, synthesize
+from optimize.search import evolve as evolve_module
+from optimize.search.evolve import Followed, _best, evolve
+from optimize.search.problem import problem_of
 
 
 def found(space, objective, **more):
@@ -57,3 +61,57 @@ def test_a_searcher_that_is_none_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(jv.InputError, match=r"needs the package cma; install it with: pip install 'jaxvib\[cma\]'"):
         found(DesignSpace(SCENE, FREE), NEAREST)
+
+
+def test_the_best_designs_that_differ_are_kept():
+    designs = np.array([[0.5, 0.5], [0.505, 0.495], [0.2, 0.5], [0.5, 0.52], [0.9, 0.9]])
+    merits, kept = _best(np.array([3.0, 2.0, 5.0, 4.0, 1.0]), designs)
+    np.testing.assert_array_equal(merits, [1.0, 2.0, 4.0, 5.0])
+    np.testing.assert_array_equal(kept, designs[[4, 1, 3, 2]])
+    many = np.linspace(0.0, 1.0, 20)
+    np.testing.assert_array_equal(_best(many, np.stack([many, many], axis=1))[0], many[:8])
+
+
+def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
+    """Values are those of whole branches, which are looked at for the first designs, and where following leads nowhere."""
+    problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [])
+    looked = []
+    look = evolve_module.looked_up
+    monkeypatch.setattr(evolve_module, "looked_up", lambda problem, z: looked.append(len(z)) or look(problem, z))
+    followed = Followed(problem)
+    first = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.9]])
+    second = first[::-1] + 0.01
+    found = np.concatenate([followed.of(first), followed.of(second)])[:, 0]
+    awaited = [float(jam_modes(problem.space.at(jnp.asarray(z))).select(3).omega) for z in (*first, *second)]
+    np.testing.assert_allclose(found, awaited, rtol=1e-9)
+    assert looked == [3] and len(followed.seen[0]) == 6
+    np.testing.assert_allclose(followed.seen[1], awaited, rtol=1e-9)
+    followed.seen = followed.seen[0], np.full(6, 1e-3)  # nothing is near there
+    np.testing.assert_allclose(followed.of(first)[:, 0], awaited[:3], rtol=1e-9)
+    assert looked == [3, 3]
+    np.testing.assert_allclose(followed.seen[1][-3:], awaited[:3], rtol=1e-9)
+    for _ in range(40):
+        followed.of(second)
+    assert len(followed.seen[0]) == len(followed.seen[1]) <= 200
+
+
+def test_an_evolution_counts_and_tells_what_it_tries():
+    """Of x > 5 alone there is the objective: half of what is drawn at first. Breaking x + y <= 9 costs."""
+    problem = problem_of(
+        DesignSpace(SCENE, FREE),
+        plain("half", lambda x, y: jnp.where(x > 5.0, (x - 6.0) ** 2 + (y - 5.0) ** 2 + 2.0, jnp.nan)),
+        [plain("sum", lambda x, y: x + y) < 9.0],
+    )
+    told = []
+    found = evolve(problem, 300, 0, lambda share, least: told.append((share, least)))
+    assert 300 <= found.drawn < 340 and 0 < found.existing < found.drawn and not found.interrupted
+    shares, least = np.array(told).T
+    assert np.all(np.diff(shares) > 0.0) and shares[-1] == found.drawn / 300 and len(found.history) == len(told)
+    there = np.isfinite(least)
+    assert np.all(np.diff(least[there]) <= 1e-12)
+    best = 1.0 + 8.0 * found.point.z[0]
+    np.testing.assert_allclose(best, [5.0, 4.0], atol=0.01)  # where the line x + y = 9 ends
+    assert 1 <= len(found.point.z) <= 8 and np.all(found.point.z[:, 0] > 0.5)
+    nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * jnp.nan), [])
+    none = evolve(nowhere, 20, 0, lambda share, least: None)
+    assert none.point is None and none.existing == 0 and none.drawn >= 20

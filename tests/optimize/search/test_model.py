@@ -123,13 +123,13 @@ def test_curvatures_are_those_of_the_lagrangian_along_what_is_free():
         awaited = not_indefinite(bend, slopes[k, [1, 3]] * np.where((z[k] <= 0.0) | (z[k] >= 1.0), 0.0, 1.0))
         np.testing.assert_allclose(found[k], awaited, atol=1e-8 * np.abs(bend).max())
     # Where the objective is positive, half its square stands beside: (f^2/2)''/f.
-    positive = one._replace(values=np.where(np.arange(4) == 0, 3.0 * np.ones((4, 1)), values))
-    positive.values[2, 0] = -1.0
+    positive = one._replace(values=values.copy())
+    positive.values[:2, 0], turned[1, 0, 4, 2] = 3.0, np.nan  # not all of the second one's are known
     both = curvatures(shape(1, 2), positive, turned, weights, np.ones((4, 1)), size)
     assert len(both) == 2
     np.testing.assert_array_equal(both[0], found)
     for k in range(4):
-        if positive.values[k, 0] > 0.0 and k < 3:
+        if k == 0:
             bend = 0.7 * second[k, 0] + 1.3 * second[k, 2] + second[k, 4] / size[k] / positive.values[k, 0]
             free = slopes[k, [1, 3]] * np.where((z[k] <= 0.0) | (z[k] >= 1.0), 0.0, 1.0)
             np.testing.assert_allclose(both[1][k], not_indefinite(bend, free), atol=1e-8 * np.abs(bend).max())
@@ -171,32 +171,33 @@ def test_the_step_is_the_models_least_value_within_bounds_and_reach():
     np.testing.assert_allclose(step.demands, [[0.8, 0.0]], atol=1e-6)
 
 
-@pytest.mark.parametrize("size", [1.0, 4.0])
+@pytest.mark.parametrize("size", [0.01, 1.0, 4.0])
 def test_a_step_to_where_two_pieces_meet(size):
     """max(2 p, 0.3 - p) + size p^2/2 of one number: they meet at p = 0.1, where 2 s - (1 - s) + size p = 0 shares them. A third
     piece stays below. Demands keep their own multipliers."""
     pieces, tilts = np.array([[0.0, -9.0, 0.3]]), np.array([[[2.0], [0.0], [-1.0]]])
     rows = np.array([[[-1.0], [1.0]]])
     point = point_of(np.array([[0.5]]), np.array([[0.3, -0.4]]), rows, pieces, tilts)
-    step = modelled(shape(0, 1, 3), point, np.ones((1, 1, 1)), np.array([size]), np.array([50.0]), np.array([0.3]))
+    step = modelled(shape(0, 1, 3), point, np.ones((1, 1, 1)), np.array([size]), np.array([50.0 + 5.0 / size]), np.array([0.3]))
     np.testing.assert_allclose(step.p, [[0.1]], atol=1e-6)
     first = (1.0 - size * 0.1) / 3.0
     np.testing.assert_allclose(step.shares, [[first, 0.0, 1.0 - first]], atol=1e-6)
     np.testing.assert_allclose(step.demands, [[0.0]], atol=1e-6)
     near = point._replace(values=np.array([[0.3, -0.05]]))  # the demand stops it at 0.05: its price is the slope there
-    step = modelled(shape(0, 1, 3), near, np.ones((1, 1, 1)), np.array([size]), np.array([50.0]), np.array([0.3]))
+    step = modelled(shape(0, 1, 3), near, np.ones((1, 1, 1)), np.array([size]), np.array([50.0 + 5.0 / size]), np.array([0.3]))
     np.testing.assert_allclose(step.p, [[0.05]], atol=1e-6)
-    np.testing.assert_allclose(step.demands, [[1.0 / size - 0.05]], atol=1e-6)
+    np.testing.assert_allclose(step.demands, [[1.0 / size - 0.05]], rtol=1e-5)
     np.testing.assert_allclose(step.shares, [[0.0, 0.0, 1.0]], atol=1e-6)
 
 
-def test_of_many_pieces_those_count_that_could_be_the_largest():
-    """Forty, of which three could be the largest within reach: one that is below now and steep among them."""
-    pieces, tilts = np.full((1, 40), 4.0), np.linspace(-3.0, 3.0, 40)[None, :, None].copy()
-    pieces[0, [7, 21, 39]], tilts[0, [7, 21, 39], 0] = [5.0, 4.5, 4.8], [-2.0, 8.0, 0.0]
-    point = point_of(np.array([[0.5]]), np.array([[5.0]]), tilts[:, 7:8], pieces, tilts)
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_of_many_pieces_those_count_that_could_be_the_largest(way):
+    """Forty, of which two meet at the least value: one is below all others now, and steep where the bound leaves room."""
+    pieces, tilts = np.full((1, 40), 4.7), way * np.linspace(-1.5, 1.5, 40)[None, :, None]
+    pieces[0, [7, 21]], tilts[0, [7, 21], 0] = [5.0, 4.5], [-2.0 * way, 8.0 * way]
+    point = point_of(np.array([[0.5 - 0.49 * way]]), np.array([[5.0]]), tilts[:, 7:8], pieces, tilts)
     step = modelled(shape(parts=40), point, np.zeros((1, 1, 1)), np.ones(1), np.array([50.0]), np.array([0.1]))
-    np.testing.assert_allclose(step.p, [[0.05]], atol=1e-6)  # 5 - 2 p = 4.5 + 8 p
+    np.testing.assert_allclose(step.p, [[0.05 * way]], atol=1e-6)  # 5 - 2 p = 4.5 + 8 p
     np.testing.assert_array_equal(np.flatnonzero(step.shares[0] > 1e-4), [7, 21])
     np.testing.assert_allclose(np.sum(step.shares), 1.0, rtol=1e-12)
     np.testing.assert_allclose(np.sum(step.shares[0] * tilts[0, :, 0]), 0.0, atol=1e-5)

@@ -1,0 +1,152 @@
+"""From starts to the best designs: which count as the best, which are gone on from, how catalogues are chosen from."""
+
+import itertools
+
+import numpy as np
+import pytest
+from two_springs import FREE, SCENE, plain, point_of
+
+from optimize import DesignSpace, expected, jam_frequency, largest
+from optimize.search import find as find_module
+from optimize.search.find import Found, Options, _away, _few, _of_their_mode, _spread, choose, find
+from optimize.search.polish import Optimality
+from optimize.search.problem import evaluate, looked_up, problem_of
+
+BOUNDS = np.array([1e4, 1e4]), np.array([9e4, 9e4])
+NEAR = plain("near", lambda x, y: (x - 6.0) ** 2 + (y - 5.0) ** 2 + 2.0)
+
+
+def ended(values, violation, z=None):
+    """Searches that ended with these objectives."""
+    s = len(values)
+    z = np.linspace(0.0, 1.0, 2 * s).reshape(s, 2) if z is None else np.asarray(z)
+    none = Optimality(np.zeros((s, 0)), np.zeros((s, 0)), np.zeros((s, 2)), np.zeros(s))
+    point = point_of(z, np.asarray(values)[:, None], np.zeros((s, 1, 2)))
+    return Found(point, np.zeros((1, s)), np.zeros(s), np.asarray(violation), none, s, s, False, BOUNDS)
+
+
+def test_the_best_is_the_least_that_keeps_all_demands():
+    assert ended([3.0, 1.0, 2.0, 2.5], [0.0, 1.0, 9e-8, 0.0]).best == 2
+    assert ended([3.0, 1.0, 2.0, 2.5], [2e-7, 0.4, 0.3, 5.0]).best == 0  # none keeps them: the one that nearly does
+
+
+def test_the_few_to_go_on_from_are_the_best_that_differ():
+    z = [[0.5, 0.5], [0.505, 0.493], [0.2, 0.5], [0.5, 0.52], [0.9, 0.9], [0.1, 0.1]]
+    found = ended([3.0, 2.0, 5.0, 4.0, np.nan, 1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], z)
+    np.testing.assert_array_equal(_few(found), [z[1], z[3], z[2], z[5]])  # what keeps no demand comes last
+    many = ended(np.arange(20.0), np.zeros(20))
+    np.testing.assert_array_equal(_few(many), many.point.z[:7])
+    assert _few(ended([np.nan], [np.inf])).shape == (0, 2)
+
+
+def test_how_far_a_number_is_from_its_catalogue():
+    assert _away((1.0, 2.0, 4.0), 2.5) == 0.25 and _away((1.0, 2.0, 4.0), 3.5) == 0.125 and _away((1.0, 2.0), 1.0) == 0.0
+    assert _away((0.0, 2.0), 0.0) == 0.0
+
+
+def test_a_jam_of_another_number_is_no_answer():
+    problem = problem_of(DesignSpace(SCENE, FREE), jam_frequency(mode=3), [], 2)
+    z = np.array([[0.5, 0.5], [0.4, 0.3]])
+    point = evaluate(problem, z, looked_up(problem, z))
+    np.testing.assert_array_equal(_of_their_mode(problem, point).values, point.values)
+    other = point._replace(known=(point.known[0] * np.array([1.0, 1.001]),))
+    kept = _of_their_mode(problem, other)
+    np.testing.assert_array_equal(kept.values[:, 0], [point.values[0, 0], np.nan])
+    np.testing.assert_array_equal(kept.slopes, point.slopes)
+
+
+def test_tolerances_count_wherever_they_stand():
+    space, off = DesignSpace(SCENE, FREE), {"machine.stiffness": 0.05}
+    mean = expected(NEAR, off, samples=4)
+    for objective, demands, counts in (
+        (NEAR, [], False),
+        (largest(NEAR, mean), [], True),
+        (NEAR, [mean < 3.0], True),
+        (NEAR, [plain("other", lambda x, y: x) < mean], True),
+    ):
+        assert _spread(problem_of(space, objective, demands)) == counts
+
+
+OPTIONS = Options(starts=4, seed=0, iterations=25, rate=0.05, polishing=8)
+
+
+def test_a_search_tells_what_it_does_and_keeps_its_history():
+    problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
+    told = []
+    found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
+    assert told[0] == ("drawing starts", 0.0)
+    shares = [share for _, share in told]
+    assert shares == sorted(shares) and ("descending, best 2.063", 0.5) in told and told[-1] == ("polishing, best 2", 0.9)
+    random = np.random.default_rng(0).uniform(size=(4, 2))
+    starts = 1.0 + 8.0 * random
+    np.testing.assert_allclose(found.history[0], np.sum((starts - [6.0, 5.0]) ** 2, axis=1) + 2.0, rtol=1e-12)
+    assert len(found.history) >= 1 + 25 + 2 and found.drawn == found.existing == 4 and not found.interrupted
+    np.testing.assert_allclose(found.history[-1], 2.0, rtol=1e-12)
+    np.testing.assert_array_equal(found.bounds, BOUNDS)
+    begun = find(problem, Options(4, 0, 25, 0.05, 8, begin=np.array([[0.1, 0.2], [0.3, 0.9]])), lambda *_: None)
+    np.testing.assert_allclose(begun.history[0], [(1.8 - 6.0) ** 2 + (2.6 - 5.0) ** 2 + 2.0, 2.6**2 + 3.2**2 + 2.0], rtol=1e-12)
+    assert begun.drawn == begun.existing == 2
+    nowhere = problem_of(DesignSpace(SCENE, FREE), plain("no", lambda x, y: x * np.nan), [], 4)
+    assert find(nowhere, OPTIONS, lambda *_: None) is None
+
+
+def test_what_takes_long_is_searched_from_the_best_without_tolerances():
+    problem = problem_of(DesignSpace(SCENE, FREE), expected(NEAR, {"machine.stiffness": 0.05}, samples=4), [], 4)
+    told = []
+    found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares) and {"drawing starts"} == {what for what, share in told if share in (0.0, 0.5)}
+    assert found.drawn == found.existing == 4 and len(found.point.z) == 16  # the best one, and random ones beside it
+    random = np.random.default_rng(0).uniform(size=(16, 2))
+    begun = evaluate(problem, np.concatenate([[[0.625, 0.5]], random])[:16], ())
+    np.testing.assert_allclose(found.history[0], begun.values[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(found.point.z[found.best], [0.625, 0.5], atol=0.01)
+
+
+CATALOGUE = [1e4, 1.5e4, 2.2e4, 3.3e4, 4.7e4, 6.8e4]
+
+
+def bent(x, y):
+    return (x * y - 6.0) ** 2 + (x - 2.0 * y) ** 2 + 1.0
+
+
+def chosen(demands=(), catalogue=CATALOGUE, wish=bent):
+    space = DesignSpace(SCENE, {}, choices={"machine.stiffness": catalogue})
+    problem = problem_of(space, plain("bent", wish), demands, 4)
+    return problem, choose(problem, OPTIONS, lambda *_: None)
+
+
+def test_choices_from_catalogues_are_the_best_of_all():
+    problem, found = chosen()
+    tried = {pair: bent(*(np.array(pair) / 1e4)) for pair in itertools.product(CATALOGUE, CATALOGUE)}
+    least = min(tried, key=tried.get)
+    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    np.testing.assert_allclose(numbers, least, rtol=1e-9)
+    np.testing.assert_allclose(found.point.values[found.best, 0], tried[least], rtol=1e-9)
+    assert 2 <= found.nodes < 20 and found.drawn == found.existing == 4
+
+
+def test_a_choice_that_is_the_best_anyway_needs_no_bounds():
+    _, found = chosen(wish=lambda x, y: (x - 1.5) ** 2 + (y - 4.7) ** 2 + 1.0)
+    assert found.nodes == 0
+
+
+def test_choices_keep_demands_or_there_are_none(monkeypatch):
+    product = plain("product", lambda x, y: x * y)
+    problem, found = chosen([product > 9.0])
+    tried = {pair: bent(*(np.array(pair) / 1e4)) for pair in itertools.product(CATALOGUE, CATALOGUE) if np.prod(pair) > 9e8}
+    numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])
+    np.testing.assert_allclose(numbers, min(tried, key=tried.get), rtol=1e-9)
+    assert chosen([product > 8.9, product < 9.0], [1e4, 2e4, 7e4])[1] is None  # machines between, but no choice
+    monkeypatch.setattr(find_module, "_NODES", 0)
+    assert chosen()[1] is None
+
+
+@pytest.mark.parametrize("bounds", [((1e4, 4e4), (2e4, 4e4)), ((7e4, 7e4), (7e4, 9e4))])
+def test_between_narrower_bounds_the_best_is_at_them(bounds):
+    problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [], 4)
+    low, high = (np.array(each) for each in bounds)
+    found = find_module._bounded(problem, low, high, np.array([[3e4, 3e4], [8e4, 1e4]]), OPTIONS)
+    numbers = problem.space.within(low, high).numbers(found.point.z)
+    np.testing.assert_allclose(numbers, np.clip([[6e4, 5e4]] * 2, low, high), rtol=1e-9)
+    np.testing.assert_array_equal(found.bounds, [low, high])
