@@ -1,0 +1,52 @@
+"""Quantities of a run-up, from motions in closed form."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from optimize import peak_force, settling_time
+
+TIME = jnp.linspace(0.0, 10.0, 2001)
+SPEED = 7.0
+
+
+def answers(size, force=None):
+    """What a run-up with this amplitude of platform 2 answers; platform 1 rests."""
+    y, v = size * jnp.sin(SPEED * TIME), size * SPEED * jnp.cos(SPEED * TIME)
+    state = SimpleNamespace(displacement=jnp.stack([0.0 * y, y], axis=1), velocity=jnp.stack([0.0 * v, v], axis=1))
+    run = SimpleNamespace(trajectory=SimpleNamespace(state=state, time=TIME, foundation_force=force), omega=jnp.asarray(SPEED))
+    return SimpleNamespace(start_up=lambda until, spin_up: run if (until, spin_up) == (10.0, 2.0) else None)
+
+
+@pytest.mark.parametrize("within", [0.05, 0.2])
+@pytest.mark.parametrize("size", [0.02, 3.0])
+def test_the_amplitude_settles_within_a_share(within, size):
+    """size (1 - exp(-t)): off by more than the share of its end until t = -ln(within). Samples are 5 ms apart."""
+    asked = settling_time(until=10.0, spin_up="2 s", within=within, of=2)
+    last = float(jnp.mean(1.0 - jnp.exp(-TIME[-100:])))
+    found = float(asked.read(answers(size * (1.0 - jnp.exp(-TIME)))))
+    np.testing.assert_allclose(found, -np.log(1.0 - last * (1.0 - within)), atol=1e-5)  # h^2/8 of the line between samples
+    later = float(asked.read(answers(size * (1.0 + jnp.where(TIME > 4.0, 0.0, 1.0)))))  # too large at first
+    np.testing.assert_allclose(later, 4.0, atol=0.006)
+
+
+def test_what_still_changes_settles_at_the_end():
+    falling = answers(2.0 - 0.1 * TIME)
+    np.testing.assert_allclose(settling_time(until=10.0, spin_up=2.0, within=0.001, of=2).read(falling), 10.0, atol=0.006)
+    with pytest.raises(jv.InputError, match="platforms 1 to 2"):
+        settling_time(until=10.0, spin_up=2.0, of=3).read(falling)
+    for within in (0.0, 1.0):
+        with pytest.raises(jv.InputError, match="greater than 0 and less than 1"):
+            settling_time(until=10.0, spin_up=2.0, within=within)
+    for wrong in (0.0, 11.0):
+        with pytest.raises(jv.InputError, match="at most until, 10 s"):
+            peak_force(until=10.0, spin_up=wrong)
+
+
+def test_the_peak_of_a_force_is_its_largest_modulus():
+    force = jnp.stack([3.0 * jnp.sin(TIME), 4.0 * jnp.sin(TIME)], axis=1) * jnp.exp(-TIME)[:, None]
+    top = float(jnp.sin(jnp.pi / 4.0) * jnp.exp(-jnp.pi / 4.0))
+    np.testing.assert_allclose(peak_force(until=10.0, spin_up=2.0).read(answers(TIME, force)), 5.0 * top, rtol=1e-5)

@@ -1,0 +1,127 @@
+"""Quantities and demands as expressions: their pieces, units, words; what they ask."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+from optimize import Quantity, amplitude, foundation_force, largest, least
+from optimize.wishes.answers import Answers
+from optimize.wishes.quantity import Asking, Demand
+
+SCENE = scene("two_mass")
+
+
+def constant(name, value, unit=""):
+    return Quantity(name, unit, lambda s: jnp.asarray(value))
+
+
+A, B, C = constant("a", 2.0), constant("b", 5.0), constant("c", -3.0)
+TOP, LOW = largest(A, B), least(A, C)
+
+
+@pytest.mark.parametrize(
+    ("quantity", "sign", "pieces"),
+    [
+        (A, 1.0, [2.0]),
+        (A, -1.0, [-2.0]),
+        (TOP, 1.0, [2.0, 5.0]),
+        (TOP, -1.0, [-5.0]),  # minus the largest is the least: no search goes along its kinks
+        (LOW, -1.0, [-2.0, 3.0]),
+        (LOW, 1.0, [-3.0]),
+        (-LOW, 1.0, [-2.0, 3.0]),
+        (-TOP, -1.0, [2.0, 5.0]),
+        (-TOP, 1.0, [-5.0]),
+        (TOP + largest(A, C), 1.0, [4.0, -1.0, 7.0, 2.0]),
+        (TOP - LOW, 1.0, [0.0, 5.0, 3.0, 8.0]),
+        (LOW - TOP, -1.0, [0.0, 3.0, 5.0, 8.0]),
+        (TOP * A, 1.0, [4.0, 10.0]),
+        (B * TOP, 1.0, [10.0, 25.0]),
+        (LOW * A, -1.0, [-4.0, 6.0]),
+        (TOP * C, 1.0, [-15.0, -15.0]),  # by what is negative they would be those of the least
+        (TOP / A, 1.0, [1.0, 2.5]),
+        (TOP / C, 1.0, [-5.0 / 3.0, -5.0 / 3.0]),
+        (A / TOP, 1.0, [0.4]),
+        (A * B, 1.0, [10.0]),
+        (TOP**2, 1.0, [25.0]),
+        (largest(TOP, 3.0 * A), 1.0, [2.0, 5.0, 6.0]),
+    ],
+)
+def test_the_largest_piece_is_the_quantity(quantity, sign, pieces):
+    found = quantity.pieces(Answers(SCENE), sign)
+    np.testing.assert_allclose(found, pieces, rtol=1e-14)
+    np.testing.assert_allclose(jnp.max(found), sign * quantity(SCENE), rtol=1e-14)
+
+
+def test_functions_of_a_scene_or_of_its_modes_too():
+    Quantity("one", "", lambda s: s.drive.speed)
+    Quantity("two", "", lambda s, modes: modes.omega[0])
+    Quantity("more may be given", "", lambda s, k=3: s.drive.speed)
+    for wrong in (None, 3.0, lambda: 1.0, lambda s, modes, more: 1.0):
+        with pytest.raises(ValueError, match="give a function of a scene, or of a scene and its jam modes"):
+            Quantity("wrong", "", wrong)
+
+
+def test_units_and_words_of_expressions():
+    force, arm, time = constant("force", 3.0, "N"), constant("arm", 2.0, "m"), constant("time", 1.0, "s")
+    expressions = {
+        (force + "2 N"): ("force + 2 N", "N"),
+        (force * arm): ("force * arm", "N m"),
+        (force * arm) * time: ("force * arm * time", "(N m) s"),
+        ((force + force) * arm): ("(force + force) * arm", "N m"),
+        (force / (arm * time)): ("force / arm * time", "N/(m s)"),
+        (force / arm): ("force / arm", "N/m"),
+        (force / force): ("force / force", ""),
+        (force / 2.0): ("force / 2", "N"),
+        (1.0 / time): ("1 / time", "1/s"),
+        (arm**2): ("(arm)^2", "(m)**2"),
+        -force: ("negative force", "N"),
+        largest(force, 2.0 * force): ("largest of (force; 2 * force)", "N"),
+    }
+    for expression, (words, unit) in expressions.items():
+        assert (expression.words, expression.unit) == (words, unit)
+    own = amplitude(mode=3, of=2)
+    for built in (own + own, 2.0 * own, constant("x", 1.0, "m") / own, largest(own, 3.0 * own), own - constant("x", 1.0, "m")):
+        assert built.mode == 3 and built.of == 2
+    assert (force * arm).mode is None and (force * arm).of is None
+
+
+@pytest.mark.parametrize("wrong", [True, float("inf"), None, [1.0]])
+def test_what_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match="give a quantity, a finite number or text with a unit"):
+        A + wrong
+    with pytest.raises(ValueError, match="give one quantity or several"):
+        largest(A, 3.0)
+
+
+def test_demands_say_by_how_much_they_are_not_met():
+    answers = Answers(SCENE)
+    most, more, other = A < 3.0, A > 5.0, B < A
+    assert (most.constant, more.constant, other.constant) == (3.0, 5.0, None)
+    for demand, limit, excess in ((most, 3.0, -1.0), (more, 5.0, 3.0), (other, 0.0, 3.0), (B > A, 0.0, -3.0), (most, 1.5, 0.5)):
+        np.testing.assert_allclose(demand.excess(answers, jnp.asarray(limit)), excess, rtol=1e-14)
+    assert most.form() == (A < 8.0).form() != (A > 8.0).form() and most.form().constant == 0.0
+    assert other.form() == Demand(B, A, "at most", "") and other.words == "b at most a"
+    assert (foundation_force(mode=3) < "2 kN").words == "foundation force, mode 3 at most 2 kN"
+
+
+def test_what_asks_knows_its_tiers():
+    asked = []
+
+    def function(answers, tier, *settings):
+        asked.append((tier, settings))
+        return answers.scene.drive.speed
+
+    both = Asking("a_b", "", function, settings=(1, 2), tiers=("leading", "exact"))
+    assert both.words == "a b" and both.at_tier("exact").words == "a b, exact" and both.at_tier("time") is both
+    assert Asking("a_b", "", function, tiers=("leading",)).words == "a b"
+    assert Asking("a_b", "", function, text="said so").words == "said so"
+    exact = both.at_tier("exact")
+    np.testing.assert_array_equal(exact.pieces(Answers(SCENE), -1.0), [-120.0])
+    assert asked == [("exact", (1, 2))] and exact.easy == both and not exact.forward_only
+    timed = Asking("t", "", function, tier="time")
+    assert timed.forward_only and (A + timed).forward_only and (timed * A).forward_only and not (A + both).forward_only
+    assert (A + exact).easy.parts == (A, both) and (A + both).at_tier("exact").parts == (A, exact)
+    assert len(asked) == 1
+    parted = Asking("p", "", function, settings=(7,), parted=lambda answers, sign, tier, seven: sign * jnp.array([1.0, seven]))
+    np.testing.assert_array_equal(parted.pieces(Answers(SCENE), -1.0), [-1.0, -7.0])
