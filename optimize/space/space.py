@@ -267,7 +267,8 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         target = places_of(scene, name, "ties")
         if target.entries & taken:
             raise InputError(f"ties.{name}", "is free as well; a number that follows another cannot be free")
-        source_name, factor = (given, 1.0) if isinstance(given, str) else given if len(given) == 2 else (None, None)
+        pair = isinstance(given, (list, tuple)) and len(given) == 2
+        source_name, factor = given if pair else (given, 1.0)
         if not isinstance(source_name, str):
             raise InputError(f"ties.{name}", f"is {given!r}; give another number's name, or (name, factor)")
         source = places_of(scene, source_name, f"ties.{name}")

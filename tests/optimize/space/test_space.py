@@ -1,0 +1,100 @@
+"""Design spaces: scales, catalogues, ties, what is refused."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from optimize import DesignSpace, hold, jam_frequency, total
+
+SCENE, THREE = scene("two_mass"), scene("three_mass")
+
+
+@pytest.mark.parametrize(
+    ("bounds", "middle"),
+    [
+        ((1e4, 9e4), 5e4),
+        ((1e4, 1e5), 1e4 * 10.0**0.5),  # a factor of 10 and more is divided by ratio
+        ((1e4, 9e4, "log"), 3e4),
+        ((1e4, 1e6, "even"), 5.05e5),
+        ((0.0, 1e6), 5e5),
+    ],
+)
+def test_ranges_are_divided_evenly_or_by_ratio(bounds, middle):
+    space = DesignSpace(SCENE, {"machine.stiffness[0]": bounds})
+    for z in (jnp.array([0.5]), np.array([0.5])):
+        np.testing.assert_allclose(space.numbers(z), [middle], rtol=1e-12)
+        np.testing.assert_allclose(space.shares(space.numbers(z)), z, rtol=1e-12)
+    np.testing.assert_allclose(space.numbers(np.array([[0.0], [1.0]])), np.array(bounds[:2])[:, None], rtol=1e-12)
+    np.testing.assert_array_equal(space.shares(np.array([[-1.0], [1e9]])), [[0.0], [1.0]])
+    fixed = space.within(np.array([5e4]), np.array([5e4]))
+    np.testing.assert_allclose(fixed.numbers(np.array([0.0])), [5e4])
+    np.testing.assert_array_equal(fixed.shares(np.array([5e4])), [0.0])
+
+
+def test_catalogues_are_ascending_without_doubles_and_have_places():
+    catalogue = {"machine.stiffness": ["30 N/mm", 1e4, 3e4, 2e4], "loads.count": [4, 2, 4], "loads.drag": [0.0, 2.0]}
+    space = DesignSpace(SCENE, {"machine.link_stiffness": (1e5, 3e5)}, choices=catalogue)
+    assert space.counts == (2, 4) and space.size == 4
+    assert [(c.name, c.values, c.start) for c in space.choices] == [
+        ("machine.stiffness", (1e4, 2e4, 3e4), 1),
+        ("machine.stiffness", (1e4, 2e4, 3e4), 2),
+        ("loads.drag", (0.0, 2.0), 3),
+    ]
+    assert space.logs == (False,) * 4
+    wide = DesignSpace(SCENE, {}, choices={"machine.stiffness[0]": [1e4, 2e4, 1e5]})
+    np.testing.assert_allclose(wide.numbers(np.array([0.5])), [1e4 * 10.0**0.5])
+    counts = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"loads.count": [2, 3]})
+    assert counts.choices == () and counts.size == 1
+
+
+def test_ties_follow_in_order():
+    ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 2.0), "machine.link_stiffness": ("machine.stiffness[1]", "keep")}
+    space = DesignSpace(THREE, {"machine.stiffness[0]": (1e4, 9e4)}, ties=ties)
+    built = space.at(jnp.array([0.5]))
+    np.testing.assert_allclose(built.machine.stiffness, [5e4, 1e5, 3e3])
+    np.testing.assert_allclose(built.machine.link_stiffness, np.array([1e4, 5e3, 2e4]) / 4e4 * 1e5)
+    all_of_them = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, ties={"machine.damping": ("machine.stiffness", 1e-3)})
+    np.testing.assert_allclose(all_of_them.at(jnp.array([0.0, 1.0])).machine.damping, [10.0, 90.0])
+
+
+def test_what_is_held_is_off_by_its_share():
+    space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"), "100 N/mm")])
+    from optimize.wishes.answers import Answers
+
+    np.testing.assert_allclose(space.residuals(Answers(space.at(jnp.array([0.5, 1.0])))), [0.4], rtol=1e-12)
+    kept = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"))])
+    assert float(kept.held[0].value) == 8e4
+
+
+FREE = {"machine.stiffness": (1e4, 9e4)}
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: DesignSpace(SCENE, {"machine": {"stiffness": (1, 2)}}), "write the whole name in quotes"),
+        (lambda: DesignSpace(SCENE, {"loads.drag": (1.0, 2.0, 3.0, 4.0)}), "give the bounds as"),
+        (lambda: DesignSpace(SCENE, {"loads.drag": (1.0, 2.0, "ratio")}), "it must be 'log' or 'even'"),
+        (lambda: DesignSpace(SCENE, {"loads.drag": (0.0, 2.0, "log")}), "give a low bound greater than 0"),
+        (lambda: DesignSpace(SCENE, {"loads.drag": (2.0, 2.0)}), "must be less than the second"),
+        (lambda: DesignSpace(SCENE, {}, choices={"loads.drag": []}), "give a list of values"),
+        (lambda: DesignSpace(SCENE, {}, choices={"loads.drag": [1.0, 1.0]}), "has one value"),
+        (lambda: DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"loads.drag": [1.0, 2.0]}), "is free already"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"machine.stiffness[0]": "loads.drag"}), "cannot be free"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping": 3.0}), "or (name, factor)"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping": ("a", "b", "c")}), "or (name, factor)"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"machine.damping[0]": "machine.damping"}), "is tied to itself"),
+        (lambda: DesignSpace(THREE, FREE, ties={"loads.drag": "machine.damping"}), "name one of them"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", 0.0)}), "give a number greater than 0"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", True)}), "give a number greater than 0"),
+        (lambda: DesignSpace(SCENE, FREE, ties={"loads.drag": ("machine.damping[0]", "half")}), "give a number greater than 0"),
+        (lambda: DesignSpace(SCENE, FREE, [hold(total("machine.stiffness"), 8e4)] * 2), "more must be free than held"),
+        (lambda: DesignSpace(scene(speed=1e-3), FREE, [hold(jam_frequency(mode=5))]), "give the value it shall be held at"),
+    ],
+)
+def test_wrong_spaces_are_said_in_one_sentence(make, says):
+    with pytest.raises(jv.InputError) as caught:
+        make()
+    assert says in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,125 @@
+"""What quantities ask a scene for."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from optimize import amplitude, fold_margin, foundation_force, phase, total
+from optimize.wishes import answers as answers_module
+from optimize.wishes.answers import Answers, Recorder, guesses
+from optimize.wishes.given import arguments, same_unit
+from optimize.wishes.jams import between
+
+SCENE = scene("two_mass")
+
+
+@pytest.fixture(scope="module")
+def modes():
+    return jv.jam_modes(SCENE)
+
+
+def test_runs_in_a_jam_take_sixty_periods_of_the_lowest_frequency(monkeypatch):
+    asked = []
+    monkeypatch.setattr(answers_module, "simulate", lambda scene, until, **more: asked.append((until, more)))
+    answers = Answers(SCENE)
+    answers.jam_run(3)
+    answers.jam_run(3)
+    k, m = np.array([[2.5e5, -2e5], [-2e5, 2.3e5]]), np.diag([120.0, 95.0 + 2.4])
+    lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(m, k)).min())
+    ((until, more),) = asked
+    np.testing.assert_allclose(until, 60.0 * 2.0 * np.pi / lowest, rtol=1e-10)
+    assert (more["start"], more["mode"], more["adjoint"]) == ("jam", 3, None)
+    answers.start_up(5.0, 2.0)
+    assert asked[1][0] == 5.0 and asked[1][1]["spin_up"] == 2.0
+    kept = Answers(SCENE)
+    kept.keep_run(3, "the run")
+    assert kept.jam_run(3) == "the run" and len(asked) == 2
+
+
+def test_guesses_are_the_jam_and_the_folds_beside_it(modes):
+    folds = np.sort(np.asarray(modes.folds.omega)[np.asarray(modes.folds.exists)])
+    for mode in (3, 4):
+        omega = float(modes.select(mode).omega)
+        assert float(guesses(modes, ("jam", mode))) == omega
+        np.testing.assert_allclose(guesses(modes, ("below", mode)), folds[folds < omega].max())
+        np.testing.assert_allclose(guesses(modes, ("above", mode)), folds[folds > omega].min())
+    assert not np.isfinite(guesses(modes, ("above", 5))) and np.isfinite(guesses(modes, ("below", 5)))
+
+
+def test_margins_are_to_the_nearer_fold(modes):
+    """Odd modes end at a lower rotor speed on the side of lower load speeds, even ones on the other; none is 0, or 10 n."""
+    answers = Answers(SCENE, modes=modes)
+    assert answers.modes is modes
+    below, above = answers.folds(5)
+    assert 0.0 < below < 120.0 and float(above) == 1200.0
+    for mode in (3, 4):
+        ends = np.array([float(each) for each in answers.folds(mode)])
+        slow, fast = ends if mode == 3 else ends[::-1]
+        assert slow < 120.0 < fast
+        np.testing.assert_allclose(fold_margin(mode=mode).read(answers), min(120.0 - slow, fast - 120.0), rtol=1e-12)
+        pieces = fold_margin(mode=mode).pieces(answers, -1.0)
+        np.testing.assert_allclose(pieces, [slow - 120.0, 120.0 - fast], rtol=1e-12)
+        assert fold_margin(mode=mode).pieces(answers).shape == (1,)
+
+
+def test_modes_are_numbered():
+    for wrong in (0, 6, True, 2.0):
+        with pytest.raises(jv.InputError, match="numbered 1 to 5"):
+            Answers(SCENE).jam(wrong)
+    recorder = Recorder()
+    recorder["a"], recorder["b"], recorder["a"]
+    assert recorder.keys == ["a", "b"]
+
+
+@pytest.mark.parametrize(("of", "found"), [(None, (1, 2)), (2, 2), ([1, 2], (1, 2)), ((2, 1), (2, 1)), ((1,), 1)])
+def test_whose_amplitude(of, found):
+    assert between(SCENE, of) == found
+    assert between(scene("one_mass")) == 1
+
+
+@pytest.mark.parametrize("of", [0, 3, True, 1.0, (1, 1), (1, 3), (1, 2, 1), ()])
+def test_whose_amplitude_there_is_not(of):
+    with pytest.raises(jv.InputError, match="a pair of different platforms of 1 to 2"):
+        between(SCENE, of)
+
+
+def test_amplitudes_and_forces_of_each_tier():
+    """From answers that are known: which of them each quantity takes."""
+    jam = SimpleNamespace(
+        amplitude=jnp.array([3.0, 5.0]), displacement=jnp.array([3.0, 4.0j]), foundation_force=jnp.asarray(7.0)
+    )
+    orbit = SimpleNamespace(
+        amplitude=jnp.array([30.0, 50.0]), relative_amplitude=lambda i, j: jnp.asarray(10.0 * i + j),
+        foundation_force=jnp.asarray(70.0), omega=jnp.asarray(9.0), orders=(1, 3),
+        force_harmonics=jnp.array([[1.0 + 1.0j, 3.0j]]), displacement_harmonics=jnp.array([[1.0, 5.0], [1.0j, 5.0]]),
+        force_peaks=lambda: jnp.array([60.0, 70.0]),
+    )  # fmt: skip
+    run = SimpleNamespace(amplitude=jnp.array([300.0, 500.0]), foundation_force=jnp.asarray(700.0))
+    known = SimpleNamespace(scene=SCENE, jam=lambda mode: jam, orbit=lambda mode: orbit, jam_run=lambda mode: run)
+    for of, values in ((1, (3.0, 30.0, 300.0)), (2, (5.0, 50.0, 500.0))):
+        for tier, value in zip(("leading", "exact", "time"), values, strict=True):
+            assert float(amplitude(mode=3, of=of, tier=tier).read(known)) == value
+    assert float(amplitude(mode=3).read(known)) == 5.0 and float(amplitude(mode=3, of=(2, 1), tier="exact").read(known)) == 21.0
+    for tier, value in (("leading", 7.0), ("exact", 70.0), ("time", 700.0)):
+        assert float(foundation_force(mode=3, tier=tier).read(known)) == value
+    np.testing.assert_allclose(phase(mode=3).read(known), np.pi / 2.0)
+    np.testing.assert_allclose(phase(mode=3, tier="exact").read(known), np.pi / 2.0)
+    np.testing.assert_allclose(foundation_force(mode=3, harmonic=3).read(known), 3.0)
+    assert float(foundation_force(mode=3, harmonic=2).read(known)) == 0.0
+    np.testing.assert_array_equal(foundation_force(mode=3, tier="exact").pieces(known), [60.0, 70.0])
+    np.testing.assert_array_equal(foundation_force(mode=3, tier="exact").pieces(known, -1.0), [-70.0])
+    np.testing.assert_array_equal(foundation_force(mode=3).pieces(known, -1.0), [-7.0])
+
+
+def test_what_users_give_is_read():
+    assert arguments(lambda s: s) == 1 and arguments(lambda s, m: s) == 2 and arguments(lambda s, m=3, *, k=2: s) == 1
+    assert arguments(lambda *s: s) == 0 and arguments(max) in (0, 1)
+    assert same_unit("N", "kg m/s^2") and same_unit("", "dimensionless") and same_unit("rad/s", "rad/s")
+    assert not same_unit("N", "kN") and not same_unit("N", "m") and not same_unit("nonsense", "N")
+    for wrong in ("drive.speed", "machine.kind", "machine", "effects.mass", 3):
+        with pytest.raises(jv.InputError, match="must name numbers of a scene"):
+            total(wrong)
