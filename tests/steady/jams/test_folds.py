@@ -9,7 +9,8 @@ from load_speeds import all_load_speeds
 from scenes import published
 
 import jaxvib as jv
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.jams import folds
+from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, without_ripples
 
 rotor_speeds = eqx.filter_jit(eqx.filter_vmap(jam_rotor_speed, in_axes=(None, 0)))
 
@@ -148,3 +149,62 @@ def test_folds_are_differentiable():
     for i in range(2):
         step = jnp.zeros(2).at[i].set(h)
         np.testing.assert_allclose(exact[:, i], (both(k + step)[1] - both(k - step)[1]) / (2 * h), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("cuts", "found", "modes"),
+    [
+        ([1.1, 1.5, 2.1, 2.5, 3.1, 3.5], 6, [1, 2, 3, 4, 5, 6, 7]),  # a peak at each of three resonances
+        ([2.1, 2.5, 3.1, 3.5], 4, [3, 4, 5, 6, 7, 7, 7]),  # none at the first
+        ([1.1, 1.5, 3.1, 3.5], 4, [1, 2, 5, 6, 7, 7, 7]),  # none at the second
+        ([2.9, 2.95, 3.1, 3.5], 4, [3, 4, 5, 6, 7, 7, 7]),  # two nearest to the third, which the last one needs
+        ([1.1, 1.2, 1.3, 1.5], 4, [1, 2, 3, 4, 7, 7, 7]),  # two nearest to the first
+        ([], 0, [7] * 7),
+    ],
+)
+def test_peaks_belong_to_the_resonances_they_are_nearest_to(cuts, found, modes):
+    cuts = np.array(cuts + [9.0] * (6 - found))
+    assert piece_modes(jnp.asarray(cuts), jnp.arange(6) < found, jnp.array([1.0, 2.0, 3.0])).tolist() == modes
+
+
+def test_the_ripples_that_span_least_are_left_out():
+    speeds = jnp.array([9.0, 1.0, 1.1, 1.05, 8.0, 2.0, 2.1, 2.09])
+    np.testing.assert_array_equal(without_ripples(speeds, jnp.asarray(8), 4), [0, 1, 4, 5])
+    np.testing.assert_array_equal(without_ripples(speeds, jnp.asarray(6), 4), [0, 1, 4, 5])
+    np.testing.assert_array_equal(without_ripples(speeds, jnp.asarray(4), 4), [0, 1, 2, 3])
+
+
+def test_folds_are_looked_for_on_both_sides_of_every_pole():
+    """Poles of two platforms that know nothing of each other: w^2 = k/m, decay c/2m. Points crowd there by that width."""
+    s = two((2.0, 1.0), (8.0, 9.0), (0.04, 0.06), 0.0, 0.0, 1e-6, 0.7)
+    model = folds.linear_model(s)
+    mass = np.asarray(model.mass)[[0, 1], [0, 1]]
+    decay, w2 = np.array([0.04, 0.06]) / (2.0 * mass), np.array([8.0, 9.0]) / mass
+    awaited = np.concatenate([sign * 1j * np.sqrt(w2 - decay**2) - decay for sign in (1.0, -1.0)])
+    poles = np.asarray(folds._poles(model.mass, model.damping(s.drive.speed), model.carrier.stiffness))
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(awaited), rtol=1e-12)
+    grid, resonances = folds.fold_points(model, 40)
+    np.testing.assert_allclose(resonances, np.sort(np.sqrt(w2)), rtol=1e-12)
+    grid = np.asarray(grid)
+    assert grid.shape == (160,) and np.all(np.diff(grid) >= 0.0)
+    np.testing.assert_allclose(grid[0], 1e-3 * resonances[0], rtol=1e-9)
+    assert grid[-1] > 5.0 * resonances[1]
+    for pole in awaited[:2]:
+        below, above = pole.imag - grid[grid < pole.imag - 1e-12], grid[grid > pole.imag + 1e-12] - pole.imag
+        for side in (below, above):
+            assert np.min(side) < 0.5 * -pole.real and np.sum(side < 10.0 * -pole.real) > 6
+
+
+def test_two_folds_in_one_interval_are_found():
+    """Slopes that touch 0 twice between two points, from above and from below; and one that stays away."""
+    grid = jnp.linspace(0.0, 10.0, 21)
+    for sign in (1.0, -1.0):
+        slope = lambda w, sign=sign: sign * ((w - 3.27) ** 2 - 0.01) * ((w - 7.1) ** 2 + 0.3)  # noqa: E731
+        wide, values = folds._with_close_folds(slope, grid, 4)
+        assert wide.shape == values.shape == (25,) and np.all(np.diff(wide) >= 0.0)
+        np.testing.assert_allclose(values, jax.vmap(slope)(wide), rtol=1e-12)
+        turned = np.sign(values) != sign
+        assert 0 < np.sum(turned) <= 4 and np.all(np.abs(np.asarray(wide)[turned] - 3.27) < 0.1)
+        dense = np.linspace(6.0, 8.0, 20001)
+        closest = dense[np.argmin(sign * slope(dense))]  # it stays away from 0 there
+        assert np.min(np.abs(np.asarray(wide) - closest)) < 1e-3

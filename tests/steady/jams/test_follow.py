@@ -8,7 +8,8 @@ from scenes import scene
 
 import jaxvib as jv
 from jaxvib.equations.linear import jammed_model
-from jaxvib.steady.jams.follow import follow_fold, follow_jam
+from jaxvib.steady.jams.follow import _newton, follow_fold, follow_jam
+from jaxvib.steady.jams.jam import jam_at
 
 SCENE = scene("two_mass", speed=120.0)
 
@@ -54,3 +55,22 @@ def test_followed_folds_are_those_of_the_whole_branch():
         step = 1e-6 * k[0]
         sides = [speed(k.at[0].add(sign * step), omega) for sign in (1.0, -1.0)]
         np.testing.assert_allclose(slope[0], (sides[0] - sides[1]) / (2.0 * step), rtol=1e-5)
+
+
+def test_steps_are_no_longer_than_a_tenth_and_stay_below_the_most():
+    far = _newton(lambda w: w - 1000.0, jnp.asarray(10.0), jnp.asarray(jnp.inf))
+    np.testing.assert_allclose(far, 10.0 * 1.1**6, rtol=1e-12)
+    np.testing.assert_allclose(_newton(lambda w: w - 1.0, jnp.asarray(10.0), jnp.asarray(jnp.inf)), 10.0 * 0.9**6, rtol=1e-12)
+    np.testing.assert_allclose(_newton(lambda w: w - 50.0, jnp.asarray(10.0), jnp.asarray(10.4)), 10.4 - 0.4 / 2**6, rtol=1e-12)
+    np.testing.assert_allclose(_newton(lambda w: w**2 - 110.0, jnp.asarray(10.0), jnp.asarray(20.0)), 110.0**0.5, rtol=1e-12)
+
+
+def test_an_undamped_resonance_has_no_amplitude_though_another_platform_rests():
+    """The exciter's platform at its resonance, without damping and apart from the other one, which does not move."""
+    machine = jv.two_mass(mass=(2.0, 1.0), stiffness=(8.0, 9.0), damping=(0.0, 0.0), link_stiffness=0.0, link_damping=0.0)
+    alone = jv.Scene(machine, jv.balls(count=1, mass=0.01, radius=0.1, drag=1e-3), jv.ConstantSpeed(20.0))
+    resonance = jnp.sqrt(9.0 / 1.01)
+    jam = jam_at(jammed_model(alone), jnp.asarray(4), resonance, jnp.asarray(20.0), jnp.asarray(False))
+    assert np.isnan(jam.displacement).all()
+    beside = jam_at(jammed_model(alone), jnp.asarray(4), 1.01 * resonance, jnp.asarray(20.0), jnp.asarray(False))
+    assert np.isfinite(beside.displacement).all()

@@ -1,0 +1,37 @@
+"""Parts of the characteristic speeds, by linear algebra of SciPy."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxvib.steady.balance.criterion import _joined
+from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root
+
+
+@pytest.mark.parametrize(
+    "port", [[3.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, -5.0], [0.3 - 2.0j, 1.0j, 4.0, -0.5], [1e-9, 7.0, 1.0, 0.0]]
+)
+def test_modes_are_those_of_the_matrix_and_of_what_the_port_leaves(port):
+    random = np.random.default_rng(0)
+    a = random.normal(size=(4, 4)) + (1j * random.normal(size=(4, 4)) if np.iscomplexobj(np.asarray(port)) else 0.0)
+    square, c = a @ a.conj().T, np.asarray(port)
+    values, vectors, held = _free_and_held_modes(jnp.asarray(square), jnp.asarray(c))
+    np.testing.assert_allclose(values, np.linalg.eigvalsh(square), rtol=1e-10)
+    np.testing.assert_allclose(square @ np.asarray(vectors), np.asarray(vectors) * np.asarray(values), atol=1e-9)
+    basis = scipy.linalg.null_space(c.conj()[None])
+    np.testing.assert_allclose(held, np.linalg.eigvalsh(basis.conj().T @ square @ basis), rtol=1e-9)
+
+
+def test_roots_of_nothing_are_nan():
+    np.testing.assert_allclose(_inverse_root(jnp.array([4.0, 0.0, -1.0])), [0.5, np.nan, np.nan])
+
+
+def test_intervals_that_touch_are_one_and_empty_ones_none():
+    rows = np.array(
+        [[0.0, 2.0], [2.0, 3.0], [5.0, 5.0], [100.0, 100.0 + 1e-7], [200.0, 300.0], [np.nan, np.nan], [400.0, np.inf]]
+    )
+    assert _joined(rows) == [[0.0, 3.0], [200.0, 300.0], [400.0, None]]
+    assert _joined(np.array([[100.0, 200.0], [200.0 + 1e-7, 300.0]])) == [[100.0, 300.0]]
+    assert _joined(np.array([[100.0, 200.0], [200.01, 300.0]])) == [[100.0, 200.0], [200.01, 300.0]]
+    assert _joined(np.array([[0.01, 0.02], [0.0200001, 0.03]])) == [[0.01, 0.02], [0.0200001, 0.03]]

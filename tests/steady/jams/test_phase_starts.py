@@ -1,0 +1,93 @@
+"""Where jams at unequal phases are looked for, and what Newton's method says of phases at a load speed."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.steady.jams.patterns import phase_pattern
+from jaxvib.steady.jams.phase_starts import _regular, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phases import influence_of, parts_of, torques_at
+
+MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
+RESONANCE = np.sqrt(1.16e6 / 37.1)
+
+
+def parts(count=2, drag=0.04):
+    return parts_of(
+        jv.Scene(MACHINE, jv.pendulums(count=count, mass=0.1 / count, radius=0.08, drag=drag), jv.ConstantSpeed(460.0))
+    )
+
+
+def needed(omega, drag=0.04):
+    """The multiple of the drag that loads need which are together, by hand: half of w^4 S^2 Im 1/D for both directions."""
+    dynamic = 1.16e6 - 37.1 * omega**2 + 843.0j * omega
+    torque = omega**4 * (0.1 * 0.08) * (0.05 * 0.08) * (-1.0 / dynamic).imag
+    return torque / (drag * 0.08**2 * (460.0 - omega))
+
+
+def test_load_speeds_crowd_about_the_resonance():
+    speeds = load_speeds(parts())
+    assert np.all(np.diff(speeds) > 0.0) and speeds[0] > 0.0 and 460.0 * (1.0 - 2e-6) < speeds[-1] < 460.0
+    damped = np.sqrt(RESONANCE**2 - (843.0 / 74.2) ** 2)
+    for side in (-1.0, 1.0):
+        away = np.sort(side * (speeds - damped))
+        away = away[away > 1e-9]
+        assert away[0] < 1.1e-4 * damped and np.sum(away < 0.01 * damped) > 12
+    assert np.max(np.diff(speeds[speeds < 0.98 * 460.0])) < 0.005 * 460.0
+
+
+def test_regular_phases_are_every_split_into_two():
+    splits = _regular(parts(count=3))
+    assert {tuple(np.round(row / np.pi).astype(int)) for row in splits} == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)}
+
+
+@pytest.mark.parametrize("omega", [150.0, 170.0, 200.0])
+def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
+    p, w = parts(), jnp.asarray(omega)
+    influence = influence_of(p, w)[0]
+    factor, phase, residual = phases_near(p, influence, w, jnp.array([0.3, 0.3001]))
+    np.testing.assert_allclose(factor, needed(omega), rtol=1e-9)
+    np.testing.assert_allclose(phase, [0.0, 0.0], atol=1e-9)
+    assert residual < 1e-14
+    # Without a step: how far the loads' multiples differ, beside what their torques could be at most.
+    start = jnp.array([0.0, 1.0])
+    factor, phase, residual = phases_near(p, influence, w, start, 0)
+    each = -np.asarray(torques_at(p, influence, w, start)) / (0.04 * 0.08**2 * (460.0 - omega))
+    most = omega**4 * np.sum(np.abs(influence)) * 0.004**2 / (0.04 * 0.08**2 * (460.0 - omega))
+    np.testing.assert_allclose(residual, abs(each[1] - each[0]) / most, rtol=1e-9)
+    np.testing.assert_allclose([factor, phase[1]], [each[0], 1.0], rtol=1e-9)
+
+
+def test_a_load_alone_needs_what_it_needs():
+    p = parts(count=1)
+    factor, phase, residual = phases_near(p, influence_of(p, jnp.asarray(170.0))[0], jnp.asarray(170.0), jnp.array([2.0]))
+    np.testing.assert_allclose(factor, 2.0 * needed(170.0), rtol=1e-9)
+    assert phase.tolist() == [0.0] and residual == 0.0
+
+
+def test_starts_lie_at_the_jams_that_are_known():
+    """Of loads together: where the drag needed is the scene's."""
+    omega, phase = starts_of(parts(), np.zeros((1, 2)))
+    assert omega.shape == (len(phase),) and np.all((omega > 0.0) & (omega < 460.0))
+    speeds = np.linspace(20.0, 455.0, 200001)
+    off = needed(speeds) - 1.0
+    jams = speeds[:-1][off[1:] * off[:-1] < 0.0]
+    assert len(jams) >= 1
+    together = np.abs(np.angle(np.exp(1j * (phase[:, 1] - phase[:, 0])))) < 1e-3
+    for jam in jams:
+        assert np.min(np.abs(omega[together] / jam - 1.0)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("phases", "pattern"),
+    [
+        ([0.0, 0.2, 0.1], jv.PhasePattern.together),
+        ([0.0, 0.1, 3.1, 3.2], jv.PhasePattern.opposite),
+        ([0.0, 2.0 * np.pi / 3.0, 4.0 * np.pi / 3.0], jv.PhasePattern.spread),
+        ([0.0, 1.0, 2.0], jv.PhasePattern.other),
+        ([0.0, np.pi, 0.0], jv.PhasePattern.other),
+    ],
+)
+def test_patterns_by_their_resultants(phases, pattern):
+    assert bool(phase_pattern(jnp.array(phases)) == pattern)

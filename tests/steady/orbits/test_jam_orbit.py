@@ -1,0 +1,63 @@
+"""Parts of the search for exact jams."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import published
+
+import jaxvib as jv
+from jaxvib.steady.orbits import diagram, jam_orbit
+from jaxvib.steady.orbits.jam_orbit import _between
+from jaxvib.steady.orbits.orbit import _swing
+
+
+def test_points_between_are_on_the_cubic_through_values_and_slopes():
+    x = np.array([0.0, 1.0, 3.0, 3.5])
+    cubic, slope = np.poly1d([1.0, -4.0, 2.0, 5.0]), np.polyder(np.poly1d([1.0, -4.0, 2.0, 5.0]))
+    between, values = _between(x, cubic(x), slope(x))
+    parts = jam_orbit._PARTS
+    assert between.size == values.size == 3 * parts + 1 and parts > 2
+    np.testing.assert_allclose(between[::parts], x)
+    np.testing.assert_allclose(np.diff(between[parts : 2 * parts]), 2.0 / parts)
+    np.testing.assert_allclose(values, cubic(between), rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("top", "target", "ends"), [(5.0, 5.001, True), (5.0, 4.999, False), (-5.0, -5.001, True), (-5.0, -4.999, False)]
+)
+def test_a_branch_may_turn_back_before_the_rotor_speed(monkeypatch, top, target, ends):
+    """n = top -/+ (w - 2)^2, whose fold is at 2; a target that the parabola passes is not before its end."""
+    sign = np.sign(top)
+    monkeypatch.setattr(jam_orbit, "branch_at", lambda scene, w: (top - sign * (w - 2.0) ** 2, -2.0 * sign * (w - 2.0)))
+    scene = published().scene()
+    assert jam_orbit._ends_before(scene, 1.7, 2.4, target) == ends
+    assert not jam_orbit._ends_before(scene, 2.1, 2.4, target)  # no fold in there
+
+
+def test_the_diagram_begins_at_a_fifth_of_the_lowest_resonance(monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def solver(scene, accuracy):
+        def solve(omega):
+            raise Asked(omega)
+
+        return solve
+
+    monkeypatch.setattr(diagram, "_Solver", solver)
+    scene = published(natural=(0.3, 0.4)).scene()
+    with pytest.raises(Asked) as caught:
+        jv.branches(scene, exact=True, points=50)
+    (omega,) = caught.value.args
+    lowest = float(jnp.min(jv.jam_modes(scene).resonances))
+    np.testing.assert_allclose([omega[0], omega[-1]], [0.2 * lowest, 4.0], rtol=1e-12)
+    assert omega.size == 50 and np.all(np.diff(omega) > 0.0)
+
+
+def test_swings_are_half_of_what_lies_between_the_extremes():
+    """Of signals that are not symmetric: 3 + cos t + cos 2 t lies between 3 - 9/8 and 5."""
+    orders = np.array([0, 1, 2])
+    np.testing.assert_allclose(
+        _swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]])), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
+    )
+    np.testing.assert_allclose(_swing(np.array([1, 3]), jnp.array([[1.0, 0.0], [0.0, 2.0j]])), [1.0, 2.0], rtol=1e-12)
