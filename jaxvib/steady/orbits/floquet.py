@@ -186,7 +186,8 @@ def _signals(orders: np.ndarray, harmonics: Array, theta: Array, number: int) ->
     """Re sum_k c_k exp(i k theta) and its first derivatives, so many in all, at the angles theta (n,); c (m, K, P) gives
     (number, m, n, P)."""
     factors = (1j * orders) ** np.arange(number)[:, None, None]
-    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * theta[None, :, None] * np.asarray(orders, theta.dtype)[None, None])
+    angles = theta[None, :, None] * np.asarray(orders, theta.dtype)[None, None]
+    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * angles)
     waves, parts = jnp.concatenate([wave.real, -wave.imag], -1), jnp.concatenate([harmonics.real, harmonics.imag], -2)
     return jnp.einsum("dnk,mkp->dmnp", waves, parts)
 

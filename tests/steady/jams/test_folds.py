@@ -9,6 +9,7 @@ from load_speeds import all_load_speeds
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.equations.linear import linear_model
 from jaxvib.steady.jams import folds
 from jaxvib.steady.jams.folds import jam_rotor_speed, piece_modes, without_ripples
 
@@ -177,7 +178,7 @@ def test_the_ripples_that_span_least_are_left_out():
 def test_folds_are_looked_for_on_both_sides_of_every_pole():
     """Poles of two platforms that know nothing of each other: w^2 = k/m, decay c/2m. Points crowd there by that width."""
     s = two((2.0, 1.0), (8.0, 9.0), (0.04, 0.06), 0.0, 0.0, 1e-6, 0.7)
-    model = folds.linear_model(s)
+    model = linear_model(s)
     mass = np.asarray(model.mass)[[0, 1], [0, 1]]
     decay, w2 = np.array([0.04, 0.06]) / (2.0 * mass), np.array([8.0, 9.0]) / mass
     awaited = np.concatenate([sign * 1j * np.sqrt(w2 - decay**2) - decay for sign in (1.0, -1.0)])
