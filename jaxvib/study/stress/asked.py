@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from jaxvib.motion.simulate import simulate
 from jaxvib.motion.steps import StepChoice
 from jaxvib.results.status import status_name, status_names
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.study.stress.case import Answer, Reference
+from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import Outcome, run_out
 from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
@@ -26,10 +27,10 @@ __all__ = [
     "compared_state",
     "end_of_run",
     "final_state",
+    "jam_case",
     "light_force_slope",
-    "mode_speeds",
-    "mode_speeds_again",
     "published",
+    "run_case",
     "state_of",
 ]
 
@@ -50,7 +51,7 @@ def published(
     return form.scene()
 
 
-def mode_speeds(scene: Scene) -> Answer:
+def _mode_speeds(scene: Scene) -> Answer:
     """Load speeds of the jam modes that exist, ascending, or the first status that is neither found nor absent."""
     modes = jam_modes(scene)
     names = status_names(modes.status)
@@ -58,10 +59,21 @@ def mode_speeds(scene: Scene) -> Answer:
     return Answer(np.sort(np.asarray(modes.omega)[names == "found"]), status=other[0] if other else "")
 
 
-def mode_speeds_again(scene: Scene) -> Reference:
+def _mode_speeds_again(scene: Scene) -> Reference:
     """The same as roots of n(Omega) = n, by dense complex algebra and Brent's method."""
     p = plain(scene)
     return Reference(light_modes(p, float(scene.drive.speed)))
+
+
+jam_case = partial(
+    Case,
+    quantity="load speeds of all jam modes",
+    against="roots of n(Omega) by Brent's method",
+    answer=_mode_speeds,
+    reference=_mode_speeds_again,
+    within=(1e-9, 1e-3),
+)
+run_case = partial(Case, quantity="state at the end of a run", against="SciPy's DOP853 on the plain equations")
 
 
 def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.ndarray:

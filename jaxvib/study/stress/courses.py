@@ -21,7 +21,7 @@ from jaxvib.motion.growth import growth
 from jaxvib.motion.simulate import simulate
 from jaxvib.results.status import status_name
 from jaxvib.study.accuracy.gradient_check import check_gradients
-from jaxvib.study.stress.asked import away, final_state, published, state_of
+from jaxvib.study.stress.asked import away, final_state, published, run_case, state_of
 from jaxvib.study.stress.bends import stop_law
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import orbit_rotor_speed, orbit_speed
@@ -233,31 +233,25 @@ CASES = (
         reference=lambda scene: Reference([_energy(plain(scene), _swinging(scene))]),
         within=(1e-7, 1e-2),
     ),
-    Case(
+    run_case(
         "run-up through the resonance, fast",
         hard="the drive's acceleration jumps at the end",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: _passing(RunUp(60.0, acceleration=100.0)),
         answer=_FAST[0],
         reference=_FAST[1],
         within=(1e-6, 1e-2),
     ),
-    Case(
+    run_case(
         "run-up through the resonance, slow",
         hard="the load is caught at the resonance, or not: a passage decides over what comes after",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: _passing(RunUp(60.0, acceleration=3.0)),
         answer=_SLOW[0],
         reference=_SLOW[1],
         within=(1e-5, 0.1),
     ),
-    Case(
+    run_case(
         "motor caught by the resonance",
         hard="the rotor itself gets stuck: its speed is an unknown that the vibration acts on",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: _passing(DCMotor(60.0, stall_torque=3.0, inertia=0.2)),
         answer=_STALLED[0],
         reference=_STALLED[1],

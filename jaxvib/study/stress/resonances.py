@@ -16,7 +16,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.stress.asked import away, final_state, light_force_slope, mode_speeds, mode_speeds_again, published
+from jaxvib.study.stress.asked import away, final_state, jam_case, light_force_slope, published, run_case
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import orbit_speed
 from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
@@ -108,15 +108,10 @@ _RUN, _RUN_AGAIN = final_state(40.0, lambda scene: away(scene, displacement=1.0)
 
 CASES = (
     *(
-        Case(
+        jam_case(
             f"light fold, 1e-8 {side}",
             hard="two modes merge: the load speed has an infinite slope, and 8 digits of the rotor's speed decide over both",
-            quantity="load speeds of all jam modes",
-            against="roots of n(Omega) by Brent's method",
             scene=lambda sign=sign: published(_LIGHT_FOLD * (1.0 + sign * 1e-8)),
-            answer=mode_speeds,
-            reference=mode_speeds_again,
-            within=(1e-9, 1e-3),
             named=((), ("at_fold",)),
         )
         for side, sign in (("below", -1.0), ("above", 1.0))
@@ -135,42 +130,26 @@ CASES = (
         )
         for side, sign in (("below", -1.0), ("above", 1.0))
     ),
-    Case(
+    jam_case(
         "no damping at all",
         hard="the vibration has no bound at a resonance, and no torque away from it",
-        quantity="load speeds of all jam modes",
-        against="roots of n(Omega) by Brent's method",
         scene=lambda: published(damping=(0.0, 0.0), link_damping=0.0),
-        answer=mode_speeds,
-        reference=mode_speeds_again,
-        within=(1e-9, 1e-3),
         named=(("unbounded",), ("unbounded",)),
     ),
-    Case(
+    jam_case(
         "damping 1e-8 of critical",
         hard="peaks 1e-8 wide and 1e8 high, which no even grid sees",
-        quantity="load speeds of all jam modes",
         against="roots of n(Omega) between points that crowd to 1e-15 of the resonances",
         scene=lambda: published(damping=(1e-8, 1e-8), link_damping=1e-8),
-        answer=mode_speeds,
-        reference=mode_speeds_again,
-        within=(1e-9, 1e-3),
     ),
-    Case(
+    jam_case(
         "overdamped, modes",
         hard="no resonance is left: folds vanish, and one mode remains",
-        quantity="load speeds of all jam modes",
-        against="roots of n(Omega) by Brent's method",
         scene=lambda: published(damping=(5.0, 5.0), link_damping=5.0),
-        answer=mode_speeds,
-        reference=mode_speeds_again,
-        within=(1e-9, 1e-3),
     ),
-    Case(
+    run_case(
         "overdamped, run",
         hard="decay rates 2e4 apart make the equations stiff",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: published(damping=(50.0, 50.0), link_damping=50.0, eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -186,15 +165,10 @@ CASES = (
         reference=_force_slopes_again,
         within=(1e-6, 2e-2),
     ),
-    Case(
+    jam_case(
         "link of stiffness 0",
         hard="a platform that nothing shakes: a resonance that no load feels",
-        quantity="load speeds of all jam modes",
-        against="roots of n(Omega) by Brent's method",
         scene=_bed_only,
-        answer=mode_speeds,
-        reference=mode_speeds_again,
-        within=(1e-9, 1e-3),
     ),
     Case(
         "link of 1e-9, gradient",
@@ -226,14 +200,9 @@ CASES = (
         reference=_frequencies_again,
         within=(1e-6, 1e-2),
     ),
-    Case(
+    jam_case(
         "three platforms alike, jams",
         hard="three resonances at one speed, of which the load feels one",
-        quantity="load speeds of all jam modes",
-        against="roots of n(Omega) by Brent's method",
         scene=lambda: _alike(0.0),
-        answer=mode_speeds,
-        reference=mode_speeds_again,
-        within=(1e-9, 1e-3),
     ),
 )

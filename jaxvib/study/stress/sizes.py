@@ -15,7 +15,7 @@ from jaxvib.machine.platforms import two_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.results.status import status_name
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.stress.asked import away, compared_state, final_state, mode_speeds, mode_speeds_again, published
+from jaxvib.study.stress.asked import away, compared_state, final_state, jam_case, published, run_case
 from jaxvib.study.stress.case import Answer, Case, Reference
 from jaxvib.study.stress.motions import run_out
 from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
@@ -120,11 +120,9 @@ def _no_drag(scene: Scene) -> Answer:
 
 
 CASES = (
-    Case(
+    run_case(
         "load 100 times its platform",
         hard="the mass matrix is nearly singular where the load moves along the platform's direction",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=_heavy,
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -141,11 +139,9 @@ CASES = (
         within=(1e-7, 1e-3),
         named=((), ("not_converged", "coarse")),
     ),
-    Case(
+    run_case(
         "one load",
         hard="nothing: what the other runs are beside",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: published(eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -161,11 +157,9 @@ CASES = (
         reference=_many_once,
         within=(1e-6, 1e-2),
     ),
-    Case(
+    run_case(
         "drag 0, run",
         hard="nothing turns the loads, energy is exchanged and never lost",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=_undragged,
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -193,11 +187,9 @@ CASES = (
         within=(1e-7, 1e-3),
         named=((), ("not_converged", "coarse", "absent")),
     ),
-    Case(
+    run_case(
         "drag 1e3 times as large, run",
         hard="loads follow the rotor within 1e-3 of its speed: the equations are stiff",
-        quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations",
         scene=lambda: published(eps=0.05, beta=1e3),
         answer=_RUN,
         reference=_RUN_AGAIN,
@@ -216,25 +208,18 @@ CASES = (
             ("quarry screen of 1e5 kg", "stiffnesses of 1e8 N/m beside masses of 1e5 kg", 1e5, 1.0, 2e-2),
         )
         for case in (
-            Case(
+            run_case(
                 f"{name}, run",
                 hard=hard,
-                quantity="state at the end of a run",
-                against="SciPy's DOP853 on the plain equations",
                 scene=lambda numbers=(mass, length, time): _sized(*numbers),
                 answer=_sized_run(time)[0],
                 reference=_sized_run(time)[1],
                 within=(1e-6, 1e-2),
             ),
-            Case(
+            jam_case(
                 f"{name}, modes",
                 hard=hard,
-                quantity="load speeds of all jam modes",
-                against="roots of n(Omega) by Brent's method",
                 scene=lambda numbers=(mass, length, time): _sized(*numbers),
-                answer=mode_speeds,
-                reference=mode_speeds_again,
-                within=(1e-9, 1e-3),
             ),
         )
     ),
