@@ -87,6 +87,11 @@ class Loads(eqx.Module):
     def rest(self) -> tuple[Array, ...]:
         """The coordinates u of loads at rest, all at one point, (count,) each."""
 
+    def arm(self) -> Array:
+        """How far from the rotor's axis each load is at rest, (count,) m."""
+        across, up, *_ = self.position(*self.rest())
+        return jnp.hypot(across, up)
+
     @abc.abstractmethod
     def inertia_factor(self) -> Array:
         """kappa: the load's inertia along its track is kappa times that of its mass alone."""

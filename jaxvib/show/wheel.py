@@ -61,8 +61,7 @@ def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 def track_radius(loads: Loads) -> float:
     """How far from the axis the loads are at rest, m."""
-    across, up, *_ = loads.position(*loads.rest())
-    return float(jnp.max(jnp.hypot(across, up)))
+    return float(jnp.max(loads.arm()))
 
 
 def at_rest(scene: Scene) -> Pose:

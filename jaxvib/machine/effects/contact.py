@@ -144,9 +144,7 @@ class LoadContact(Effect):
 
     def _reduced(self, loads: Loads) -> Array:
         """mu, of the lightest loads where they differ."""
-        across, up, *_ = loads.position(*loads.rest())
-        arm = jnp.hypot(across[0], up[0])
-        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own_radius(loads) / arm) ** 2)
+        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own_radius(loads) / loads.arm()[0]) ** 2)
 
 
 _NEAREST = 0.9

@@ -105,9 +105,8 @@ class Sliding(Effect):
 
     def own_rate(self, loads: Loads, speed: Array) -> Array:
         """kappa/(kappa - 1) mu R w^2 / width: at which a slip dies out."""
-        across, up, *_ = loads.position(*loads.rest())
         kappa = loads.inertia_factor()
-        return kappa / (kappa - 1.0) * self.coefficient * jnp.hypot(across[0], up[0]) * speed**2 / self.width
+        return kappa / (kappa - 1.0) * self.coefficient * loads.arm()[0] * speed**2 / self.width
 
     @property
     def slip_limit(self) -> SlipLimit:

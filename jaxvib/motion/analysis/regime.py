@@ -219,8 +219,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     none to the rotor's radius of gyration.
     """
     carrier, loads = scene.machine.carrier(), scene.loads
-    across, up, *_ = loads.position(*loads.rest())
-    each = jnp.broadcast_to(loads.mass * jnp.hypot(across, up), (loads.count,)) * jnp.exp(1j * phase)
+    each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
     thrown = [imbalance for imbalance in (effect.imbalance(origin) for effect in scene.effects) if imbalance is not None]
     own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))

@@ -70,8 +70,7 @@ def _row(name: str, value: float, limit: float, says: str) -> NumberRow:
 
 
 def _arm(scene: Scene) -> float:
-    across, up, *_ = scene.loads.position(*scene.loads.rest())
-    return float(np.mean(np.hypot(np.asarray(across), np.asarray(up))))
+    return float(np.mean(scene.loads.arm()))
 
 
 def _own_radius(scene: Scene) -> tuple[float, str] | None:
