@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import UNIT, Output, app, shared
-from jaxvib.cli.motion.document import chosen_steps, run_document
+from jaxvib.cli.document import chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 

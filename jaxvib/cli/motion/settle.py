@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
-from jaxvib.cli.motion.document import chosen_steps, measured_document, run_document
+from jaxvib.cli.document import chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
