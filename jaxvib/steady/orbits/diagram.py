@@ -20,6 +20,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.roots import next_share
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points
 from jaxvib.steady.jams.picture import branch_summary, picture
@@ -171,10 +172,7 @@ class _Solver:
         return found
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
-        padded = np.concatenate([omega, np.full(-omega.size % _LANES, omega[-1])]).reshape(-1, _LANES)
-        # All batches are sent off before the first one is waited for.
-        parts = [_values(self.scene, jnp.asarray(part), many, self.accuracy) for part in padded]
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: omega.size], *parts)
+        return in_chunks(_LANES, lambda w: _values(self.scene, w, many, self.accuracy), omega)
 
 
 def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -177,17 +177,16 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
         deviation2,
     ])[:, 0]  # fmt: skip
     trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)
-    roots = jnp.linalg.eigvals(rest).T
-    inner = jnp.linalg.eigvals(jnp.moveaxis(end[1], -1, 0)).T if len(end) > 1 else None
+    roots = _eigenvalues(rest).T
+    inner = _eigenvalues(jnp.moveaxis(end[1], -1, 0)).T if len(end) > 1 else None
     return Floquet(roots, inner, trivial)
 
 
 def _signals(orders: np.ndarray, harmonics: Array, theta: Array, number: int) -> Array:
     """Re sum_k c_k exp(i k theta) and its first derivatives, so many in all, at the angles theta (n,); c (m, K, P) gives
     (number, m, n, P)."""
-    factors = (1j * orders) ** np.arange(number)[:, None, None]
-    angles = theta[None, :, None] * np.asarray(orders, theta.dtype)[None, None]
-    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * angles)
+    factors, k = (1j * orders) ** np.arange(number)[:, None, None], np.asarray(orders, theta.dtype)[None, None]
+    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * k * theta[None, :, None])
     waves, parts = jnp.concatenate([wave.real, -wave.imag], -1), jnp.concatenate([harmonics.real, harmonics.imag], -2)
     return jnp.einsum("dnk,mkp->dmnp", waves, parts)
 
@@ -206,6 +205,12 @@ def _small_solve(weight: Array, right: Array) -> Array:
         return right / a[0]
     det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return jnp.stack([a[1, 1] * right[0] - a[0, 1] * right[1], a[0, 0] * right[1] - a[1, 0] * right[0]]) / det[None]
+
+
+def _eigenvalues(matrices: Array) -> Array:
+    """Of matrices (P, n, n), (P, n). One after the other: library calls for batches may wait for each other for ever where
+    several programs run side by side (jaxlib 0.10)."""
+    return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 
 def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:

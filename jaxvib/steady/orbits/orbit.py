@@ -15,6 +15,7 @@ from jaxvib.equations.linear import JammedModel
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
+from jaxvib.ode.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.folds import rotor_speed_at
@@ -294,17 +295,19 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     each = max(4, int(orders[-1]) // 4)
     width = 2.0 * np.pi / _PARTS
     samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
-    still = jax.lax.stop_gradient(harmonics)
+    still, k = jax.lax.stop_gradient(harmonics), np.asarray(orders, harmonics.real.dtype)[None]
+    slopes = jnp.concatenate([1j * k, -(k**2)]).astype(still.dtype) * still[None]
 
-    def at(c: Array | np.ndarray, theta: Array | np.ndarray) -> Array:
-        return (jnp.exp(1j * orders.reshape((1,) * np.ndim(theta) + (-1,)) * theta[..., None]) @ c).real
+    def at(c: Array, theta: Array) -> Array:
+        sine, cosine = sine_and_cosine(k * theta[:, None])
+        return cosine @ c.real.T - sine @ c.imag.T
 
     def newton(_: int, theta: Array) -> Array:
-        first, second = at(1j * orders * still, theta), at(-(orders**2) * still, theta)
+        first, second = at(slopes, theta).T
         step = first / jnp.where(second < 0.0, second, -jnp.inf)
         return jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
 
-    values = at(still, samples)
+    values = (np.exp(1j * orders * samples[..., None]).astype(still.dtype) @ still).real
     theta = jnp.take_along_axis(jnp.asarray(samples, values.dtype), jnp.argmax(values, axis=1)[:, None], axis=1)[:, 0]
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
     return at(harmonics, jax.lax.fori_loop(0, 4, newton, theta))
