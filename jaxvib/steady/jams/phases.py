@@ -17,7 +17,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude
+from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude, times
+from jaxvib.ode.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
@@ -151,8 +152,9 @@ def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
 
 def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
     """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
-    turn = jnp.exp(1j * phase)
-    return mean_torque(parts.unbalance, -(omega**4) * jnp.conj(turn) * (influence @ (parts.unbalance * turn)))
+    sine, cosine = sine_and_cosine(phase)
+    turn = jax.lax.complex(cosine, sine)
+    return mean_torque(parts.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, parts.unbalance * turn))
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
