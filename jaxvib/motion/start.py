@@ -16,6 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced
 
@@ -72,7 +73,7 @@ def initial_state(
     zero = jnp.zeros(mass.shape[:1], mass.dtype)
 
     half = number(apart, "rad", "apart", low=0.0)
-    spread = half * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1), zero.dtype)
+    spread = half * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
 
     def phases(value: float | Array) -> Array:
         if angles is not None:
@@ -100,12 +101,16 @@ def initial_state(
         if "simulate" not in advice:  # which is who asks
             raise
         raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
-    jam = modes.select(mode, throw=throw)
-    angle = phases(0.0)
+    row, angle = modes.row(mode, throw=throw), phases(0.0)
     require_start(scene, (angle,))
-    displacement = jam.displacement * jnp.exp(1j * jnp.mean(angle))
-    rate = (jnp.full((n,), jam.omega),)
-    return with_spin(scene, State(displacement.real, -jam.omega * displacement.imag, (angle,), rate))
+    return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
+
+
+@cached
+def _in_jam(omega: Array, displacement: Array, row: int, angle: Array) -> State:
+    """The motion of the jam in that row of all of them, the loads at these angles."""
+    turned = displacement[row] * jnp.exp(1j * jnp.mean(angle))
+    return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 
 
 def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:

@@ -112,14 +112,20 @@ class JamModes(AbstractJam):
         """The numbers of the modes that exist."""
         return [int(k) for k, there in zip(np.asarray(self.mode), np.asarray(self.exists), strict=True) if there]
 
-    def row(self, mode: int) -> int:
+    def row(self, mode: int, *, throw: bool = False) -> int:
         """Where the numbers of the jam mode of that number stand in the arrays, whether it exists or not.
 
-        **Raises** `InputError` for a number there can never be.
+        **Raises** `InputError` for a number there can never be; with `throw` also as `select`.
         """
         most = self.mode.shape[0]
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+        if throw and not traced(self.omega) and not np.asarray(self.exists)[int(mode) - 1]:
+            there = ", ".join(map(str, self.mode_numbers()))
+            raise ComputationError(
+                "absent",
+                f"jam mode {mode} does not exist at rotor speed {float(self.rotor_speed[0]):.6g} rad/s; there: {there}",
+            )
         return int(mode) - 1
 
     def select(self, mode: int, *, throw: bool = True) -> Jam:
@@ -128,15 +134,8 @@ class JamModes(AbstractJam):
         **Raises** `InputError` for a number there can never be, `ComputationError` (status "absent") where it does not exist
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
-        row = self.row(mode)
-        jam = _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), row)
-        if throw and not traced(self.omega) and not np.asarray(self.exists)[row]:
-            there = ", ".join(map(str, self.mode_numbers()))
-            raise ComputationError(
-                "absent",
-                f"jam mode {mode} does not exist at rotor speed {float(self.rotor_speed[0]):.6g} rad/s; there: {there}",
-            )
-        return jam
+        row = self.row(mode, throw=throw)
+        return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), row)
 
     def summary(self) -> str:
         """A table a person can read; amplitudes zero to peak."""
