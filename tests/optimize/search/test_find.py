@@ -110,14 +110,18 @@ def bent(x, y):
     return (x * y - 6.0) ** 2 + (x - 2.0 * y) ** 2 + 1.0
 
 
-def chosen(demands=(), catalogue=CATALOGUE, wish=bent):
+def chosen(demands=(), catalogue=CATALOGUE, wish=bent, tell=lambda *_: None):
     space = DesignSpace(SCENE, {}, choices={"machine.stiffness": catalogue})
     problem = problem_of(space, plain("bent", wish), demands, 4)
-    return problem, choose(problem, OPTIONS, lambda *_: None)
+    return problem, choose(problem, OPTIONS, tell)
 
 
 def test_choices_from_catalogues_are_the_best_of_all():
-    problem, found = chosen()
+    told = []
+    problem, found = chosen(tell=lambda what, share: told.append((what, share)))
+    choosing = [share for what, share in told if what.startswith("choosing")]
+    assert choosing == sorted(choosing) and 0.5 < choosing[0] <= choosing[-1] < 0.9
+    assert all(share <= 0.5 for what, share in told if not what.startswith("choosing"))
     tried = {pair: bent(*(np.array(pair) / 1e4)) for pair in itertools.product(CATALOGUE, CATALOGUE)}
     least = min(tried, key=tried.get)
     numbers = problem.space.within(*found.bounds).numbers(found.point.z[found.best])

@@ -1,0 +1,82 @@
+"""What a person reads of a search, from results with known numbers."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from optimize import DesignSpace, Quantity, pareto, synthesize, total
+from optimize.pareto import Front
+from optimize.result import Influence, Limit, Machine, Outcome, Row, wanted
+
+SCENE = scene("two_mass")
+
+
+@pytest.fixture(scope="module")
+def searched():
+    wish = Quantity("off_by", "N", lambda s: (s.machine.stiffness[0] / 1e4 - 3.0) ** 2 + 1.0)
+    return synthesize(DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4)}), wish, starts=2, iterations=25, verify=False)
+
+
+def limit(what, value, at, *, broken=0.0, active=True, gain=0.0):
+    return Limit(what, "m", value, at, broken, active, 0.0, gain)
+
+
+def test_limits_influences_and_machines_are_said_in_a_designers_units(searched):
+    limits = (
+        limit("first at most 2 mm", 2e-3, 2e-3, gain=-0.5),
+        limit("second at most 3 mm", 3.3e-3, 3e-3, broken=0.1),
+        limit("third at most 4 mm", 1e-3, 4e-3, active=False),
+    )
+    influences = (*(Influence(f"number {k}", float(k), -float(k) / 2.0) for k in range(7)), Influence("last", -1.5, 9.0))
+    machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
+    said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).said()
+    assert said[0] == "  at its limit: first at most 2 mm (2 mm); moved by 1 %: -0.5 % of the objective"
+    assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
+    assert said[2] == "  met: third at most 4 mm (1 mm)"
+    assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
+    assert [line.split(":")[0][-8:] for line in said[4:8]] == [f"number {k}" for k in (6, 5, 4, 3)]
+    assert said[8] == "  2 different machines: 3 x 2e+04, 1 x 3e+04 N"
+    one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).said()
+    assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
+    none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).said()
+    assert none == ["  1 % less / more x: +2e+03 % / -1 % of the objective"]
+
+
+def test_rows_are_in_units_of_the_largest_value(searched):
+    table = (
+        Row("a", "N/m", 500.0, 2e3, math.nan, math.nan),
+        Row("b", "", -3.0, 1.0, 2.0, math.nan),
+        Row("c", "s", *[math.nan] * 4),
+    )
+    rows = dataclasses.replace(searched, table=table).rows()
+    assert rows == [["a, N/mm", "0.5", "2", "", ""], ["b", "-3", "1", "2", ""], ["c, s", "", "", "", ""]]
+    summary = dataclasses.replace(searched, table=table, unverified="not asked for").summary().splitlines()
+    assert (
+        summary[0].startswith("least off by: the search ended where") and "2 starts (2 drawn), 2 converged, 2 to" in summary[1]
+    )
+    assert "  not verified: not asked for" in summary
+    columns = [line.index(word) + len(word) for line, word in zip(summary[2:5], ("before", "0.5", "-3"), strict=True)]
+    assert len(set(columns)) == 1
+    assert wanted("negative foundation_force") == "greatest foundation force"
+
+
+def test_outcomes_are_plain_for_json():
+    found = Outcome({"machine.mass": [1.0, 2.0]}, False, math.nan, (0.5, math.inf), 3.0, math.nan).as_dict()
+    assert found["machine.mass"] == [1.0, 2.0] and found["amplitude"] == [0.5, None] and found["foundation_force"] == 3.0
+    assert found["omega"] is None and found["force_per_amplitude"] is None and len(found) == 5
+
+
+def test_fronts_are_shown_in_units_of_their_largest_values():
+    values = np.array([[0.5e-3, 2e4], [0.25, 1e4]])
+    front = Front(values=values, names=("one", "two"), units=("m", "N/m"), machines=("", ""))
+    assert front.summary().splitlines() == ["one, mm against two, N/mm", "  0.5  20", "  250  10"]
+    empty = Front(values=np.zeros((0, 2)), names=("one", "two"), units=("m", "N/m"), machines=())
+    assert empty.summary() == "one, m against two, N/m"
+    with pytest.raises(jv.InputError, match="points is 1"):
+        pareto(
+            DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}), total("machine.stiffness"), total("machine.mass"), points=1
+        )

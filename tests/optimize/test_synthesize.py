@@ -1,0 +1,106 @@
+"""What a search puts together: the table, the tiers that check it, which of several searches is the best."""
+
+import math
+
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, total, total_mass
+from optimize.search.find import Found
+from optimize.search.polish import Optimality
+from optimize.search.problem import Point
+from optimize.synthesize import _named, _options, _other_tiers, _rank, _run, _standard, _table, _with_loads, synthesize
+
+SCENE = scene("two_mass")
+SPACE = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4), "loads.drag": (1.0, 2.0)}, [hold(total("machine.stiffness"), 8e4)])
+
+
+def test_the_table_has_each_quantity_once():
+    standard = [
+        "jam frequency",
+        "amplitude of platform 1 (y1)",
+        "amplitude of platform 2 (y2)",
+        "foundation force",
+        "force per amplitude",
+    ]
+    assert [name for name, _ in _standard(SCENE, 3, None)] == standard and _standard(SCENE, None, None) == []
+    force, mass = foundation_force(mode=3), total_mass()
+    named = _named(SPACE, SCENE, force, [mass < 300.0, force < 9.0, amplitude(mode=3, of=1) < 1.0], 3)
+    assert [name for name, _ in named] == [*standard, "sum of all support stiffnesses", "mass of platforms and loads"]
+    largest = _named(SPACE, SCENE, -mass, [], None)  # what is to be large is told as it is
+    assert [q for _, q in largest] == [mass, total("machine.stiffness")]
+    values = np.array([[1.0, 2.0], [3.0, 4.0]])
+    rows = _table(SPACE, SCENE, largest, values, ([5.0, 6.0], [7.0, 8.0]))
+    assert [row.what for row in rows[:3]] == ["stiffness of support 1", "stiffness of support 2", "drag of each ball"]
+    assert rows[0][2:4] == (5e4, 5e4) and all(math.isnan(x) for x in rows[0][4:])
+    assert rows[3] == ("mass of platforms and loads", "kg", 1.0, 3.0, 5.0, 7.0) and rows[4][2:] == (2.0, 4.0, 6.0, 8.0)
+
+
+def test_other_tiers_are_told_where_there_are_such():
+    quantities = [total_mass(), jam_frequency(mode=3), expected(jam_frequency(mode=3), {"loads.drag": 0.05}, samples=2)]
+    exact, time = _other_tiers(SCENE, quantities, True, None, 3)
+    np.testing.assert_allclose(exact[1], float(jv.jam_orbit(SCENE, mode=3).omega), rtol=1e-9)
+    assert math.isnan(exact[0]) and all(map(math.isnan, time)) and math.isfinite(exact[2])
+    assert all(map(math.isnan, _other_tiers(SCENE, quantities, False, None, 3)[0]))
+
+    class Ran:
+        omega, amplitude, foundation_force = 60.0, np.array([3.0, 4.0]), 5.0
+
+    of_run = [*quantities, foundation_force(mode=3), amplitude(mode=3, of=2), jam_frequency(mode=3) / total_mass()]
+    _, time = _other_tiers(SCENE, of_run, False, Ran(), 3)
+    assert time[1] == 60.0 and time[3:5] == [5.0, 4.0]
+    assert math.isnan(time[0]) and math.isnan(time[2])  # one run says nothing of other machines
+    assert math.isnan(_other_tiers(SCENE, of_run, False, Ran(), None)[1][1])
+
+
+def test_designs_that_keep_demands_rank_first():
+    def found(value, violation):
+        point = Point(np.zeros((1, 2)), np.array([[value]]), np.zeros((1, 1, 2)), (), (), np.zeros((1, 0)), np.zeros((1, 0, 2)))
+        none = Optimality(np.zeros((1, 0)), np.zeros((1, 0)), np.zeros((1, 2)), np.zeros(1))
+        return Found(point, np.zeros((1, 1)), np.zeros(1), np.array([violation]), none, 1, 1, False, (np.zeros(2), np.ones(2)))
+
+    assert _rank(found(5.0, 0.0)) == (False, 5.0) and _rank(found(5.0, 0.3)) == (True, 0.3)
+    assert _rank(found(5.0, 0.0)) < _rank(found(6.0, 9e-8)) < _rank(found(1.0, 0.2)) < _rank(found(0.5, 0.3))
+
+
+def test_numbers_of_loads_that_share_every_number():
+    more = _with_loads(SPACE, 5)
+    assert more.scene.loads.count == 5 and more.size == SPACE.size and SPACE.scene.loads.count == 3
+    own = DesignSpace(scene("two_mass", "pendulums"), {"machine.stiffness": (1e4, 9e4)})
+    with pytest.raises(jv.InputError, match="give one mass, radius and drag for all"):
+        _with_loads(own, 5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (dict(iterations=0), "iterations is 0"),
+        (dict(polishing=-1), "polishing is -1"),
+        (dict(seed=-1), "seed is -1"),
+        (dict(rate=0.0), "rate is 0.0"),
+        (dict(rate=1.0), "rate is 1.0"),
+        (dict(searcher=None), "searcher is None"),
+    ],
+)
+def test_wrong_options_are_said_in_one_sentence(wrong, says):
+    right = dict(starts=1, seed=0, iterations=1, polishing=0, rate=0.5, searcher="gradients")
+    assert _options(**right).rate == 0.5
+    with pytest.raises(jv.InputError, match=says):
+        _options(**{**right, **wrong})
+
+
+def test_wrong_questions_are_said_in_one_sentence():
+    wish = Quantity("k", "N/m", lambda s: s.machine.stiffness[0])
+    running = DesignSpace(jv.Scene(SCENE.machine, SCENE.loads, jv.RunUp(120.0, acceleration=5.0)), {"loads.drag": (1.0, 2.0)})
+    for space, subject_to, begin, says in (
+        (3.0, [], None, "must be a DesignSpace"),
+        (SPACE, [3.0], None, "write demands such as"),
+        (SPACE, [], 3.0, "must be the Synthesis of an earlier search"),
+        (running, [], None, "give a ConstantSpeed"),
+    ):
+        with pytest.raises(jv.InputError, match=says):
+            synthesize(space, wish, subject_to=subject_to, begin=begin)
+    assert _run(SCENE, None, True)[1].startswith("the objective and the demands belong to no jam mode")
+    assert _run(SCENE, 3, False) == (None, "not asked for")
