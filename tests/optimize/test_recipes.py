@@ -1,5 +1,7 @@
 """Recipes and trade-offs."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto
+from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto, recipes
 from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune, widest_range
 from optimize.space.numbers import changed, places_of
 
@@ -37,6 +39,20 @@ def test_one_spring_is_chosen_to_be_exchanged():
     found = retune(SCENE, wish, starts=4)
     assert found[0][0] == "machine.link_stiffness[0]" and len(found) == 3
     np.testing.assert_allclose(found[0][1].scene.machine.link_stiffness, [3e5], rtol=1e-4)
+
+
+def test_springs_are_ranked_by_the_best_that_each_search_found(monkeypatch):
+    """Not by where its other starts ended."""
+    ends = {"machine.stiffness[0]": [3.0, 9.0], "machine.stiffness[1]": [4.0, 4.0], "machine.link_stiffness[0]": [1.0, 99.0]}
+
+    def search(space, objective, *, starts, verify):
+        (place,) = space.places
+        assert starts == 16 and not verify and float(space.high[0] / space.low[0]) == pytest.approx(9.0)
+        return SimpleNamespace(values=np.array(ends[place.name]))
+
+    monkeypatch.setattr(recipes, "synthesize", search)
+    found = [name for name, _ in retune(SCENE, None)]
+    assert found == ["machine.link_stiffness[0]", "machine.stiffness[0]", "machine.stiffness[1]"]
 
 
 def test_recipes_are_designs():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from two_springs import FREE, SCENE, plain
 
-from optimize import DesignSpace, hold
+from optimize import DesignSpace, Quantity, hold
 from optimize.search.descent import STRETCH, descend
 from optimize.search.problem import evaluate, problem_of
 
@@ -123,3 +123,19 @@ def test_the_first_step_goes_along_what_is_held():
     drawn = plain("drawn", lambda x, y: x + 3.0 * y)  # to be large: along the line x would fall below its bound
     low = problem_of(DesignSpace(SCENE, FREE, [hold(total, 7.0)]), -drawn, [], 2)
     np.testing.assert_allclose(run(low, np.array([[0.0, 0.625]]), 1).point.z, [[0.0, 0.625]], atol=1e-12)
+
+
+def test_two_things_that_are_held_are_kept_together():
+    """x + y = 7 and the link at 1e5 x: one number is left, and the least of the bowl on the line is found."""
+    total, link = (
+        plain("sum", lambda x, y: x + y),
+        Quantity("link", "", lambda s: s.machine.link_stiffness[0] / s.machine.stiffness[0]),
+    )
+    space = DesignSpace(SCENE, {**FREE, "machine.link_stiffness": (5e4, 9.5e5, "even")}, [hold(total, 7.0), hold(link, 10.0)])
+    problem = problem_of(space, plain("bowl", lambda x, y: bowl(x, y, jnp.log)), [], 2)
+    found = run(problem, np.array([[0.3, 0.4, 0.3]]), STRETCH * 6)
+    at = np.linspace(1.0, 6.0, 100001)
+    least = at[np.argmin(bowl(at, 7.0 - at))]
+    numbers = np.asarray(space.numbers(found.point.z[0])) / 1e4
+    np.testing.assert_allclose(numbers, [least, 7.0 - least, 10.0 * least], rtol=0.01)
+    assert np.all(np.abs(found.point.values[:, 1:]) < 1e-6)

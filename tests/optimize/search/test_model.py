@@ -175,7 +175,7 @@ def test_the_step_is_the_models_least_value_within_bounds_and_reach():
 def test_a_step_to_where_two_pieces_meet(size):
     """max(2 p, 0.3 - p) + size p^2/2 of one number: they meet at p = 0.1, where 2 s - (1 - s) + size p = 0 shares them. A third
     piece stays below. Demands keep their own multipliers."""
-    pieces, tilts = np.array([[0.0, -9.0, 0.3]]), np.array([[[2.0], [0.0], [-1.0]]])
+    pieces, tilts = np.array([[0.0, -0.3, 0.3]]), np.array([[[2.0], [-2.0], [-1.0]]])
     rows = np.array([[[-1.0], [1.0]]])
     point = point_of(np.array([[0.5]]), np.array([[0.3, -0.4]]), rows, pieces, tilts)
     step = modelled(shape(0, 1, 3), point, np.ones((1, 1, 1)), np.array([size]), np.array([50.0 + 5.0 / size]), np.array([0.3]))
