@@ -28,3 +28,13 @@ def test_the_step_is_diffraxs(method):
     assert int(ours.stats["num_steps"]) == int(theirs.stats["num_steps"])
     for a, b in zip(jax.tree.leaves(ours.ys), jax.tree.leaves(theirs.ys), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", [UnrolledDopri8(), LoopDopri8()])
+def test_a_state_may_hold_numbers_and_arrays(method):
+    """y' = -y of a number, an array and a number: exp(-1) of each."""
+    start = jnp.asarray(2.0), jnp.array([1.0, -3.0]), jnp.asarray(0.5)
+    term = diffrax.ODETerm(lambda t, y, args: jax.tree.map(jnp.negative, y))
+    end = diffrax.diffeqsolve(term, method, 0.0, 1.0, 0.1, start, saveat=diffrax.SaveAt(t1=True))
+    for found, first in zip(end.ys, start, strict=True):
+        np.testing.assert_allclose(found[0], np.exp(-1.0) * first, rtol=1e-12)
