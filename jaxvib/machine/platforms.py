@@ -52,7 +52,7 @@ class Platforms(Machine):
             ends[row, i - 1], ends[row, j - 1] = 1.0, -1.0
 
         def assembled(support: Array, link: Array) -> Array:
-            return (ends.T * jnp.concatenate([support, link])[None]) @ ends
+            return (jnp.concatenate([support, link])[None] * ends.T) @ ends
 
         port = np.zeros((1, n))
         port[0, self.exciter - 1] = 1.0
