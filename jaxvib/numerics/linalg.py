@@ -21,6 +21,7 @@ __all__ = [
     "root_or_zero",
     "small_inverse",
     "small_solve",
+    "solve_in_turn",
     "times",
     "written_inverse",
 ]
@@ -171,7 +172,7 @@ def magnitude(value: Array) -> Array:
 
 def small_solve(a: Array, b: Array) -> Array:
     """x of a x = b; written out for 1, 2 and 3 equations (many times faster than a library call under `vmap`), by `eliminate`
-    up to 8, by the library beyond: for a batch one system after the other, see `_in_turn`."""
+    up to 8, by the library beyond: for a batch one system after the other, see `solve_in_turn`."""
     n = b.shape[0]
     if n == 1:
         return b / a[0, 0]
@@ -182,7 +183,7 @@ def small_solve(a: Array, b: Array) -> Array:
     both = jnp.result_type(a, b)
     a, b = a.astype(both), b.astype(both)
     return jax.lax.custom_linear_solve(
-        lambda x: a @ x, b, lambda _, right: _in_turn(a, right), lambda _, right: _in_turn(a.T, right)
+        lambda x: a @ x, b, lambda _, right: solve_in_turn(a, right), lambda _, right: solve_in_turn(a.T, right)
     )
 
 
@@ -217,8 +218,8 @@ def _times(a: Array, b: Array) -> Array:
 
 
 @custom_vmap
-def _in_turn(a: Array, b: Array) -> Array:
-    """x of a x = b by the library. On a processor it is called for one system of a batch after the other.
+def solve_in_turn(a: Array, b: Array) -> Array:
+    """x of a x = b by the library; values alone. On a processor it is called for one system of a batch after the other.
 
     A call for a batch may wait for itself for ever there: it hands its systems to the threads that run such calls, and when all
     of them wait so, none is left to work (jaxlib before 0.11.2). From about 20 equations on, one after the other is faster too.
@@ -226,15 +227,15 @@ def _in_turn(a: Array, b: Array) -> Array:
     return jnp.linalg.solve(a, b)
 
 
-@_in_turn.def_vmap
-def _solve_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tuple[Array, bool]:
+@solve_in_turn.def_vmap
+def _solved_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tuple[Array, bool]:
     if not is_mapped[0]:  # one system, many right-hand sides
         columns = jnp.moveaxis(b, 0, -1)
-        x = _in_turn(a, columns.reshape(a.shape[0], -1))
+        x = solve_in_turn(a, columns.reshape(a.shape[0], -1))
         return jnp.moveaxis(x.reshape(columns.shape), -1, 0), True
 
     def each(a: Array, b: Array) -> Array:
-        return jax.lax.map(lambda one: _in_turn(*one), (a, b))
+        return jax.lax.map(lambda one: solve_in_turn(*one), (a, b))
 
     right = b if is_mapped[1] else jnp.broadcast_to(b, (size, *b.shape))
     return jax.lax.platform_dependent(a, right, cpu=each, default=jax.vmap(jnp.linalg.solve)), True

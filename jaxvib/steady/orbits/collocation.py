@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.numerics.fourier import Grid, grid_of
-from jaxvib.numerics.linalg import small_solve
+from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
 __all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branch_tangent", "harmonics_of", "periodic_motion"]
 
@@ -176,7 +176,7 @@ def _newton(
         # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
         # first step gains, from psi = 0, says nothing of that yet.
         sure = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
-        change = -small_solve(matrix, residual)
+        change = -solve_in_turn(matrix, residual)
         settled = (norm < tiny * scale) | sure
         then = _State(now.steps + 1, *there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), settled, no)
         lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
@@ -202,7 +202,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
         return jnp.append(residual, 0.0)
 
     change = eqx.filter_jvp(equations, (model, value), tangents[:2])[1]
-    change = -small_solve(_linearised(model, on, given, value, deviation, x, None)[1], change)
+    change = -jnp.linalg.solve(_linearised(model, on, given, value, deviation, x, None)[1], change)
     return (deviation, x), (change[:-1].reshape(deviation.shape), change[-1])
 
 
@@ -262,7 +262,7 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     seen = (low @ np.exp(1j * grid.deviation_orders[:, None] * grid.theta)).real.ravel()
     # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
     slope = small_solve(matrix, -jnp.append(by_omega, 0.0))[-1]
-    error = small_solve(matrix, jnp.append(jax.lax.stop_gradient(seen), 0.0))
+    error = solve_in_turn(*jax.lax.stop_gradient((matrix, jnp.append(seen, 0.0))))
     last = jnp.max(deviation_k[:, -1].real ** 2 + deviation_k[:, -1].imag ** 2)
     return BranchTangent(
         slope,

@@ -297,20 +297,22 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
     still, k = jax.lax.stop_gradient(harmonics), np.asarray(orders, harmonics.real.dtype)[None]
     slopes = jnp.concatenate([1j * k, -(k**2)]).astype(still.dtype) * still[None]
+    waves = np.exp(1j * orders * samples[..., None]).astype(still.dtype)
 
-    def at(c: Array, theta: Array) -> Array:
-        sine, cosine = sine_and_cosine(k * theta[:, None])
-        return cosine @ c.real.T - sine @ c.imag.T
+    def at(c: Array, wave: Array) -> Array:
+        return wave.real @ c.real.T - wave.imag @ c.imag.T
 
-    def newton(_: int, theta: Array) -> Array:
-        first, second = at(slopes, theta).T
+    def newton(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        theta, wave = carry
+        first, second = at(slopes, wave).T
         step = first / jnp.where(second < 0.0, second, -jnp.inf)
-        return jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
+        theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
+        return theta, jax.lax.complex(*sine_and_cosine(k * theta[:, None])[::-1])
 
-    values = (np.exp(1j * orders * samples[..., None]).astype(still.dtype) @ still).real
-    theta = jnp.take_along_axis(jnp.asarray(samples, values.dtype), jnp.argmax(values, axis=1)[:, None], axis=1)[:, 0]
+    best = jnp.arange(_PARTS), jnp.argmax((waves @ still).real, axis=1)
+    begin = jnp.asarray(samples, k.dtype)[best], jnp.asarray(waves)[best]
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-    return at(harmonics, jax.lax.fori_loop(0, 4, newton, theta))
+    return at(harmonics, jax.lax.fori_loop(0, 4, newton, begin)[1])
 
 
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
