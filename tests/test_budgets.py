@@ -43,14 +43,14 @@ def forward_run(k):
 
 
 BUDGETS = {
-    "vector field": (field, 200),
-    "jam_modes": (modes, 2030),
-    "jam_modes, gradient": (jax.grad(modes), 2750),
-    "jam_orbit": (orbit, 4670),
-    "jam_orbit, gradient": (jax.grad(orbit), 5090),
-    "simulate": (run, 4630),
-    "simulate, forward derivatives": (jax.jacfwd(forward_run), 9160),
-    "simulate, reverse derivatives": (jax.grad(run), 8680),
+    "vector field": (field, 140),
+    "jam_modes": (modes, 1520),
+    "jam_modes, gradient": (jax.grad(modes), 2160),
+    "jam_orbit": (orbit, 3500),
+    "jam_orbit, gradient": (jax.grad(orbit), 3960),
+    "simulate": (run, 3410),
+    "simulate, forward derivatives": (jax.jacfwd(forward_run), 6570),
+    "simulate, reverse derivatives": (jax.grad(run), 6880),
 }
 
 
