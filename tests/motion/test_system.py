@@ -64,11 +64,14 @@ def test_a_state_comes_back_as_it_was(name, solver):
         jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), back, state)
 
 
-def test_wrapping_counts_every_turn():
-    s = scene("one_mass", "balls")
+@pytest.mark.parametrize("machine", ["one_mass", "two_mass"])
+def test_wrapping_counts_every_turn(machine):
+    """Of numbers that are held one by one, and of a vector of them."""
+    s = scene(machine, "balls")
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
     for together in (False, True):
         motion = PackedSystem(jv.vector_field(s), state, wrapped=True, together=together)
+        assert motion.apart == (machine == "one_mass")
         method = motion.method()
         assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
         held = method.wrap(motion.pack(state))

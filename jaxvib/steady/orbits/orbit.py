@@ -297,7 +297,7 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
     still, k = jax.lax.stop_gradient(harmonics), np.asarray(orders, harmonics.real.dtype)[None]
     slopes = jnp.concatenate([1j * k, -(k**2)]).astype(still.dtype) * still[None]
-    waves = np.exp(1j * orders * samples[..., None]).astype(still.dtype)
+    waves = jnp.asarray(np.exp(1j * orders * samples[..., None]), still.dtype)
 
     def at(c: Array, wave: Array) -> Array:
         return wave.real @ c.real.T - wave.imag @ c.imag.T
@@ -310,7 +310,7 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
         return theta, jax.lax.complex(*sine_and_cosine(k * theta[:, None])[::-1])
 
     best = jnp.arange(_PARTS), jnp.argmax((waves @ still).real, axis=1)
-    begin = jnp.asarray(samples, k.dtype)[best], jnp.asarray(waves)[best]
+    begin = jnp.asarray(samples, k.dtype)[best], waves[best]
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
     return at(harmonics, jax.lax.fori_loop(0, 4, newton, begin)[1])
 
