@@ -50,6 +50,7 @@ __all__ = [
     "jaxpr_as_fun",
     "no_host_checks",
     "primitive",
+    "pulled_back",
     "rewritten",
     "short_end",
     "traced",
@@ -200,6 +201,15 @@ def is_zero(tangent: object) -> bool:
 def zero_of(x: Array) -> object:
     """No tangent of `x`, as rules of a `primitive` return it."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def pulled_back(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
+    """What a function that `jax.vjp` returned gives, of cotangents that may be `zero_of`; with JAX 0.10.0, whose functions know
+    no such zeros, of numbers 0 in their place."""
+    try:
+        return list(pullback(cotangents))
+    except ValueError:
+        return list(pullback([ad.instantiate_zeros(x) for x in cotangents]))
 
 
 def backend_started() -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import HAS_RULES, beneath, is_zero, primitive, traced, zero_of
+from jaxvib.runtime.compat import HAS_RULES, beneath, is_zero, primitive, pulled_back, traced, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe
@@ -146,7 +146,8 @@ def _pulled(
     """Cotangents of the `active` arrays from those of the result's numbers, as far as these are `asked`."""
     pullback, zeros = _traced_pullback(question, active, types)
     given = iter(slopes)
-    return list(pullback.filled(notes)([next(given) if wanted else zero for wanted, zero in zip(asked, zeros, strict=True)]))
+    cotangents = [next(given) if wanted else zero for wanted, zero in zip(asked, zeros, strict=True)]
+    return pulled_back(pullback.filled(notes), cotangents)
 
 
 def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
