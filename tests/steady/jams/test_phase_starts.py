@@ -1,5 +1,6 @@
 """Where jams at unequal phases are looked for, and what Newton's method says of phases at a load speed."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,12 +69,16 @@ def test_a_load_alone_needs_what_it_needs():
 
 def test_starts_lie_at_the_jams_that_are_known():
     """Of loads together: where the drag needed is the scene's."""
-    omega, phase = starts_of(parts(), np.zeros((1, 2)))
+    p = parts()
+    omega, phase = starts_of(p, np.zeros((1, 2)))
     assert omega.shape == (len(phase),) and np.all((omega > 0.0) & (omega < 460.0))
     speeds = np.linspace(20.0, 455.0, 200001)
     off = needed(speeds) - 1.0
     jams = speeds[:-1][off[1:] * off[:-1] < 0.0]
     assert len(jams) >= 1
+    # Either their own multiple is near 1, or they are next to a jam.
+    multiples = jax.vmap(lambda w, a: phases_near(p, influence_of(p, w)[0], w, a, 0)[0])(jnp.asarray(omega), jnp.asarray(phase))
+    assert np.all((multiples > 1.0 / 3.001) & (multiples < 3.001))
     together = np.abs(np.angle(np.exp(1j * (phase[:, 1] - phase[:, 0])))) < 1e-3
     for jam in jams:
         assert np.min(np.abs(omega[together] / jam - 1.0)) < 1e-3
