@@ -14,14 +14,18 @@ SCENE = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.0
 
 
 def test_a_branch_is_made_of_the_jams_that_each_drag_has():
-    """Speeds and growth are those of the scene with so many times the drag, whose jam is solved for by itself."""
-    jam = phase_jam(SCENE, 165.0, jnp.zeros(2))
-    speeds = np.array([150.0, 160.0, float(jam.omega), 172.0])
-    branch = phase_branch(SCENE, jam, jnp.asarray(speeds))
-    np.testing.assert_allclose(branch.drag_factor[2], 1.0, rtol=1e-9)
-    np.testing.assert_allclose(branch.growth[2], jam.growth, rtol=1e-6)
+    """Of loads whose drags differ, at unequal phases: speeds and growth are those of the scene with so many times the drag,
+    whose jam is solved for by itself."""
+    scene = eqx.tree_at(lambda s: s.loads.drag, SCENE, jnp.array([0.04, 0.05]))
+    jam = phase_jam(scene, 182.0, jnp.zeros(2))
+    speeds = np.sort([178.0, 180.0, float(jam.omega), 190.0])
+    at = int(np.searchsorted(speeds, float(jam.omega)))
+    branch = phase_branch(scene, jam, jnp.asarray(speeds))
+    np.testing.assert_allclose(branch.drag_factor[at], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(branch.growth[at], jam.growth, rtol=1e-6)
+    assert abs(float(jam.phase[1])) > 0.1 and float(jam.growth) > 1.0
     for k, omega in enumerate(speeds):
-        braked = eqx.tree_at(lambda s: s.loads.drag, SCENE, 0.04 * branch.drag_factor[k])
+        braked = eqx.tree_at(lambda s: s.loads.drag, scene, scene.loads.drag * branch.drag_factor[k])
         alone = phase_jam(braked, omega, branch.phase[k])
         np.testing.assert_allclose(alone.omega, omega, rtol=1e-8)
         np.testing.assert_allclose(branch.growth[k], alone.growth, rtol=1e-5)
