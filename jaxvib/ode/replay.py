@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
+from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
 from jaxvib.runtime.compat import no_host_checks, short_end
 
@@ -276,9 +277,9 @@ def _saved(saveat: diffrax.SaveAt, slopes: PyTree[Array | None], y0: Y) -> _Save
     times, states, last = [], [], [jax.tree.map(jnp.zeros_like, y0)]
     for sub, slope in zip(saveat.subs, slopes, strict=True):
         count = (0 if sub.ts is None else sub.ts.size) + sub.t1
-        whole = jax.tree.map(
-            lambda y, dy, count=count: jnp.zeros((count, *y.shape), y.dtype) if dy is None else dy, y0, slope, is_leaf=_is_none
-        )
+        leaves, rest = jax.tree.flatten(y0)
+        pairs = zip(leaves, flat_tangents(slope, y0), strict=True)
+        whole = rest.unflatten([jnp.zeros((count, *y.shape), y.dtype) if dy is None else dy for y, dy in pairs])
         if sub.t1:
             last.append(jax.tree.map(lambda dy: dy[-1], whole))
         if sub.ts is not None:
@@ -288,10 +289,6 @@ def _saved(saveat: diffrax.SaveAt, slopes: PyTree[Array | None], y0: Y) -> _Save
     places = jnp.argsort(all_times)
     all_states = jax.tree.map(lambda *dy: jnp.concatenate(dy)[places], *states) if states else None
     return _Saved(all_times[places], all_states, jax.tree.map(lambda *dy: sum(dy), *last), places)
-
-
-def _is_none(x: object) -> bool:
-    return x is None
 
 
 def _by_inputs(

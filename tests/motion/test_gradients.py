@@ -210,6 +210,25 @@ def test_reverse_gradient_through_time_is_the_forward_one():
     np.testing.assert_allclose(relative(reverse), relative(forward), atol=1e-11)
 
 
+def test_reverse_gradient_of_many_loads_is_the_forward_one():
+    """Their state is held as it is, on arrays, and has parts that are None."""
+    s = scene("one_mass", "balls")
+    s = eqx.tree_at(lambda s: s.loads, s, jv.balls(count=20, mass=0.01, radius=0.08, drag=0.4))
+    start = jv.initial_state(s, "rest", angles=jnp.linspace(0.0, 6.0, 20))
+
+    def end(stiffness, adjoint):
+        moved = eqx.tree_at(lambda s: s.machine.stiffness, s, stiffness)
+        run = jv.simulate(moved, 0.2, start=start, save="window", adjoint=adjoint, max_steps=1024)
+        return run.window.state.displacement[-1, 0]
+
+    forward, reverse = (
+        jax.jit(way(lambda k, adjoint=adjoint: end(k, adjoint)))(s.machine.stiffness)
+        for way, adjoint in ((jax.jacfwd, diffrax.ForwardMode()), (jax.grad, None))
+    )
+    assert jnp.all(forward != 0.0)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_every_gradient_through_time_is_the_finite_difference():
     x = jnp.ones(6)
