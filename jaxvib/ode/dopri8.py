@@ -225,12 +225,26 @@ def _fence_of(lanes: bool, one: Array) -> _Fence:
 
     def through_memory(y: Y) -> Y:
         leaves, rest = jax.tree.flatten(y)
-        if any(jnp.ndim(leaf) for leaf in leaves):
-            return jax.tree.map(lambda leaf: leaf / one.astype(leaf.dtype), y)
-        kept = jnp.stack(leaves) * one.astype(leaves[0].dtype)
-        return jax.tree.unflatten(rest, [kept[i] for i in range(len(leaves))])
+        if len(leaves) == 1 or any(jnp.ndim(leaf) for leaf in leaves):
+            return divided(y)
+        return jax.tree.unflatten(rest, _from_bits(jnp.stack(leaves), one.astype(leaves[0].dtype)))
 
     def divided(y: Y) -> Y:
         return jax.tree.map(lambda leaf: leaf / one.astype(leaf.dtype), y)
 
     return divided if lanes else through_memory
+
+
+@jax.custom_jvp
+def _from_bits(stack: Array, one: Array) -> list[Array]:
+    """The numbers of a stack, each read as bits: the compiler puts what a number was made of in place of one that it reads as
+    what it is. Tangents have no bits to be read, and are multiplied by a 1 that the compiler cannot know."""
+    bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
+    return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]
+
+
+@_from_bits.defjvp
+def _from_bits_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[list[Array], list[Array]]:
+    stack, one = primals
+    moved = tangents[0] * one
+    return _from_bits(stack, one), [moved[i] for i in range(len(stack))]
