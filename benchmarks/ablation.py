@@ -44,6 +44,7 @@ NONE = contextlib.nullcontext
 OFF: dict[str, Callable[[], Any]] = {
     "unrolled step: always looped": lambda: mock.patch.object(system, "_MOST_WRITTEN", 0),
     "scalarize: on arrays": lambda: mock.patch.object(system, "MAX_SCALARS", 0),
+    "inverses: quotients": lambda: mock.patch.object(system, "with_inverses", lambda program: program),
     "polynomial sine and cosine: jnp.sin, jnp.cos": lambda: mock.patch.object(
         scalarize, "sine_and_cosine", lambda x: (jnp.sin(x), jnp.cos(x))
     ),
@@ -53,10 +54,10 @@ OFF: dict[str, Callable[[], Any]] = {
 
 def ended(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: bool, solver: Any = None) -> jv.State:
     """The state after so many equal steps."""
-    packed = PackedSystem(jv.vector_field(s), start)
+    packed = PackedSystem(jv.vector_field(s), start, lanes=lanes)
     ended = diffrax.diffeqsolve(
         packed.term,
-        packed.method(lanes) if solver is None else solver,
+        packed.method() if solver is None else solver,
         0.0,
         steps * step,
         step,

@@ -255,7 +255,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     watched = scene.loads.one_sided
     field = _Watching(equations(scene), scene) if watched else equations(scene)
     state = _watched(state, jnp.zeros_like(state.azimuth)) if watched else state
-    motion = PackedSystem(field, state, wrapped=single, together=together)
+    motion = PackedSystem(field, state, wrapped=single, together=together, lanes=True)
     length = end / _PARTS
 
     def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:

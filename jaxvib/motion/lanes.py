@@ -33,7 +33,7 @@ def advance(motion: PackedSystem, held: Held, begin: Array, length: Array, step:
     """What the integrator holds a `length` of time after `begin`, by steps of the size `step`, and how many those were."""
     solution = diffrax.diffeqsolve(
         motion.term,
-        motion.method(lanes=True),
+        motion.method(),
         t0=begin,
         t1=begin + length,
         dt0=step,
@@ -87,7 +87,7 @@ def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
     dtype = state.displacement.dtype
     single, together = wrap_angles(scene, dtype)
     field = vector_field(scene)
-    motion = PackedSystem(field, state, wrapped=single, together=together)
+    motion = PackedSystem(field, state, wrapped=single, together=together, lanes=True)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
 

@@ -31,9 +31,31 @@ from jaxvib.ode.scalar_rules import (
 )
 from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
 from jaxvib.ode.sincos import sine_and_cosine
-from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, rewritten
+from jaxvib.runtime.compat import (
+    HAS_JAXPRS,
+    Atoms,
+    ClosedJaxpr,
+    Instead,
+    Jaxpr,
+    JaxprEqn,
+    Literal,
+    Primitive,
+    Var,
+    operation_like,
+    rewritten,
+    substituted,
+)
 
-__all__ = ["MAX_SCALARS", "NotScalarizable", "scalarize", "scalarized_program", "scalarized_vmap", "scalars_of"]
+__all__ = [
+    "MAX_SCALARS",
+    "NotScalarizable",
+    "arrays_program",
+    "scalarize",
+    "scalarized_program",
+    "scalarized_vmap",
+    "scalars_of",
+    "with_inverses",
+]
 
 X = TypeVar("X")
 Shared = TypeVar("Shared")
@@ -153,6 +175,60 @@ def _without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
             live.append((equation, inputs))
             read.update(atom for atom in inputs if isinstance(atom, Var))
     return rewritten(program, live[::-1], results)
+
+
+def with_inverses(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program, each quotient the product with an inverse; results change by their rounding.
+
+    A division takes as long as ten products. What several numbers are divided by is inverted once, and an inverse does not wait
+    for what is divided.
+    """
+    inverse: dict[Var, Var] = {}
+
+    def product(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
+        if equation.primitive != _division() or not isinstance(divisor := inputs[1], Var) or not _is_floating(divisor):
+            return None
+        made: list[tuple[JaxprEqn, Atoms]] = []
+        if divisor not in inverse:
+            inverted = operation_like(lambda x: 1.0 / x, divisor)
+            made.append((inverted, [inverted.invars[0], divisor]))
+            (inverse[divisor],) = inverted.outvars
+        times = operation_like(lax.mul, divisor, divisor)
+        return [*made, (times, [inputs[0], inverse[divisor]])], times.outvars[0]
+
+    return substituted(program, product)
+
+
+def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
+    """`function`, traced as it is, on arrays, but for its sines and cosines, which are those of `jaxvib.ode.sincos`.
+
+    **Returns** None where this version of JAX lets nobody read its programs.
+    """
+    if not HAS_JAXPRS:
+        return None
+    known: dict[Var, list[Var]] = {}
+
+    def polynomial(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
+        place = _angles().get(equation.primitive)
+        if place is None or not isinstance(angle := inputs[0], Var) or not _is_floating(angle):
+            return None
+        made: list[tuple[JaxprEqn, Atoms]] = []
+        if angle not in known:
+            both = operation_like(sine_and_cosine, angle)
+            made.append((both, [angle]))
+            known[angle] = list(both.outvars)
+        return made, known[angle][place]
+
+    return substituted(jax.make_jaxpr(function)(*jax.eval_shape(lambda *a: a, *arguments)), polynomial)
+
+
+def _is_floating(x: Any) -> bool:
+    return jnp.issubdtype(x.aval.dtype, jnp.floating)
+
+
+@functools.cache
+def _division() -> Primitive:
+    return primitive_of(lax.div, np.float32(1.0), np.float32(2.0))
 
 
 @functools.cache

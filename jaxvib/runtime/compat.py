@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
-import importlib
 import importlib.metadata
 import inspect
 import json
@@ -21,7 +20,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FunctionType, ModuleType
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +31,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HAS_JAXPRS",
-    "HAS_RULES",
+    "Atoms",
     "ClosedJaxpr",
+    "Instead",
     "Jaxpr",
     "JaxprEqn",
     "Literal",
@@ -46,17 +46,15 @@ __all__ = [
     "enumeration_names",
     "enumeration_of",
     "evaluating",
-    "is_zero",
     "jaxpr_as_fun",
     "no_host_checks",
-    "primitive",
-    "pulled_back",
+    "operation_like",
     "rewritten",
     "short_end",
+    "substituted",
     "traced",
     "user_folder",
     "wide_vectors_are_right",
-    "zero_of",
 ]
 
 _TESTED = ((0, 10), (0, 12))
@@ -76,31 +74,6 @@ except ImportError:
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
 
 
-def _module(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        return None
-
-
-core, ad, batching, mlir = map(
-    _module, ("jax.extend.core", "jax.interpreters.ad", "jax.interpreters.batching", "jax.interpreters.mlir")
-)
-HAS_RULES = all(
-    hasattr(module, name)
-    for module, name in (
-        (core, "Primitive"),
-        (ad, "Zero"),
-        (ad, "primitive_jvps"),
-        (ad, "primitive_transposes"),
-        (batching, "primitive_batchers"),
-        (mlir, "lower_fun"),
-        (mlir, "register_lowering"),
-    )
-)
-"""Rules of primitives. Without them derivatives of cached functions are traced in each process."""
-
-
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
@@ -110,6 +83,38 @@ def rewritten(
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
     except (AttributeError, TypeError):
         return program
+
+
+Atoms: TypeAlias = "list[Var | Literal]"
+"""The inputs of an operation."""
+
+Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
+"""Operations, each with its inputs, that stand for another one, and the variable that stands for its result."""
+
+
+def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
+    """A program in which others stand for those operations of one result for which `chosen` gives some."""
+    instead: dict[int, Var] = {}
+    equations: list[tuple[JaxprEqn, Atoms]] = []
+
+    def known(atoms: Sequence[Var | Literal]) -> Atoms:
+        return [instead.get(id(atom), atom) for atom in atoms]
+
+    for equation in program.jaxpr.eqns:
+        inputs = known(equation.invars)
+        found = chosen(equation, inputs)
+        equations += [(equation, inputs)] if found is None else found[0]
+        if found is not None:
+            instead[id(equation.outvars[0])] = found[1]
+    return rewritten(program, equations, known(program.jaxpr.outvars))
+
+
+def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
+    """The one operation of a function of such arguments, with variables of its own."""
+    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
+    # Of the same function JAX would give the same program again, with the same variables.
+    (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
+    return equation
 
 
 Out = TypeVar("Out")
@@ -158,58 +163,6 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
     """In here known numbers are computed with at once, whatever JAX is transforming; without it they are part of that."""
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
-
-
-def primitive(
-    name: str,
-    *,
-    computed: Callable[..., list[Array]],
-    in_batch: Callable[..., tuple],
-    differentiated: Callable[..., tuple] | None = None,
-    transposed: Callable[..., list] | None = None,
-    traced: Callable[..., list[Array]] | None = None,
-    abstract: Callable[..., Sequence] | None = None,
-) -> Callable[..., list[Array]]:
-    """A function of arrays, and of what else it is given by name, of which JAX knows no more than these rules.
-
-    **Arguments**: what it computes, in numbers; in a batch, of arrays and the axis of each; differentiated, of arrays and
-    tangents; transposed, of cotangents and arrays; what is traced in its place, and the types of its results. **Returns** a
-    function, of numbers only where rules have another form (`HAS_RULES`).
-    """
-    if not HAS_RULES:
-        return computed
-    made = core.Primitive(name)
-    made.multiple_results = True
-    made.def_impl(computed)
-    batching.primitive_batchers[made] = in_batch
-    if differentiated is not None:
-        ad.primitive_jvps[made] = differentiated
-    if transposed is not None:
-        ad.primitive_transposes[made] = transposed
-    if abstract is not None:
-        made.def_abstract_eval(abstract)
-    if traced is not None:
-        mlir.register_lowering(made, mlir.lower_fun(traced, multiple_results=True))
-    return made.bind
-
-
-def is_zero(tangent: object) -> bool:
-    """Whether a rule of a `primitive` is given no tangent."""
-    return isinstance(tangent, ad.Zero)
-
-
-def zero_of(x: Array) -> object:
-    """No tangent of `x`, as rules of a `primitive` return it."""
-    return ad.Zero(jax.typeof(x).to_tangent_aval())
-
-
-def pulled_back(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
-    """What a function that `jax.vjp` returned gives, of cotangents that may be `zero_of`; with JAX 0.10.0, whose functions know
-    no such zeros, of numbers 0 in their place."""
-    try:
-        return list(pullback(cotangents))
-    except ValueError:
-        return list(pullback([ad.instantiate_zeros(x) for x in cotangents]))
 
 
 def backend_started() -> bool:

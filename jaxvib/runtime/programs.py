@@ -21,7 +21,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import HAS_RULES, beneath, is_zero, primitive, pulled_back, traced, zero_of
+from jaxvib.runtime.compat import beneath, traced
+from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
 from jaxvib.runtime.structure import Skeleton, Undescribable, describe

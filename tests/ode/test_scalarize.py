@@ -11,7 +11,15 @@ import jaxvib as jv
 from jaxvib.motion.start import initial_state
 from jaxvib.ode import scalarize as module
 from jaxvib.ode.scalar_rules import primitive_of, rules, to_scalars
-from jaxvib.ode.scalarize import NotScalarizable, scalarize, scalarized_program, scalarized_vmap, scalars_of
+from jaxvib.ode.scalarize import (
+    NotScalarizable,
+    arrays_program,
+    scalarize,
+    scalarized_program,
+    scalarized_vmap,
+    scalars_of,
+    with_inverses,
+)
 
 X = np.array([[0.3, -0.7, 0.2], [0.9, -0.1, 0.5]])
 
@@ -182,7 +190,7 @@ def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machi
 def test_without_readable_programs_everything_stays_on_arrays(monkeypatch):
     monkeypatch.setattr(module, "HAS_JAXPRS", False)
     x = jnp.arange(3.0)
-    assert scalarized_program(jnp.sin, x) is None
+    assert scalarized_program(jnp.sin, x) is None and arrays_program(jnp.sin, x) is None
     np.testing.assert_array_equal(scalarized_vmap(lambda y, shared: jnp.sin(y) * shared)(x, 2.0), 2.0 * jnp.sin(x))
 
 
@@ -198,3 +206,30 @@ def test_each_operation_is_done_once_and_none_for_nothing():
     assert sorted(names) == ["add", "add", "div", "mul", "mul", "sub", "sub"]
     x = np.array([0.3, -0.7])
     np.testing.assert_allclose(jax.core.eval_jaxpr(program.jaxpr, program.consts, *x), [wasteful(jnp.asarray(x))], rtol=1e-15)
+
+
+def names_and_values(program, *x):
+    names = sorted(equation.primitive.name for equation in program.jaxpr.eqns)
+    return names, jax.core.eval_jaxpr(program.jaxpr, program.consts, *x)
+
+
+def test_what_divides_several_numbers_is_inverted_once():
+    x = np.array([0.3, -0.7, 1.9])
+    program = scalarized_program(lambda x: x[0] / x[2] - (x[1] + 2.0) / x[2] + x[0] / 3.0, jnp.ones(3))
+    names, before = names_and_values(program, *x)
+    assert names == ["add", "add", "div", "div", "div", "sub"]
+    names, after = names_and_values(with_inverses(program), *x)
+    assert names == ["add", "add", "div", "div", "mul", "mul", "sub"]  # 3 is a number of the program
+    np.testing.assert_allclose(after, before, rtol=1e-15)
+
+
+def test_on_arrays_sines_and_cosines_are_computed_once_together():
+    def function(x):
+        y = jnp.sin(x) * jnp.cos(x)
+        return jnp.sin(y) + jnp.cos(x), jnp.sin(jnp.float32(2.0))
+
+    x = jnp.linspace(-3.0, 400.0, 50)
+    names, found = names_and_values(arrays_program(function, x), x)
+    assert names == ["add", "custom_jvp_call", "custom_jvp_call", "mul", "sin"]  # the last of a number of the program
+    for ours, jaxs in zip(found, function(x), strict=True):
+        np.testing.assert_allclose(ours, jaxs, rtol=0.0, atol=1e-15)

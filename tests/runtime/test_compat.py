@@ -89,31 +89,6 @@ def test_functions_can_have_a_rule_for_vmap(kind):
     assert called == ([] if kind is compat._PlainVmap else [(2, [True])])
 
 
-def test_primitives_take_rules(monkeypatch):
-    """`jax.interpreters`: batches, derivatives, transposes, lowering."""
-    assert compat.HAS_RULES
-    rules = {"computed": lambda x: [2.0 * x], "in_batch": lambda x, axes: ([2.0 * x[0]], axes)}
-    doubled = compat.primitive("doubled", **rules)
-    assert doubled(jnp.asarray(2.0)) == [4.0]
-    assert jax.vmap(lambda x: doubled(x)[0])(jnp.arange(3.0)).tolist() == [0.0, 2.0, 4.0]
-    monkeypatch.setattr(compat, "HAS_RULES", False)
-    assert compat.primitive("doubled", **rules) is rules["computed"]
-
-
-@pytest.mark.parametrize("knows", [True, False])
-def test_reverse_derivatives_take_no_cotangent_for_a_number(knows):
-    """`jax.vjp`'s functions know zeros from 0.10.1 on."""
-    values, pullback = jax.vjp(lambda x: [2.0 * x, jnp.sin(x)], jnp.asarray(0.0))
-
-    def older(cotangents):
-        if any(map(compat.is_zero, cotangents)):
-            raise ValueError("unexpected tree structure.")
-        return pullback(cotangents)
-
-    (found,) = compat.pulled_back(pullback if knows else older, [compat.zero_of(values[0]), jnp.asarray(3.0)])
-    assert float(found) == 3.0
-
-
 def test_known_numbers_are_computed_with_while_jax_transforms():
     """`jax.core.eval_context`."""
     seen = []
