@@ -9,6 +9,8 @@ from typing import Any
 import jax
 from jax import Array
 
+from jaxvib.runtime.compat import HAS_JAXPRS, Primitive
+
 __all__ = ["HAS_RULES", "is_zero", "primitive", "pulled_back", "zero_of"]
 
 
@@ -19,13 +21,10 @@ def _module(name: str) -> Any:
         return None
 
 
-core, ad, batching, mlir = map(
-    _module, ("jax.extend.core", "jax.interpreters.ad", "jax.interpreters.batching", "jax.interpreters.mlir")
-)
-HAS_RULES = all(
+ad, batching, mlir = map(_module, ("jax.interpreters.ad", "jax.interpreters.batching", "jax.interpreters.mlir"))
+HAS_RULES = HAS_JAXPRS and all(
     hasattr(module, name)
     for module, name in (
-        (core, "Primitive"),
         (ad, "Zero"),
         (ad, "primitive_jvps"),
         (ad, "primitive_transposes"),
@@ -55,7 +54,7 @@ def primitive(
     """
     if not HAS_RULES:
         return computed
-    made = core.Primitive(name)
+    made = Primitive(name)
     made.multiple_results = True
     made.def_impl(computed)
     batching.primitive_batchers[made] = in_batch
