@@ -8,6 +8,7 @@ import pytest
 from scenes import scene as platforms
 
 import jaxvib as jv
+from jaxvib.steady.whirl import _held
 from jaxvib.study.maps.published_rotor import published_rotor
 
 
@@ -98,3 +99,18 @@ def test_platforms_do_not_whirl():
         jv.whirl(published_rotor(), [10.0, -5.0])
     with pytest.raises(jv.InputError, match=r"loads is 'some'; allowed: fixed, none"):
         jv.whirl(published_rotor(), loads="some")
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_whirls_of_one_speed_are_told_apart_in_machines_of_every_size(size):
+    """Without damping and gyroscopic coupling both turn at sqrt(k/m), one in each sense."""
+    machine = jv.planar_rotor(mass=37.0 * size, stiffness=1.16e6 * size, damping=0.0)
+    scene = jv.Scene(machine, jv.pendulums(count=1, mass=0.5 * size, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))
+    found = jv.whirl(scene, loads="none")
+    np.testing.assert_allclose(found.speed[0], (1.16e6 / 37.0) ** 0.5, rtol=1e-9)
+    assert sorted(np.asarray(found.forward[0]).tolist()) == [False, True]
+
+
+def test_springs_hold_whatever_the_units_of_their_coordinates():
+    assert _held(1e-9 * np.eye(3)) and _held(np.diag([1e12, 1e-12]))
+    assert not _held(1e10 * np.array([[1.0, 1.0], [1.0, 1.0]])) and not _held(np.diag([1e-9, 0.0]))

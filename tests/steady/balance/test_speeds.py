@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+import jaxvib as jv
 from jaxvib.steady.balance.criterion import _joined
-from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root
+from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root, characteristic_speeds
 
 
 @pytest.mark.parametrize(
@@ -35,3 +36,22 @@ def test_intervals_that_touch_are_one_and_empty_ones_none():
     assert _joined(np.array([[100.0, 200.0], [200.0 + 1e-7, 300.0]])) == [[100.0, 300.0]]
     assert _joined(np.array([[100.0, 200.0], [200.01, 300.0]])) == [[100.0, 200.0], [200.01, 300.0]]
     assert _joined(np.array([[0.01, 0.02], [0.0200001, 0.03]])) == [[0.01, 0.02], [0.0200001, 0.03]]
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "says"),
+    [
+        ((1e4, 1e30), "machine.exciter stands on y2, which cannot move beside the others"),
+        ((1e30, 1e4), "machine.stiffness is so high at y1 that it cannot move beside the others"),
+        ((1e12, 1e4), None),
+        ((1e4, 0.0), None),
+    ],
+)
+def test_what_rounding_holds_fast_is_named(stiffness, says):
+    machine = jv.two_mass(mass=(3.0, 2.0), stiffness=stiffness, damping=(1.0, 1.0), link_stiffness=1e3, link_damping=1.0)
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(50.0))
+    if says is None:
+        assert np.all(np.isfinite(characteristic_speeds(scene).resonances))
+    else:
+        with pytest.raises(jv.InputError, match=says):
+            characteristic_speeds(scene)
