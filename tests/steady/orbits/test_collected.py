@@ -14,8 +14,8 @@ from scipy.integrate import solve_ivp
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.collocation import periodic_motion
-from jaxvib.steady.orbits.orbit import light_rotor_speed
+from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution, periodic_motion
+from jaxvib.steady.orbits.orbit import _least_push, light_rotor_speed
 
 
 def different():
@@ -153,6 +153,24 @@ def test_loads_side_by_side_in_the_leading_order_and_in_scene_files():
 def test_loads_that_would_have_to_pull_at_each_other_are_not_called_stable():
     orbit = jv.jam_orbit(side_by_side(), omega=40.0)
     assert bool(orbit.status == jv.OrbitStatus.held) and not bool(orbit.stable)
+
+
+def test_what_loads_side_by_side_push_with_is_what_those_behind_need():
+    """Of a motion that is no balance: the mean over a period of m R cos(phi_j) y'' - b R^2 (n - phi_j'), summed up to each."""
+    model, grid = assembled(side_by_side()), grid_of(33, False)
+    deviation = lambda theta: 0.3 * np.sin(theta) + 0.1 * np.cos(2.0 * theta)  # noqa: E731
+    orders, omega, speed = np.asarray(grid.orders), 40.0, 55.0
+    answer = np.zeros((1, orders.size), complex)
+    answer[0, [1, 2, 3]] = [20.0 + 70.0j, 30.0 - 5.0j, 4.0j]
+    motion = PeriodicSolution(jnp.asarray(deviation(grid.theta))[None], jnp.asarray(omega), jnp.asarray(speed))
+    found = _least_push(model, grid, motion, Harmonics(None, None, jnp.asarray(answer), None))
+    theta = 2.0 * np.pi * np.arange(2000) / 2000.0
+    acceleration = np.real(answer[0] @ np.exp(1j * orders[:, None] * theta))
+    needed = []
+    for place in np.asarray(model.offsets):
+        phi, rate = theta + deviation(theta) + place, omega * (1.0 + 0.3 * np.cos(theta) - 0.2 * np.sin(2.0 * theta))
+        needed.append(np.mean(0.5 * 0.1 * np.cos(phi) * acceleration - 0.7 * 0.1**2 * (speed - rate)))
+    np.testing.assert_allclose(found, np.min(-np.cumsum(needed)[:-1]), rtol=1e-9)
 
 
 def test_loads_side_by_side_need_room_and_one_size():

@@ -325,3 +325,8 @@ def test_the_highest_of_several_peaks_is_that_between_samples():
     dense = np.max((harmonics @ wave).real, axis=1)  # within 1e-9 between its samples
     np.testing.assert_allclose(_swing(orders, jnp.asarray(harmonics)), dense, rtol=3e-9)
     np.testing.assert_allclose(_peaks(orders, jnp.asarray(harmonics[0])).max(), dense[0], rtol=3e-9)
+    width = 2.0 * np.pi / 16.0
+    parts = width * np.arange(16)[:, None] + np.linspace(0.0, width, 12501)
+    inside = np.exp(1j * orders[:, None, None] * parts)
+    each = np.max(np.einsum("k,kpt->pt", harmonics[0], inside).real, axis=1)  # of each part of the period, its ends included
+    np.testing.assert_allclose(_peaks(orders, jnp.asarray(harmonics[0])), each, atol=3e-9 * dense[0])
