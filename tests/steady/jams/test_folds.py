@@ -209,3 +209,10 @@ def test_two_folds_in_one_interval_are_found():
         dense = np.linspace(6.0, 8.0, 20001)
         closest = dense[np.argmin(sign * slope(dense))]  # it stays away from 0 there
         assert np.min(np.abs(np.asarray(wide) - closest)) < 1e-3
+
+
+def test_a_point_that_is_closest_already_is_kept():
+    slope = lambda w: jnp.abs(w - 3.5) + 0.1  # noqa: E731
+    wide, values = folds._with_close_folds(slope, jnp.linspace(0.0, 10.0, 21), 1)
+    np.testing.assert_array_equal(np.sort(wide)[6:10], [3.0, 3.5, 3.5, 4.0])
+    np.testing.assert_allclose(values, jax.vmap(slope)(wide), rtol=1e-12)
