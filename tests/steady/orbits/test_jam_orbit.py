@@ -58,6 +58,6 @@ def test_swings_are_half_of_what_lies_between_the_extremes():
     """Of signals that are not symmetric: 3 + cos t + cos 2 t lies between 3 - 9/8 and 5."""
     orders = np.array([0, 1, 2])
     np.testing.assert_allclose(
-        _swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]])), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
+        _swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]], complex)), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
     )
     np.testing.assert_allclose(_swing(np.array([1, 3]), jnp.array([[1.0, 0.0], [0.0, 2.0j]])), [1.0, 2.0], rtol=1e-12)
