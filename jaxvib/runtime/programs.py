@@ -43,6 +43,8 @@ def cached(function: Callable[P, T]) -> CachedFunction[P, T]:
 
 
 class CachedFunction(Generic[P, T]):
+    """What `cached` returns: the function, whose programs and those of its derivatives are `stored`."""
+
     def __init__(self, function: Callable[P, T]):
         self.stored = StoredFunction(function)
         functools.update_wrapper(self, function)
