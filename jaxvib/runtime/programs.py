@@ -58,7 +58,7 @@ class CachedFunction(Generic[P, T]):
             return self.stored(leaves, treedef)
         if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, moved)):
             question = _Question(self, Skeleton.of(leaves, treedef))
-            if _is_describable(question):
+            if question.is_describable():
                 return question.result(_stored(*(leaf for leaf in leaves if eqx.is_array(leaf)), question=question))
         return self.stored.jitted(*args, **kwargs)
 
@@ -91,10 +91,16 @@ class _Question:
     def result(self, arrays: Sequence[Array]) -> Any:
         return self.skeletons[0].filled(arrays)
 
+    def is_describable(self) -> bool:
+        """Whether its program can be told from others on disk."""
+        try:
+            return _is_describable(self)
+        except TypeError:  # an argument without a hash
+            return False
+
 
 @functools.lru_cache(256)
 def _is_describable(question: _Question) -> bool:
-    """Whether its program can be told from others on disk."""
     try:
         describe((question.function, question.arguments), lambda _: None)
     except Undescribable:
@@ -232,7 +238,7 @@ def _in_batch(arrays: Sequence[Array], axes: Sequence[Any], *, question: _Questi
     first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
     result = _mapped(question, batched, first)
     found = question.split(result)
-    shared = len(jax.tree.leaves(result[0])) if _shares_result(question, batched) else 0
+    shared = sum(map(eqx.is_array, jax.tree.leaves(result[0]))) if _shares_result(question, batched) else 0
     return found, [None if k < shared else 0 for k in range(len(found))]
 
 

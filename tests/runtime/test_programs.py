@@ -112,6 +112,28 @@ def test_other_transformations_go_through(asked, route):
         np.testing.assert_allclose(ours, theirs, rtol=1e-14, atol=1e-14)
 
 
+def labelled(x, labels):
+    return {"label": labels[0], "value": jnp.sin(x), "whole": 2}
+
+
+@pytest.mark.parametrize("labels", [("a",), ["a"], (np.float64(1.0),)])
+def test_results_and_arguments_that_are_no_arrays_stand_beside_derivatives(asked, labels):
+    function = programs.cached(labelled)
+    for route in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(route(lambda x: function(x, labels)["value"])(X), np.diag(np.cos(X)), atol=1e-15)
+    values, slopes = jax.jvp(lambda x: function(x, labels)["value"], (X,), (X,))
+    np.testing.assert_allclose(values, np.sin(X), rtol=1e-15)
+    np.testing.assert_allclose(slopes, X * np.cos(X), rtol=1e-15)
+
+
+def test_an_argument_without_a_hash_is_differentiated_as_before(asked):
+    class Bare:
+        __hash__ = None
+
+    question = programs._Question(programs.cached(labelled), structure.Skeleton(((X, Bare()), {})))
+    assert not question.is_describable()
+
+
 def test_whole_numbers_have_no_tangent(asked):
     function, _ = asked
     found, slopes = jax.jvp(function, (X,), (jnp.ones(3),))
