@@ -117,13 +117,15 @@ def labelled(x, labels):
 
 
 @pytest.mark.parametrize("labels", [("a",), ["a"], (np.float64(1.0),)])
-def test_results_and_arguments_that_are_no_arrays_stand_beside_derivatives(asked, labels):
+def test_results_and_arguments_that_are_no_arrays_stand_beside_derivatives(asked, labels, monkeypatch, tmp_path):
     function = programs.cached(labelled)
+    monkeypatch.setitem(globals(), "labelled", function)  # where it is found by its name
     for route in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(route(lambda x: function(x, labels)["value"])(X), np.diag(np.cos(X)), atol=1e-15)
     values, slopes = jax.jvp(lambda x: function(x, labels)["value"], (X,), (X,))
     np.testing.assert_allclose(values, np.sin(X), rtol=1e-15)
     np.testing.assert_allclose(slopes, X * np.cos(X), rtol=1e-15)
+    assert len(list(tmp_path.glob("_mapped-*"))) == 2 or isinstance(labels[0], np.float64)  # a class from outside
 
 
 def test_an_argument_without_a_hash_is_differentiated_as_before(asked):
