@@ -133,7 +133,7 @@ def integrate(
     field = vector_field(scene)
     motion = PackedSystem(field, state, wrapped=single and solver is None, together=together, solver=solver)
     if solver is None:
-        solver = motion.method()
+        solver = motion.method(adjoint)
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
     if isinstance(controller, StepControl):
         if controller.steps is not None:

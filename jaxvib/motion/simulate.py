@@ -127,7 +127,8 @@ def simulate(
     known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if solver is None and not known and end.dtype.itemsize >= 8:
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
-        solver = LoopDopri8(tangents=isinstance(adjoint, diffrax.ForwardMode))
+        forward = isinstance(adjoint, diffrax.ForwardMode)
+        solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
     def run(chosen: StepControl | diffrax.AbstractStepSizeController) -> Run:
         kept = samples if save == "all" else 0

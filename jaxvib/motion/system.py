@@ -100,11 +100,13 @@ class PackedSystem(eqx.Module):
         """The equations of motion on what the integrator holds."""
         return diffrax.ODETerm(self._rates)
 
-    def method(self) -> diffrax.AbstractSolver:
-        """The method of order 8 in the form that is fastest here."""
+    def method(self, adjoint: diffrax.AbstractAdjoint | None = None) -> diffrax.AbstractSolver:
+        """The method of order 8 in the form that is fastest here, with the derivatives of `adjoint`, or by step replay."""
         # Without the equations' numbers: a method holds no traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
-        return UnrolledDopri8(lanes=self.lanes, wrap=wrap) if self.size <= _MOST_WRITTEN else LoopDopri8(wrap=wrap)
+        if self.size <= _MOST_WRITTEN:
+            return UnrolledDopri8(lanes=self.lanes, wrap=wrap)
+        return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
     def pack(self, state: State) -> Held:
         """A state (or a tree like it) as the integrator holds it."""

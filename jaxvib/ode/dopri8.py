@@ -129,19 +129,22 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
         """8."""
         return 8
 
-    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
-        """The rates at the start: the last stage of a step is the first of the next one."""
-        return terms.vf(t0, y0, args)
-
     def func(self, terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         """The vector field, for the choice of the first step."""
         return terms.vf(t0, y0, args)
 
     @abc.abstractmethod
     def advance(
-        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
-    ) -> tuple[Y, Array, VF, Y]:
-        """From the rates `first` at t0: the state at t1, the rates of all stages (stages, n), those at t1, the error."""
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: VF,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Array, Y, VF]:
+        """The state at t1, the rates of all stages (stages, n), the error, the method's own state."""
 
     def step(
         self,
@@ -154,11 +157,9 @@ class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
         made_jump: BoolScalarLike,
     ) -> StepResult:
         """One step from t0 to t1: the state, its error estimate, and the stages that the interpolant between them needs."""
-        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
-        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        end, stages, last, error = self.advance(terms, t0, t1, y0, first, args)
+        end, stages, error, solver_state = self.advance(terms, t0, t1, y0, args, solver_state, made_jump)
         end = end if self.wrap is None else self.wrap(end)
-        return end, error, dict(y0=y0, stages=dense_stages(stages)), last, diffrax.RESULTS.successful
+        return end, error, dict(y0=y0, stages=dense_stages(stages)), solver_state, diffrax.RESULTS.successful
 
 
 class UnrolledDopri8(AbstractDopri8):
@@ -187,10 +188,23 @@ class UnrolledDopri8(AbstractDopri8):
     lanes: bool = eqx.field(static=True, default=False)
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
+    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
+        """The rates at the start: the last stage of a step is the first of the next one."""
+        return terms.vf(t0, y0, args)
+
     def advance(
-        self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args
-    ) -> tuple[Y, Array, VF, Y]:
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: VF,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Array, Y, VF]:
         """See `AbstractDopri8.advance`."""
+        # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
+        first = solver_state if made_jump is False else terms.vf(t0, y0, args)
         fence = _fence_of(self.lanes, jnp.where(t1 >= t0, 1.0, t1 - t0))
         dt = terms.contr(t0, t1)
         stages = [first]
@@ -199,7 +213,7 @@ class UnrolledDopri8(AbstractDopri8):
             y = fence(_stage_state(y0, dt, row[: len(stages)], stages))
             stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
-        return y, jnp.stack([ravel(k) for k in stages]), stages[-1], error
+        return y, jnp.stack([ravel(k) for k in stages]), error, stages[-1]
 
 
 def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:

@@ -25,15 +25,26 @@ from jaxvib.ode.dopri8 import (
     ravel,
     unravel,
 )
-from jaxvib.ode.types import VF, Args, Mapped, RealScalarLike, Tangents, Terms, Y
+from jaxvib.ode.types import VF, Args, BoolScalarLike, Mapped, RealScalarLike, Tangents, Terms, Y
 
 __all__ = ["LoopDopri8"]
 
-_Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, VF, Args, Terms]
-"""Of a step: the time at its start, its length, the state, its rates, the arguments of the equations, the equations."""
+_Known: TypeAlias = "tuple[Array, Array] | None"
+"""The last stage of the step before (n,), and how many stages of a step it makes known: 1, or 0 where there is no such step.
+None where each step computes all of its stages."""
 
-_Step: TypeAlias = tuple[Y, Array, VF, Y]
-"""The state at the end of a step, the rates of its stages (stages, n), the last of them, the error of the state."""
+_Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, _Known, Args, Terms]
+"""Of a step: the time at its start, its length, the state, what is known of its rates, the arguments of the equations, the
+equations."""
+
+_Step: TypeAlias = tuple[Y, Array, Y]
+"""The state at the end of a step, the rates of its stages (stages, n), the error of the state."""
+
+_ROWS = np.concatenate([np.zeros((1, ROWS.shape[1])), ROWS])
+"""With what weights those before make each stage (stages, stages - 1)."""
+
+_NODES = np.concatenate([np.zeros(1), NODES])
+"""At which share of the step each stage is."""
 
 Numbers = TypeVar("Numbers", Array, tuple[Array, Array])
 """A vector (n,), a batch of them (n, batch), or a vector and its tangents (n, directions)."""
@@ -42,8 +53,13 @@ Numbers = TypeVar("Numbers", Array, tuple[Array, Array])
 class LoopDopri8(AbstractDopri8):
     """The same method as `UnrolledDopri8` with a loop over its stages, which compiles in a fraction of the time.
 
+    Its program evaluates the equations in one place, whichever stage it is.
+
     **Arguments**: `tangents` whether forward derivatives are taken (and reverse ones never): those of a step are then computed
-    along all tangents at once, eight of them for not much more than one costs; `wrap` as in `UnrolledDopri8`.
+    along all tangents at once, eight of them for not much more than one costs; `reuse` whether the last stage of a step is the
+    first of the next one, which saves one evaluation of fourteen. Where the loop begins is then known at run time only, so that
+    diffrax's adjoints have no reverse derivatives; those of `jaxvib.ode.replay` are as without it. `wrap` as in
+    `UnrolledDopri8`.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -58,16 +74,34 @@ class LoopDopri8(AbstractDopri8):
     """
 
     tangents: bool = eqx.field(static=True, default=False)
+    reuse: bool = eqx.field(static=True, default=False)
 
     @property
     def interpolation_cls(self) -> Callable[..., Dopri8Interpolation]:  # pyright: ignore
         """The interpolation that finds states within a step."""
         return _WITH_TANGENTS if self.tangents else _WITHOUT_TANGENTS
 
-    def advance(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, first: VF, args: Args) -> _Step:
+    def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> _Known:
+        """No stage is known at first."""
+        return (jnp.zeros_like(ravel(y0)), jnp.asarray(0)) if self.reuse else None
+
+    def advance(
+        self,
+        terms: Terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: _Known,
+        made_jump: BoolScalarLike,
+    ) -> tuple[Y, Array, Y, _Known]:
         """See `AbstractDopri8.advance`."""
         advance = multi_tangent_jvp(_advanced, _advance_jvp) if self.tangents else _advanced
-        return advance((t0, terms.contr(t0, t1), y0, first, args, terms))
+        known = None if made_jump is True else solver_state
+        if known is not None and made_jump is not False:
+            known = (known[0], jnp.where(made_jump, 0, known[1]))
+        end, stages, error = advance((t0, terms.contr(t0, t1), y0, known, args, terms))
+        return end, stages, error, (stages[-1], jnp.asarray(1)) if self.reuse else None
 
 
 def _linear_combination(inputs: tuple[Array, Array]) -> Array:
@@ -103,19 +137,19 @@ _WITH_TANGENTS = functools.partial(_BatchedInterpolation, combine=multi_tangent_
 
 def _advance(inputs: _Inputs) -> _Step:
     """One step."""
-    t0, dt, y0, first, args, terms = inputs
+    t0, dt, y0, known, args, terms = inputs
 
     def rates(share: RealScalarLike, y: Array) -> Array:
         return ravel(terms.vf(t0 + share * dt, unravel(y, y0), args))
 
-    end, stages, error = _stages(ravel(y0), ravel(first), rates, lambda total: dt * total, dt)
-    return _unpack_result(end, stages, error, y0)
+    end, stages, error = _stages(ravel(y0), known, rates, lambda total: dt * total, dt)
+    return unravel(end, y0), stages, unravel(error, y0)
 
 
 def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
     """`_advance` for a batch along a last axis."""
-    t0, dt, y0, first, args, terms = inputs
-    t0_too, dt_too, y0_too, first_too, *others_too = mapped
+    t0, dt, y0, known, args, terms = inputs
+    t0_too, dt_too, y0_too, known_too, *others_too = mapped
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
     flags = flat_tangents((t0_too, dt_too, *others_too), (t0, dt, args, terms))
     places = [k for k, along in enumerate(flags) if along]
@@ -125,6 +159,10 @@ def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
     def whole(tree: PyTree[Array], along: Mapped) -> Array:
         spread = lambda leaf, here: leaf if here else jnp.broadcast_to(leaf[..., None], (*leaf.shape, size))  # noqa: E731
         return ravel(jax.tree.map(spread, tree, along), 1)
+
+    if known is not None:
+        # All begin with the first stage that one of them lacks.
+        known = (whole(known[0], known_too[0]), jnp.min(known[1]))
 
     def rates(share: RealScalarLike, y: Array) -> Array:
         def rate(y: Y, moving: list[Array]) -> VF:
@@ -136,8 +174,8 @@ def _advance_batched(inputs: _Inputs, mapped: Mapped) -> _Step:
         return ravel(found, 1)
 
     dt = dt[None, :] if dt_too else dt
-    end, stages, error = _stages(whole(y0, y0_too), whole(first, first_too), rates, lambda total: dt * total, dt)
-    return _unpack_result(end, stages, error, like)
+    end, stages, error = _stages(whole(y0, y0_too), known, rates, lambda total: dt * total, dt)
+    return unravel(end, like), stages, unravel(error, like)
 
 
 _advanced = batch_last(_advance, _advance_batched)
@@ -145,8 +183,8 @@ _advanced = batch_last(_advance, _advance_batched)
 
 def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
     """`_advance` and the tangents of all that."""
-    t0, dt, y0, first, args, terms = inputs
-    dt0, ddt, dy0, dfirst, *others = tangents
+    t0, dt, y0, known, args, terms = inputs
+    dt0, ddt, dy0, dknown, *others = tangents
     leaves, rest = jax.tree.flatten((t0, dt, args, terms))
     moves = flat_tangents((dt0, ddt, *others), (t0, dt, args, terms))
     places = [k for k, move in enumerate(moves) if move is not None]
@@ -170,50 +208,43 @@ def _advance_jvp(inputs: _Inputs, tangents: Tangents) -> tuple[_Step, _Step]:
         total, change = pair
         return dt * total, dt * change if ddt is None else dt * change + total[:, None] * ddt[None, :]
 
-    def whole(tangents: Tangents) -> Array:
-        size = jax.tree.leaves((dt0, ddt, dy0, dfirst, others))[0].shape[-1]
-        pairs = zip(flat_tangents(tangents, y0), jax.tree.leaves(y0), strict=True)
+    def whole(tangents: Tangents, like: PyTree[Array]) -> Array:
+        size = jax.tree.leaves((dt0, ddt, dy0, dknown, others))[0].shape[-1]
+        pairs = zip(flat_tangents(tangents, like), jax.tree.leaves(like), strict=True)
         return ravel([jnp.zeros((*leaf.shape, size), leaf.dtype) if dx is None else dx for dx, leaf in pairs], 1)
 
-    starts = (ravel(y0), whole(dy0)), (ravel(first), whole(dfirst))
-    (end, dend), (stages, dstages), (error, derror) = _stages(*starts, rates, over_step, dt)
-    return _unpack_result(end, stages, error, y0), _unpack_result(dend, dstages, derror, y0)
+    if known is not None:
+        known = ((known[0], whole(dknown[0], known[0])), known[1])
+    (end, dend), (stages, dstages), (error, derror) = _stages((ravel(y0), whole(dy0, y0)), known, rates, over_step, dt)
+    return (unravel(end, y0), stages, unravel(error, y0)), (unravel(dend, y0), dstages, unravel(derror, y0))
 
 
 def _stages(
     y0: Numbers,
-    first: Numbers,
+    known: tuple[Numbers, Array] | None,
     rates: Callable[[RealScalarLike, Numbers], Numbers],
     over_step: Callable[[Numbers], Numbers],
     dt: Array,
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """A step's end, stages and error; y0, first and the rates are trees of arrays (n, ...) alike."""
-    count = len(ROWS)
-    known = jax.tree.map(lambda k: jnp.zeros((count + 1, *k.shape), k.dtype).at[0].set(k), first)
+    """A step's end, stages and error; y0, the stage that is known and the rates are trees of arrays (n, ...) alike."""
+    stages = jax.tree.map(lambda y: jnp.zeros((len(_ROWS), *y.shape), y.dtype), y0)
+    if known is not None:
+        stages = jax.tree.map(lambda k, first: k.at[0].set(first), stages, known[0])
     # A division by a 1 that the compiler cannot know keeps it from computing the state anew for each use of it.
     one = lax.stop_gradient(jnp.where(dt >= 0.0, 1.0, dt))
 
-    def weighted(known: Numbers, weights: Array | np.ndarray) -> Numbers:
+    def weighted(stages: Numbers, weights: Array | np.ndarray) -> Numbers:
         dense_stages = np.flatnonzero(weights) if isinstance(weights, np.ndarray) else range(len(weights))
-        return over_step(jax.tree.map(lambda k: sum(weights[i].astype(k.dtype) * k[i] for i in dense_stages), known))
+        return over_step(jax.tree.map(lambda k: sum(weights[i].astype(k.dtype) * k[i] for i in dense_stages), stages))
 
-    def moved(known: Numbers, weights: Array | np.ndarray) -> Numbers:
-        return jax.tree.map(lambda start, change: (start + change) / one, y0, weighted(known, weights))
+    def moved(stages: Numbers, weights: Array | np.ndarray) -> Numbers:
+        return jax.tree.map(lambda start, change: (start + change) / one, y0, weighted(stages, weights))
 
-    def with_stage(j: Array | int, known: Numbers, share: RealScalarLike, y: Numbers) -> Numbers:
-        new = rates(share, y)
-        return jax.tree.map(lambda k, value: lax.dynamic_update_index_in_dim(k, value, j, 0), known, new)
+    def stage(j: Array, stages: Numbers) -> Numbers:
+        row, share = (jnp.asarray(table, one.dtype)[j] for table in (_ROWS, _NODES))
+        new = rates(share, moved(stages, row))
+        return jax.tree.map(lambda k, value: lax.dynamic_update_index_in_dim(k, value, j, 0), stages, new)
 
-    def stage(j: Array, known: Numbers) -> Numbers:
-        row, share = (jnp.asarray(table, one.dtype)[j] for table in (ROWS[:, : count - 1], NODES))
-        return with_stage(j + 1, known, share, moved(known, row))
-
-    known = lax.fori_loop(0, count - 1, stage, known)
-    # The last stage is the end of the step; outside the loop no other one has to carry the state along.
-    end = moved(known, ROWS[-1])
-    known = with_stage(count, known, 1.0, end)
-    return end, known, weighted(known, ERROR)
-
-
-def _unpack_result(end: Array, stages: Array, error: Array, like: Y) -> _Step:
-    return unravel(end, like), stages, unravel(stages[-1], like), unravel(error, like)
+    stages = lax.fori_loop(0 if known is None else known[1], len(_ROWS), stage, stages)
+    # The state at the last stage is the end of the step; computed here no other one has to carry it along.
+    return moved(stages, ROWS[-1]), stages, weighted(stages, ERROR)

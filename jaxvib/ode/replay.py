@@ -163,7 +163,8 @@ def _backward(
     def step(y: Y, t0: Array, t1: Array, numbers: PyTree[Array | None]) -> tuple[Y, PyTree[Array]]:
         """The state after a step, and what makes states within it."""
         args, term = eqx.combine(numbers, others)
-        y1, _, dense, _, _ = solver.step(term, t0, t1, y, args, solver.init(term, t0, t1, y, args), False)
+        # As after a jump: nothing is known from the step before.
+        y1, _, dense, _, _ = solver.step(term, t0, t1, y, args, solver.init(term, t0, t1, y, args), True)
         return y1, dense
 
     def within(dense: PyTree[Array], t0: Array, t1: Array, t: Array) -> Y:

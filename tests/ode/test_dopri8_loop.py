@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxvib.ode.batching import multi_tangent_jvp
+from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
 POINT = jnp.asarray([0.7, 1.3, 0.2, 0.4, -0.3, 1.9, 0.05, 0.6, 2.5])
@@ -30,7 +31,7 @@ def motion(point, *, arrays=False, slopes=True, adaptive=True, adjoint=diffrax.F
     control = diffrax.PIDController(rtol=1e-6, atol=1e-6) if adaptive else diffrax.ConstantStepSize()
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(on_arrays if arrays else on_numbers),
-        LoopDopri8(tangents=slopes),
+        LoopDopri8(tangents=slopes, reuse=isinstance(adjoint, diffrax.ForwardMode)),
         jnp.zeros(()),
         end,
         0.1 if adaptive else end / 12.0,
@@ -129,3 +130,23 @@ def test_directions_lie_along_the_last_axis_and_fill_vectors():
     found = jax.jacfwd(multi_tangent_jvp(jnp.sin, beside))(x)
     np.testing.assert_allclose(found, np.diag(np.cos(np.arange(5.0))))
     assert shapes[-1] == (5, 8)
+
+
+def test_a_step_evaluates_the_field_in_one_place_of_its_program():
+    """Whichever stage it is, and whether the last stage of the step before is known or not."""
+    evaluations = []
+
+    def field(t, y, args):
+        evaluations.append(t)
+        return -y
+
+    def end(method):
+        evaluations.clear()
+        term = diffrax.ODETerm(field)
+        found = jax.make_jaxpr(lambda: diffrax.diffeqsolve(term, method, 0.0, 1.0, 0.1, jnp.ones(9)).ys)()
+        assert found
+        return len(evaluations)
+
+    # diffrax evaluates it once more where it looks up what a step is made of.
+    counted = {name: end(method) for name, method in (("loop", LoopDopri8()), ("reuse", LoopDopri8(reuse=True)))}
+    assert counted["loop"] == counted["reuse"] < end(UnrolledDopri8()) / 4, counted

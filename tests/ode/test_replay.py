@@ -90,7 +90,7 @@ def test_steps_end_where_the_field_jumps():
     np.testing.assert_allclose(reverse, forward, atol=1e-10)
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), LoopDopri8()])
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), LoopDopri8(), LoopDopri8(reuse=True)])
 def test_every_lane_of_a_batch_has_its_own_steps(solver):
     """Lanes that have come to their end wait for the others in steps of no length; no derivative of theirs may be lost."""
     factors = jnp.asarray([1.0, 3.0])
