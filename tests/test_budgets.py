@@ -48,9 +48,9 @@ BUDGETS = {
     "jam_modes, gradient": (jax.grad(modes), 2160),
     "jam_orbit": (orbit, 3500),
     "jam_orbit, gradient": (jax.grad(orbit), 3960),
-    "simulate": (run, 2680),
-    "simulate, forward derivatives": (jax.jacfwd(forward_run), 5110),
-    "simulate, reverse derivatives": (jax.grad(run), 4790),
+    "simulate": (run, 2490),
+    "simulate, forward derivatives": (jax.jacfwd(forward_run), 4830),
+    "simulate, reverse derivatives": (jax.grad(run), 4430),
 }
 
 

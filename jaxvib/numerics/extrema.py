@@ -62,10 +62,11 @@ def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
         reached = jnp.where((steps >= start) & (steps < stop - 1), reached, -jnp.inf)
         top, last = jnp.max(reached), sign * x[stop - 1]
         k = jnp.where(last > top, stop - 2, jnp.min(jnp.where(reached == top, steps, stop - 2)))
-        place = before[k] + jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
+        begin = jnp.asarray(first)[k]
+        place = (k - begin) + jnp.where(last > top, 1.0, jnp.where(inside, share, 0.0)[k])
         value = jnp.maximum(top, last)
         place = jnp.where(jnp.isnan(value), jnp.nan, place)  # what is made of it later is not a number either
-        return value, jnp.asarray(first)[k], place
+        return value, begin, place
 
     half_ways = jax.vmap(greatest, in_axes=(None, 0, 0))
     signs = jnp.asarray([-1.0, 1.0], x.dtype)
@@ -112,4 +113,4 @@ def _derived(polynomial: Array) -> Array:
 
 
 def _at(polynomial: Array, s: Array) -> Array:
-    return functools.reduce(lambda value, c: value * s + c, [polynomial[k] for k in range(len(polynomial) - 1, -1, -1)])
+    return functools.reduce(lambda value, c: value * s + c, reversed(jnp.unstack(polynomial)))

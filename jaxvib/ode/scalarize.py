@@ -239,7 +239,7 @@ def _commutative() -> set[Primitive]:
 
 def scalars_of(tree: PyTree[Array]) -> list[Array]:
     """All numbers of a tree of arrays, in order."""
-    return [leaf[index] for leaf in jax.tree.leaves(tree) for index in np.ndindex(*leaf.shape)]
+    return [number for leaf in jax.tree.leaves(tree) for number in (jnp.unstack(leaf.ravel()) if leaf.shape else (leaf,))]
 
 
 def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared], Out]:

@@ -176,18 +176,26 @@ def mean_speeds(times: Array, angle: Array, rate: Array, first: Sequence[int], l
 
 
 def _mean_speed(t: Array, phi: Array, rate: Array, first: Array, last: Array) -> Array:
-    total = phi[last] - phi[first]
+    samples = jnp.stack([t, phi, rate])
+
+    def sample(k: Array) -> Array:
+        return samples.at[:, k].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    (begin, phi_begin, _), (end, phi_end, _) = jnp.unstack(sample(first)), jnp.unstack(sample(last))
+    total = phi_end - phi_begin
     turns = jnp.floor(jnp.abs(total) / (2.0 * jnp.pi))
-    target = phi[last] - jnp.sign(total) * 2.0 * jnp.pi * turns
+    target = phi_end - jnp.sign(total) * 2.0 * jnp.pi * turns
     k = jnp.arange(t.shape[0])
     i = jnp.argmin(jnp.where((k >= first) & (k <= last), jnp.abs(phi - target), jnp.inf))
-    start = t[i] + (target - phi[i]) / _away_from_zero(rate[i])
+    t_i, phi_i, rate_i = jnp.unstack(sample(i))
+    start = t_i + (target - phi_i) / _away_from_zero(rate_i)
     # One secant step on the cubic through the sample: enough, the sample is next to it.
-    j = jnp.where(start > t[i], jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
-    h = jnp.where(i == j, 1.0, t[j] - t[i])
-    bend = (rate[j] - rate[i]) / h
-    start = t[i] + (target - phi[i]) / _away_from_zero(rate[i] + 0.5 * bend * (start - t[i]))
-    return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (t[last] - start), total / (t[last] - t[first]))
+    j = jnp.where(start > t_i, jnp.minimum(i + 1, last), jnp.maximum(i - 1, first))
+    t_j, _, rate_j = jnp.unstack(sample(j))
+    h = jnp.where(i == j, 1.0, t_j - t_i)
+    bend = (rate_j - rate_i) / h
+    start = t_i + (target - phi_i) / _away_from_zero(rate_i + 0.5 * bend * (start - t_i))
+    return jnp.where(turns > 0, 2.0 * jnp.pi * turns * jnp.sign(total) / (end - start), total / (end - begin))
 
 
 def _step(times: Array) -> Array:
