@@ -142,7 +142,7 @@ def samples(quick: bool) -> None:
     base = row("as it is", call())
     with mock.patch.object(scalarize, "MAX_SCALARS", 0):
         row("scalarize: on arrays", call(), base)
-    with mock.patch.object(scalarize, "_fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)):
+    with mock.patch.object(scalarize, "fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)):
         row("fence in the program on scalars: none", call(), base)
 
 

@@ -13,7 +13,6 @@ from jax import Array
 from jaxvib.runtime.compat import custom_vmap
 
 __all__ = [
-    "damped_newton",
     "eliminate",
     "hermitian_modes",
     "magnitude",
@@ -239,27 +238,6 @@ def _solved_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tup
 
     right = b if is_mapped[1] else jnp.broadcast_to(b, (size, *b.shape))
     return jax.lax.platform_dependent(a, right, cpu=each, default=jax.vmap(jnp.linalg.solve)), True
-
-
-def damped_newton(balance: Callable[[Array], Array], start: Array, iterations: int = 40) -> Array:
-    """A zero of `balance`, by steps that are damped where they do not help (Levenberg, Marquardt), from `start`."""
-    one = jnp.eye(start.shape[0], dtype=start.dtype)
-
-    def step(_: int, carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, value, size, slopes, damping = carry
-        normal = slopes.T @ slopes
-        damped = normal + damping * jnp.diag(jnp.diagonal(normal) + jnp.finfo(x.dtype).tiny)
-        trial = x - jnp.clip(small_solve(damped, slopes.T @ value), -0.5, 0.5)
-        new, by = jax.vmap(lambda way: jax.jvp(balance, (trial,), (way,)), out_axes=(None, 1))(one)
-        left = jnp.sum(new**2)
-        better = left < size  # and not NaN
-        then = trial, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
-        stay = x, value, size, slopes, jnp.minimum(8.0 * damping, 1e8)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, stay)
-
-    # The first step goes nowhere: it looks at the start, which is better than nothing.
-    begin = start, jnp.zeros_like(start), jnp.asarray(jnp.inf, start.dtype), one, jnp.asarray(0.1, start.dtype)
-    return jax.lax.fori_loop(0, iterations + 1, step, begin)[0]
 
 
 def eliminate(a: Array, b: Array) -> Array:

@@ -50,6 +50,7 @@ __all__ = [
     "MAX_SCALARS",
     "NotScalarizable",
     "arrays_program",
+    "fenced",
     "scalarize",
     "scalarized_program",
     "scalarized_vmap",
@@ -71,7 +72,7 @@ _BLOCK = 4096
 """So many entries of a batch go through a program on scalars together: it may hold a thousand values of each in memory."""
 
 _MAX_RECOMPUTED = 8
-"""A value used more than once that takes more operations than these is fenced: see `_fenced`."""
+"""A value used more than once that takes more operations than these is fenced: see `fenced`."""
 
 
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
@@ -270,7 +271,7 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
         constants = scalars_of(shared)
 
         def single(x: X) -> Array:
-            return jnp.stack(_fenced(program, [*scalars_of(x), *constants]))
+            return jnp.stack(fenced(program, [*scalars_of(x), *constants]))
 
         count = jax.tree.leaves(batch)[0].shape[0]
         rows = jax.vmap(single)(batch) if count <= _BLOCK else lax.map(single, batch, batch_size=_BLOCK)
@@ -284,7 +285,7 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
     return run
 
 
-def _fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
+def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
     """The results of a program on scalars, none of whose values the compiler computes many times over.
 
     XLA's fusion on a CPU computes a value anew for each use of it. Where shared parts are made of shared parts, as in a

@@ -20,7 +20,7 @@ from jaxvib.results.status import sentence
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
-from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
@@ -48,11 +48,11 @@ _SHOWN = 30.0
 _SAME_LINE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
 
-_CHUNK = 32
-"""So many starts a program takes: mostly some hundred are left."""
+_STARTS, _JAMS = 256, 64
+"""So many starts a program takes, and so many jams: mostly some hundred of the one and some tens of the other are left."""
 
-_SAME = 1e-6
-"""Jams whose speeds differ by less, relative, and whose phases do not, are one."""
+_SAME, _CLOSE = 1e-6, 1e-5
+"""Jams whose speeds differ by less, relative, and whose phases by less, rad, are one."""
 
 
 class PhaseJams(AbstractPhaseJam):
@@ -149,17 +149,17 @@ def phase_jams(
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
-    parts = parts_of(scene)
+    parts = _parts(scene)
     rng = np.random.default_rng(count(seed, "seed", low=0))
     omega, phase = starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count)))
-    omega, phase = in_chunks(_CHUNK, lambda w, a: _balanced_many(parts, w, a), omega, phase)
+    omega, phase = in_chunks(_STARTS, lambda w, a: _balanced_many(parts, w, a), omega, phase)
     groups = _equal_loads(parts)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
     # Where a start was solved for hardly, the same jam comes out once more: what is distinct is told of the jams themselves.
     # With nothing to solve from, one that is no jam: the arrays have their shapes, and end up empty.
     first = (omega[starts_at[places]], phase[starts_at[places]]) if places else (np.array([float(parts.speed)]), phase[:1])
-    jams = in_chunks(_CHUNK, lambda w, a: _jams_from(scene, w, a), *first)
+    jams = in_chunks(_JAMS, lambda w, a: _jams_from(scene, w, a), *first)
     found = np.flatnonzero(np.asarray(jams.status == PhaseStatus.found)) if places else np.zeros(0, dtype=int)
     places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]
@@ -175,15 +175,20 @@ def _distinct(
     """Places of jams (n,) that differ, by falling speed, and how many of the `starts` (n,) of all of them led to each."""
     places: list[int] = []
     reached: list[int] = []
+    near = 0  # the first of `places` that is not too fast to be the same
     for k in np.argsort(-omega, kind="stable"):
-        same = (i for i, p in enumerate(places) if abs(omega[p] - omega[k]) < _SAME * omega[p])
-        place = next((i for i in same if _same(phase[places[i]], phase[k], groups)), None)
+        while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME * omega[places[near]]:
+            near += 1
+        place = next((i for i in range(near, len(places)) if _same(phase[places[i]], phase[k], groups)), None)
         if place is None:
             places.append(int(k))
             reached.append(int(starts[k]))
         else:
             reached[place] += int(starts[k])
     return places, np.asarray(reached, dtype=int)
+
+
+_parts = cached(parts_of)
 
 
 @cached
@@ -195,7 +200,7 @@ def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 @cached
 def _balanced_many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
     """`balanced` from many speeds and phases."""
-    return eqx.filter_vmap(balanced, in_axes=(None, 0, 0))(parts, omega, phase)
+    return jax.vmap(lambda w, a: balanced(parts, w, a, on_numbers=True))(omega, phase)
 
 
 def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
@@ -242,8 +247,8 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
     def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
         w, begins = at
         start = jnp.where(begins, phase, last)
-        influence, answer = influence_of(parts, w)
-        factor, angles, residual = phases_near(parts, influence, w, start)
+        factor, angles, residual = phases_near(parts, at_speed(parts, w), start)
+        answer = influence_of(parts, w)[1]
         good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (factor > 0.0)
         braked = eqx.tree_at(lambda field: field.drag, parts.averaged, factor * parts.drag)
         growth = averaged_growth(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
@@ -268,6 +273,8 @@ def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bo
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
         return np.exp(1j * phase[group])
 
+    if np.max(np.abs(np.exp(1j * first) - np.exp(1j * second))) < _CLOSE:  # mostly, and soon seen
+        return True
     lead = points(first, groups[0])[0]
     for start in points(second, groups[0]):
         turned = [points(second, g) * lead / start for g in groups]
@@ -281,6 +288,6 @@ def _match(first: np.ndarray, second: np.ndarray) -> bool:
     left = list(second)
     for point in first:
         near = int(np.argmin([abs(point - other) for other in left]))
-        if abs(point - left.pop(near)) > 1e-5:
+        if abs(point - left.pop(near)) > _CLOSE:
             return False
     return True

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.numerics.linalg import damped_newton
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.numerics.newton import damped_newton
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at
 
-__all__ = ["LOAD_SPEEDS", "load_speeds", "phases_near", "starts_of"]
+__all__ = ["LOAD_SPEEDS", "AtSpeed", "at_speed", "load_speeds", "phases_near", "starts_of"]
 
 LOAD_SPEEDS = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
@@ -20,11 +22,12 @@ LOAD_SPEEDS = 240
 _FEW, _ROUNDS = 7, 6
 """Steps of Newton's method before those that have found their phases are left out, and how often."""
 
-_SPEEDS, _CHUNK = 64, 256
-"""So many speeds a program takes with all sets of phases, and so many speeds each with its own."""
+_SPEEDS, _CHUNK = 400, 2048
+"""So many load speeds a program takes, and so many sets of phases."""
 
-_HALVINGS = 6
-"""Of the stretch between two load speeds that a jam lies in, before Newton's method takes over."""
+_PARTS, _CUTS = 8, 2
+"""Into so many parts the stretch between two load speeds that a jam lies in is cut, and how often, before Newton's method takes
+over."""
 
 
 def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -32,71 +35,99 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     regular ones at each of many load speeds.
 
     Where a pattern, followed to the next load speed up or down, passes the multiple 1 there is a jam between the two, which is
-    narrowed down by halving. Points whose own multiple is near 1 are starts too, and so are the mirror images of all: of two
+    narrowed down. Points whose own multiple is near 1 are starts too, and so are the mirror images of all: of two
     patterns that nearly are each other's image, one is often hidden by steeper slopes.
     """
     speeds, phases = load_speeds(parts), np.concatenate([phases, _regular(parts)])
-    first = in_chunks(_SPEEDS, lambda w: _first_steps(parts, w, jnp.asarray(phases)), speeds)
+    at_speeds = _at_speeds(parts, speeds)
     row = np.repeat(np.arange(speeds.size), len(phases))
-    factor, angles, good = _gone_on(parts, speeds[row], *(x.reshape(-1, *x.shape[2:]) for x in first))
+    factor, angles, good = _settled(parts, at_speeds, row, np.tile(phases, (speeds.size, 1)))
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
-    digits = [1e4 * size[:, None], 1e3 * np.cos(angles), 1e3 * np.sin(angles)]
-    kinds = np.concatenate([row[:, None], *(np.round(d).astype(int) for d in digits)], axis=1)
+    digits = [1e4 * size[:, None], 1e3 * np.cos(angles[:, 1:]), 1e3 * np.sin(angles[:, 1:])]
+    kinds = np.concatenate([row[:, None], np.rint(np.concatenate(digits, axis=1)).astype(int)], axis=1)
     # Of each row one number is compared, which is much faster: the odds that any two of 1e5 rows share theirs are 3e-10.
     mixed = kinds @ np.random.default_rng(0).integers(2**63, size=kinds.shape[1])
     once = np.sort(np.unique(mixed, return_index=True)[1])
     row, size, angles = row[once], size[once], angles[once]
     near = np.abs(size) < np.log(3.0)
-    omega, turned_to = [speeds[row[near]]], [angles[near]]
-    for side in (-1, 1):
-        beside = speeds[np.clip(row + side, 0, speeds.size - 1)]
-        there, _, found = _follow(parts, beside, angles)
-        low, high, held = (x[found & (size * there < 0.0)] for x in (speeds[row], beside, np.arange(row.size)))
-        at, sign = angles[held], np.sign(size[held])
-        for _ in range(_HALVINGS):
-            middle = (low + high) / 2.0
-            there, turned, found = _follow(parts, middle, at)
-            same = found & (there * sign > 0.0)
-            low, high, at = np.where(same, middle, low), np.where(same, high, middle), np.where(same[:, None], turned, at)
-        omega.append(low)
-        turned_to.append(at)
-    every = np.concatenate(turned_to)
-    return np.tile(np.concatenate(omega), 2), np.concatenate([every, -every])
+
+    held = np.tile(np.arange(row.size), 2)
+    beside = np.clip(np.concatenate([row - 1, row + 1]), 0, speeds.size - 1)
+    there, _, found = _followed(parts, at_speeds, beside, angles[held])
+    passed = found & (size[held] * there < 0.0)
+    low, high, held = speeds[row[held[passed]]], speeds[beside[passed]], held[passed]
+    at, sign = angles[held], np.sign(size[held])
+    for _ in range(_CUTS if held.size else 0):
+        # At all places between at once: for few jams that takes no longer than at one of them.
+        share = np.arange(1, _PARTS) / _PARTS
+        between = low[:, None] + share * (high - low)[:, None]
+        each = _at_speeds(parts, between.ravel())
+        there, turned, found = _followed(parts, each, np.arange(between.size), np.repeat(at, _PARTS - 1, axis=0))
+        same = (found & (there * np.repeat(sign, _PARTS - 1) > 0.0)).reshape(between.shape)
+        cut = np.sum(np.logical_and.accumulate(same, axis=1), axis=1)
+        lane, ends = np.arange(held.size), np.concatenate([low[:, None], between, high[:, None]], axis=1)
+        turned = np.concatenate([at[:, None], turned.reshape(*between.shape, -1)], axis=1)
+        low, high, at = ends[lane, cut], ends[lane, cut + 1], turned[lane, cut]
+    every = np.concatenate([angles[near], at])
+    return np.tile(np.concatenate([speeds[row[near]], low]), 2), np.concatenate([every, -every])
 
 
-def _follow(parts: Parts, omega: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Phases at each of some load speeds (n,) near its own (n, count), with the logarithm of the drag's multiple."""
-    if omega.size == 0:
-        return omega, phase, omega > 0.0
-    found = in_chunks(_CHUNK, lambda w, a: _few_steps(parts, w, a), omega, phase)
-    factor, angles, good = _gone_on(parts, omega, *found)
+class AtSpeed(eqx.Module):
+    """What phases are looked for with at a load speed `omega`, rad/s: the `influence` (count, count) of `influence_of`, and
+    `most`, the multiple of the drag that a load could need at most. One, or a leading axis over many."""
+
+    omega: Array
+    influence: Array
+    most: Array
+
+
+def at_speed(parts: Parts, omega: Array) -> AtSpeed:
+    """See `AtSpeed`."""
+    influence = influence_of(parts, omega)[0]
+    torque = jnp.sum(magnitude(influence) * parts.unbalance[:, None] * parts.unbalance[None, :]) * omega**4
+    return AtSpeed(omega, influence, torque / (jnp.min(parts.drag) * jnp.abs(parts.speed - omega)))
+
+
+@cached
+def _at_each(parts: Parts, omega: Array) -> AtSpeed:
+    return jax.vmap(at_speed, in_axes=(None, 0))(parts, omega)
+
+
+def _at_speeds(parts: Parts, omega: np.ndarray) -> AtSpeed:
+    """At load speeds (n,), filled up to whole chunks: another number of them needs no other program."""
+    filled = omega[np.minimum(np.arange(-(-omega.size // _SPEEDS) * _SPEEDS), omega.size - 1)]
+    return jax.tree.map(jnp.asarray, in_chunks(_SPEEDS, lambda w: _at_each(parts, w), filled))
+
+
+def _followed(parts: Parts, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
+    """`_settled`, with the logarithm of the drag's multiple."""
+    factor, angles, good = _settled(parts, at, row, phase)
     return np.log(np.where(good, factor, 1.0)), angles, good
 
 
-def _gone_on(
-    parts: Parts, omega: np.ndarray, factor: np.ndarray, phase: np.ndarray, residual: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What Newton's method comes to from where its first steps left it, and whether that is a jam's: those that are not at
-    their phases yet go on, ever fewer."""
-    factor, phase, residual = (np.array(x) for x in (factor, phase, residual))
-    eps = np.finfo(residual.dtype).eps
-    for _ in range(_ROUNDS - 1):
+def _settled(parts: Parts, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The drag's multiple (n,) and the phases that Newton's method comes to from phases (n, count), each at the load
+    speed that `row` (n,) says, and whether these are a jam's. Those that are not at their phases after some steps go
+    on, ever fewer."""
+    factor, phase, residual = np.zeros(row.size), np.array(phase), np.full(row.size, np.inf)
+    eps, left = float(np.finfo(phase.dtype).eps), np.arange(row.size)
+    for _ in range(_ROUNDS):
+        found = in_chunks(_CHUNK, _few_steps, row[left], phase[left], shared=(parts, at))
+        factor[left], phase[left], residual[left] = found
         # Three quarters of the digits are asked for, since near a double solution a half leaves phases that are far from
         # either; where phases that satisfy the balance lie on a curve, half of the digits is what there is.
-        left = np.flatnonzero(~(residual < eps**0.75))
+        left = left[~(residual[left] < eps**0.75)]
         if left.size == 0:
             break
-        again = in_chunks(_CHUNK, lambda w, a: _few_steps(parts, w, a), omega[left], phase[left])
-        for whole, part in zip((factor, phase, residual), again, strict=True):
-            whole[left] = part
     return factor, phase, (residual < eps**0.5) & (factor > 0.0)
 
 
 @cached
-def _few_steps(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
-    return jax.vmap(lambda w, start: phases_near(parts, influence_of(parts, w)[0], w, start, _FEW))(omega, phase)
+def _few_steps(row: Array, phase: Array, parts: Parts, at: AtSpeed) -> tuple[Array, Array, Array]:
+    each = jax.tree.map(lambda values: values[row], at)
+    return jax.vmap(lambda one, start: phases_near(parts, one, start, _FEW))(each, phase)
 
 
 def load_speeds(parts: Parts) -> np.ndarray:
@@ -121,32 +152,20 @@ def _regular(parts: Parts) -> np.ndarray:
     return np.array([[np.pi * ((k >> j) & 1) if j < min(n - 1, 5) else 0.0 for j in range(n)] for k in splits])
 
 
-@cached
-def _first_steps(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array, Array]:
-    influences = jax.vmap(lambda w: influence_of(parts, w)[0])(omega)
-    return jax.vmap(lambda w, a: jax.vmap(lambda start: phases_near(parts, a, w, start, _FEW))(phase))(omega, influences)
-
-
-def phases_near(
-    parts: Parts, influence: Array, omega: Array, start: Array, steps: int = _FEW * _ROUNDS
-) -> tuple[Array, Array, Array]:
+def phases_near(parts: Parts, at: AtSpeed, start: Array, steps: int = _FEW * _ROUNDS) -> tuple[Array, Array, Array]:
     """The multiple of the drag and the phases (count,) of a jam at a given load speed, to which so many steps of Newton's
     method lead from `start` (count,); how far the loads' multiples still differ, relative. A jam's multiple is positive.
 
     All loads must need the same multiple, - T_j / (b_j R_j^2 (n - w)): it is explicit, and the phases are all that is sought.
     """
 
-    def needs(x: Array) -> Array:
+    def differ(x: Array, given: tuple[Parts, AtSpeed]) -> tuple[Array, Array]:
+        parts, at = given
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x])
-        return -torques_at(parts, influence, omega, angles) / (parts.drag * (parts.speed - omega))
+        torque = torques_at(parts, at.influence, at.omega, jax.lax.complex(jnp.cos(angles), jnp.sin(angles)))
+        each = -torque / (parts.drag * (parts.speed - at.omega) * at.most)
+        return each[1:] - each[:-1], each
 
-    scale = jnp.sum(jnp.abs(influence) * parts.unbalance[:, None] * parts.unbalance[None, :]) * omega**4 / jnp.min(parts.drag)
-    scale = scale / jnp.abs(parts.speed - omega)
-
-    def differ(x: Array) -> Array:
-        each = needs(x) / scale
-        return each[1:] - each[:-1]
-
-    x = damped_newton(differ, start[1:] - start[0], steps) if start.shape[0] > 1 else start[1:]
-    each = needs(x)
-    return each[0], jnp.concatenate([jnp.zeros(1, x.dtype), x]), jnp.max(jnp.abs(each - each[0])) / scale
+    x = start[1:] - start[0]
+    x, each = damped_newton(differ, x, (parts, at), steps) if x.size else (x, differ(x, (parts, at))[1])
+    return each[0] * at.most, jnp.concatenate([jnp.zeros(1, x.dtype), x]), jnp.max(jnp.abs(each - each[0]))

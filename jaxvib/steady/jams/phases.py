@@ -17,8 +17,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import damped_newton, eliminate, magnitude, times
-from jaxvib.ode.sincos import sine_and_cosine
+from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, times
+from jaxvib.numerics.newton import damped_newton
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
@@ -146,14 +146,12 @@ def parts_of(scene: Scene) -> Parts:
 def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
     """A_jk (count, count) complex and D^-1 P^T (nd, count): what load k does to load j, and to the carrier, per throw."""
     dynamic = parts.model.dynamic_stiffness(omega, parts.speed)
-    answer = eliminate(dynamic, parts.direction.T.astype(dynamic.dtype))
+    answer = small_solve(dynamic, parts.direction.T.astype(dynamic.dtype))
     return parts.direction.conj() @ answer, answer
 
 
-def torques_at(parts: Parts, influence: Array, omega: Array, phase: Array) -> Array:
-    """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count)."""
-    sine, cosine = sine_and_cosine(phase)
-    turn = jax.lax.complex(cosine, sine)
+def torques_at(parts: Parts, influence: Array, omega: Array, turn: Array) -> Array:
+    """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count) and exp(i a) (count,)."""
     return mean_torque(parts.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, parts.unbalance * turn))
 
 
@@ -182,7 +180,7 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 @cached
 def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
     parts = parts_of(scene)
-    return torques_at(parts, influence_of(parts, omega)[0], omega, phase)
+    return torques_at(parts, influence_of(parts, omega)[0], omega, jnp.exp(1j * phase))
 
 
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
@@ -224,20 +222,22 @@ def loads_with_drag(scene: Scene) -> CircularLoads:
     return loads
 
 
-def balanced(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
-    """Speed and phases (count,) of the balance that Newton's method finds, differentiable in the parts."""
+def balanced(parts: Parts, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
+    """Speed and phases (count,) of the balance that Newton's method finds, differentiable in the parts; `on_numbers` pays from
+    many starts, see `damped_newton`, and takes longer to compile."""
 
-    def balance(x: Array, given: Parts) -> Array:
+    def balance(x: Array, given: Parts) -> tuple[Array, None]:
         w = x[0] * jax.lax.stop_gradient(given.speed)
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x[1:]])
-        torque = torques_at(given, influence_of(given, w)[0], w, angles)
-        return ((given.speed - w) + torque / given.drag) / given.speed
+        turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
+        torque = torques_at(given, influence_of(given, w)[0], w, turn)
+        return ((given.speed - w) + torque / given.drag) / given.speed, None
 
     frozen = jax.lax.stop_gradient(parts)
     start = jnp.concatenate([jnp.reshape(omega / parts.speed, (1,)), phase[1:] - phase[0]])
-    x = damped_newton(lambda y: balance(y, frozen), jax.lax.stop_gradient(start))
+    x, _ = damped_newton(balance, jax.lax.stop_gradient(start), frozen, on_numbers=on_numbers)
     # One more step, whose derivative with respect to the scene is the implicit function theorem's.
-    x = x - eliminate(jax.jacfwd(balance)(x, frozen), balance(x, parts))
+    x = x - eliminate(jax.jacfwd(balance, has_aux=True)(x, frozen)[0], balance(x, parts)[0])
     return x[0] * frozen.speed, jnp.concatenate([jnp.zeros(1, x.dtype), jnp.arctan2(jnp.sin(x[1:]), jnp.cos(x[1:]))])
 
 
@@ -248,12 +248,11 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     frozen = jax.lax.stop_gradient(parts)
     w, angles = balanced(parts, omega, phase)
     influence, answer = influence_of(parts, w)
-    torque = torques_at(parts, influence, w, angles)
-    z = w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles))
+    turn = jnp.exp(1j * angles)
+    torque = torques_at(parts, influence, w, turn)
+    z = w**2 * answer @ (parts.unbalance * turn)
     force = parts.model.carrier.bed_force(z, 1j * w * z)
     residual = jnp.max(jnp.abs(parts.drag * (parts.speed - w) + torque)) / jnp.max(parts.drag * parts.speed)
-    growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((w, angles, z)))
-
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
     slip = (frozen.speed - w) / frozen.speed
     good = (residual < tiny) & (w > 0.0) & (slip > -tiny)
@@ -264,6 +263,8 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
     there = good & bounded
+    # Of what is no jam, which has no growth, no eigenvalues are computed: they take as long as all else.
+    growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z)))
 
     def kept(value: Array) -> Array:
         return jnp.where(there, value, jnp.nan)

@@ -1,0 +1,107 @@
+"""Zeros of a few equations by Newton's method, from one start or from many together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
+
+from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, fenced, scalarized_program, scalars_of
+from jaxvib.runtime.compat import jaxpr_as_fun
+
+__all__ = ["damped_newton"]
+
+Given = TypeVar("Given", bound=PyTree[Array])
+Beside = TypeVar("Beside", bound=PyTree[Array])
+_State: TypeAlias = tuple[Array, Beside, Array, Array, Array, Array]
+"""The best unknowns so far, what was found beside, what is left of the equations there, the sum of its squares, the slopes, and
+the damping."""
+
+
+def damped_newton(
+    balance: Callable[[Array, Given], tuple[Array, Beside]],
+    start: Array,
+    given: Given,
+    iterations: int = 40,
+    *,
+    on_numbers: bool = True,
+) -> tuple[Array, Beside]:
+    """A zero of `balance`, by steps that are damped where they do not help (Levenberg, Marquardt), from `start`.
+
+    **Arguments**: `balance(x, given)` what is left of the equations, about 1 far from a zero or less (the steps end where
+    rounding is all that they can still change), and what else is wanted there; `iterations` how many steps at most;
+    `on_numbers` whether all of it may be written on single numbers, see `scalarize`: from many starts that takes a third of
+    the time.
+
+    **Returns** the zero, and what `balance` finds beside.
+
+    >>> x, two_x = damped_newton(lambda x, a: (x**2 - a, 2.0 * x), jnp.ones(1), jnp.full(1, 2.0))
+    >>> round(float(x[0]), 5), round(float(two_x[0]), 5)
+    (1.41421, 2.82843)
+    """
+    tiny = float(jnp.finfo(start.dtype).eps) ** 1.5
+
+    def step(state: _State, given: Given) -> _State:
+        x, beside, value, size, slopes, damping = state
+        normal = slopes.T @ slopes
+        damped = normal + damping * one * (normal + jnp.finfo(x.dtype).tiny)
+        trial = x - jnp.clip(_solve_definite(damped, slopes.T @ value), -0.5, 0.5)
+
+        def along(way: ArrayLike) -> tuple[Array, Array, Beside]:
+            return jax.jvp(lambda y: balance(y, given), (trial,), (way,), has_aux=True)
+
+        new, by, found = jax.vmap(along, out_axes=(None, 1, None))(one)
+        left = jnp.sum(new**2)
+        better = left < size  # and not NaN
+        # A damping without bound says that this is the end.
+        more = jnp.where(size < tiny, jnp.inf, jnp.minimum(8.0 * damping, 1e8))
+        then = trial, found, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, (x, beside, value, size, slopes, more))
+
+    one = np.eye(start.shape[0], dtype=start.dtype)
+    nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, given)[1])
+    # The first step goes nowhere: it looks at the start, which is better than nothing.
+    inf, tenth = jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0.1, start.dtype)
+    begin = start, nothing, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
+    leaves, structure = jax.tree.flatten(begin)
+    small = on_numbers and sum(leaf.size for leaf in leaves) <= MAX_SCALARS
+    program = scalarized_program(step, begin, given) if small else None
+    if program is None:
+        return jax.tree.unflatten(structure, _repeated(_on_arrays(step, begin, given), leaves, iterations))[:2]
+    known = scalars_of(given)
+    numbers = iter(_repeated(lambda *now: fenced(program, [*now, *known]), scalars_of(begin), iterations))
+    arrays = [jnp.stack([next(numbers) for _ in range(leaf.size)]).reshape(leaf.shape) for leaf in leaves]
+    return jax.tree.unflatten(structure, arrays)[:2]
+
+
+def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Given) -> Callable[..., Sequence[Array]]:
+    """A step of the arrays of a state, with the sines and cosines of programs on single numbers where JAX allows."""
+    program, structure, known = arrays_program(step, begin, given), jax.tree.structure(begin), jax.tree.leaves(given)
+    if program is None:
+        return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), given))
+    return lambda *now: jaxpr_as_fun(program)(*now, *known)
+
+
+def _repeated(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
+    """The state after so many steps and the first look, or fewer where its last number, the damping, is without bound."""
+
+    def going(now: tuple[Array, list[Array]]) -> Array:
+        return (now[0] <= times) & (now[1][-1] < jnp.inf)
+
+    return jax.lax.while_loop(going, lambda now: (now[0] + 1, list(step(*now[1]))), (jnp.asarray(0), list(begin)))[1]
+
+
+def _solve_definite(a: Array, b: Array) -> Array:
+    """x of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no branches."""
+    rows = jnp.concatenate([a, b[:, None]], axis=1)
+    for k in range(b.shape[0]):
+        line = rows[k, 1:] / rows[k, 0]
+        above, below = (part[:, 1:] - part[:, :1] * line[None] for part in (rows[:k], rows[k + 1 :]))
+        rows = jnp.concatenate([above, line[None], below])
+    return rows[:, 0]

@@ -1,0 +1,63 @@
+"""Newton's method with damped steps, on single numbers and on arrays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvib.numerics.newton import _solve_definite, damped_newton
+
+
+def circle_and_line(x, radius):
+    """Where a circle meets a line through its centre, and the angle there."""
+    return jnp.stack([jnp.sum(x**2) - radius**2, x[1] - 2.0 * x[0]]), jnp.arctan2(x[1], x[0])
+
+
+@pytest.mark.parametrize("on_numbers", [True, False])
+def test_a_zero_is_found_with_what_is_wanted_beside(on_numbers):
+    x, angle = damped_newton(circle_and_line, jnp.array([0.3, 0.1]), jnp.asarray(0.7), on_numbers=on_numbers)
+    np.testing.assert_allclose(x, 0.7 * np.array([1.0, 2.0]) / np.sqrt(5.0), rtol=1e-14)
+    np.testing.assert_allclose(angle, np.arctan(2.0), rtol=1e-14)
+
+
+@pytest.mark.parametrize("on_numbers", [True, False])
+def test_many_starts_come_to_what_each_comes_to_alone(on_numbers):
+    starts = jax.random.uniform(jax.random.key(0), (40, 2), minval=-1.0)
+
+    def one(start):
+        return damped_newton(circle_and_line, start, jnp.asarray(0.7), 12, on_numbers=on_numbers)[0]
+
+    together = jax.vmap(one)(starts)
+    np.testing.assert_allclose(together, [one(start) for start in starts], rtol=0.0, atol=1e-12)
+    assert {tuple(np.sign(x)) for x in np.asarray(together)} == {(1.0, 1.0), (-1.0, -1.0)}
+
+
+def test_without_a_zero_the_best_point_is_kept():
+    x, _ = damped_newton(lambda x, _: (x**2 + 0.25, None), jnp.array([0.5]), None)
+    np.testing.assert_allclose(x, [0.0], atol=1e-4)
+
+
+def test_no_step_is_the_start_and_what_is_there():
+    x, angle = damped_newton(circle_and_line, jnp.array([0.3, 0.3]), jnp.asarray(0.7), 0)
+    np.testing.assert_allclose(x, [0.3, 0.3])
+    np.testing.assert_allclose(angle, np.pi / 4.0)
+
+
+def test_more_unknowns_than_numbers_are_written_for_stay_on_arrays():
+    a = jnp.diag(jnp.arange(1.0, 9.0)) / 8.0 + 0.01
+    x, _ = damped_newton(lambda x, a: (a @ x - jnp.sin(x) - 0.05, None), jnp.zeros(8), a + jnp.eye(8))
+    np.testing.assert_allclose((a + jnp.eye(8)) @ x - jnp.sin(x), jnp.full(8, 0.05), rtol=1e-13)
+    loop = next(
+        e
+        for e in jax.make_jaxpr(lambda s: damped_newton(lambda x, _: (x, None), s, None)[0])(a[0]).jaxpr.eqns
+        if e.primitive.name == "while"
+    )
+    assert any(v.aval.shape for v in loop.outvars)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_definite_equations_are_solved(n):
+    rng = np.random.default_rng(n)
+    root, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    a = root.T @ root + 0.1 * np.eye(n)
+    np.testing.assert_allclose(_solve_definite(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12)
