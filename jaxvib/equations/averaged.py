@@ -49,7 +49,7 @@ from jaxvib.equations.linear import LinearModel, linear_model, require_effects, 
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import magnitude, small_solve, times, written_inverse
+from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, written_inverse
 
 __all__ = [
     "Amplitudes",
@@ -238,7 +238,7 @@ def averaged_growth(field: Averaged, omega: Array, phase: Array, displacement: A
     matrix = jax.jacfwd(flow)(jnp.concatenate([y.real, y.imag, jnp.full_like(phase, omega), phase]))
     # Eigenvalues of a matrix that is not finite keep a library busy for ever.
     finite = jnp.all(jnp.isfinite(matrix))
-    values = jnp.linalg.eigvals(jnp.where(finite, matrix, 0.0))
+    values = eigenvalues_in_turn(jnp.where(finite, matrix, 0.0))
     common = jnp.argmin(jnp.abs(values))
     growth = jnp.max(jnp.where(jnp.arange(values.shape[0]) == common, -jnp.inf, values.real))
     return jnp.where(finite, growth, jnp.nan)

@@ -13,6 +13,7 @@ from jax import Array
 from jaxvib.runtime.compat import custom_vmap
 
 __all__ = [
+    "eigenvalues_in_turn",
     "eliminate",
     "hermitian_modes",
     "magnitude",
@@ -238,6 +239,18 @@ def _solved_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tup
 
     right = b if is_mapped[1] else jnp.broadcast_to(b, (size, *b.shape))
     return jax.lax.platform_dependent(a, right, cpu=each, default=jax.vmap(jnp.linalg.solve)), True
+
+
+@custom_vmap
+def eigenvalues_in_turn(matrix: Array) -> Array:
+    """Of a matrix (n, n), (n,) complex; values alone. The library is called for one of a batch after the other, see
+    `solve_in_turn`."""
+    return jnp.linalg.eigvals(matrix)
+
+
+@eigenvalues_in_turn.def_vmap
+def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[Array, bool]:
+    return jax.lax.map(eigenvalues_in_turn, matrix), True
 
 
 def eliminate(a: Array, b: Array) -> Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.linalg import small_solve
+from jaxvib.numerics.linalg import eigenvalues_in_turn, small_solve
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 17])
@@ -46,3 +46,12 @@ def test_types_may_be_mixed(n):
     a = jnp.asarray(np.random.default_rng(n).normal(size=(n, n)) + 1j * np.eye(n))
     x = small_solve(a, jnp.arange(1.0 * n))
     np.testing.assert_allclose(a @ x, np.arange(n), atol=1e-12)
+
+
+def test_eigenvalues_of_a_batch_of_batches_call_the_library_for_one_matrix():
+    matrices = jax.random.normal(jax.random.key(0), (3, 4, 5, 5))
+    many = jax.jit(jax.vmap(jax.vmap(eigenvalues_in_turn)))
+    for found, matrix in zip(many(matrices).reshape(-1, 5), matrices.reshape(-1, 5, 5), strict=True):
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(np.linalg.eigvals(matrix)), rtol=1e-9)
+    assert re.search(r"geev[^\n]*tensor<5x5x", text := many.lower(matrices).as_text()), text
+    assert not re.search(r"geev[^\n]*tensor<(\d+x)+5x5x", text)
