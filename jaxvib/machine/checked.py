@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import weakref
+from collections.abc import Hashable
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuilt
 from jaxvib.machine.scene import Scene, require_comparable
+from jaxvib.runtime.compat import evaluating
 from jaxvib.units import traced
 
 __all__ = ["checked"]
@@ -42,13 +46,35 @@ def checked(scene: Scene) -> Scene:
     if any(new is not old for new, (_, old) in zip(arrays, leaves, strict=True)):
         scene = jax.tree.unflatten(structure, arrays)
     if not any(traced(leaf) for leaf in arrays):
-        for section in ("machine", "loads", "drive"):
-            rebuilt(getattr(scene, section), section)
-        for effect in scene.effects:
-            rebuilt(effect, f"effects.{effect.kind}")
-        require_comparable(scene.machine, scene.loads, scene.drive)
+        numbers = structure, *((leaf.shape, leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, arrays))
+        with evaluating():  # a derivative around this has no part in it, and would make it slower
+            try:
+                hash(structure)
+            except TypeError:
+                _require_good.__wrapped__(_Asked(numbers, scene))
+            else:
+                _require_good(_Asked(numbers, scene))
         _FOUND_GOOD[id(scene)] = scene
     return scene
+
+
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """A scene, known by all its numbers: under a derivative a question makes the same one again and again."""
+
+    numbers: Hashable
+    scene: Scene = dataclasses.field(compare=False)
+
+
+@functools.lru_cache(256)
+def _require_good(asked: _Asked) -> None:
+    """**Raises** `InputError` for a number that is not allowed where it stands."""
+    scene = asked.scene
+    for section in ("machine", "loads", "drive"):
+        rebuilt(getattr(scene, section), section)
+    for effect in scene.effects:
+        rebuilt(effect, f"effects.{effect.kind}")
+    require_comparable(scene.machine, scene.loads, scene.drive)
 
 
 def _number(name: str, leaf: object) -> Array:

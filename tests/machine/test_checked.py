@@ -9,6 +9,7 @@ from plugin_effect import SealFriction
 from scenes import BALLS, machines, scene
 
 import jaxvib as jv
+from jaxvib.machine import checked as module
 from jaxvib.machine.checked import checked
 
 
@@ -107,3 +108,15 @@ def test_arrays_that_no_memory_holds_are_refused():
     ):
         with pytest.raises(jv.InputError, match=says):
             ask()
+
+
+def test_the_same_numbers_are_looked_at_once(monkeypatch):
+    looked = []
+    monkeypatch.setattr(module, "rebuilt", lambda part, section: looked.append(section))
+    module._require_good.cache_clear()
+
+    for _ in range(3):
+        checked(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 90.0])))
+    assert looked == ["machine", "loads", "drive"]
+    checked(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 80.0])))
+    assert len(looked) == 6
