@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -33,20 +33,34 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def cached(function: Callable[P, T]) -> CachedFunction[P, T]:
+@overload
+def cached(function: Callable[P, T]) -> CachedFunction[P, T]: ...
+
+
+@overload
+def cached(*, reversed_anew: bool) -> Callable[[Callable[P, T]], CachedFunction[P, T]]: ...
+
+
+def cached(function: Callable[P, T] | None = None, *, reversed_anew: bool = False) -> Any:
     """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `StoredFunction`.
 
     Derivatives by `jax.jvp`, `grad`, `jacfwd`, `jacrev` and batches by `vmap` have programs of their own, cached alike. Where
     these are derivatives of derivatives, or `jit` is around them, it is just the compiled function that JAX transforms.
+
+    **Arguments**: `reversed_anew`: the reverse derivative computes the function once more, as far as results are asked for,
+    in place of noting what it needs of all of them. It pays where the function has many results, of which few are
+    differentiated, and is quickly computed.
     """
-    return CachedFunction(function)
+    return (
+        CachedFunction(function, reversed_anew) if function else functools.partial(CachedFunction, reversed_anew=reversed_anew)
+    )
 
 
 class CachedFunction(Generic[P, T]):
-    """What `cached` returns: the function, whose programs and those of its derivatives are `stored`."""
+    """What `cached` returns: the function, whose programs and those of its derivatives are `stored`; and its argument."""
 
-    def __init__(self, function: Callable[P, T]):
-        self.stored = StoredFunction(function)
+    def __init__(self, function: Callable[P, T], reversed_anew: bool = False):
+        self.stored, self.reversed_anew = StoredFunction(function), reversed_anew
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -159,6 +173,19 @@ def _pulled(
     return pulled_back(pullback.filled(notes), cotangents)
 
 
+@cached
+def _pulled_anew(
+    question: _Question, active: tuple[bool, ...], asked: tuple[bool, ...], arrays: list[Array], slopes: list[Array]
+) -> list[Array]:
+    """`_pulled` of a function that is `reversed_anew`."""
+    function, moving = _moving(question, active, arrays)
+
+    def wanted(*moving: Array) -> list[Array]:
+        return [x for is_asked, x in zip(asked, function(*moving)[0], strict=True) if is_asked]
+
+    return list(jax.vjp(wanted, *moving)[1](slopes))
+
+
 def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
     """The result's arrays and the reverse derivative, whose form is noted for `_traced_pullback`."""
     function, moving = _moving(question, active, arrays)
@@ -226,7 +253,11 @@ def _differentiated(arrays: Sequence[Array], tangents: Sequence[Any], *, questio
     if all(not traced(tangent) or _is_simple(tangent) for tangent in moving):
         result, slopes = _pushed(question, active, list(arrays), moving)
     else:  # tangents that nobody knows: the derivative is to be transposed
-        result, notes = _noted(question, active, list(arrays))
+        if question.function.reversed_anew:
+            args, kwargs = question.arguments.filled(arrays)
+            result, notes = question.function(*args, **kwargs), []
+        else:
+            result, notes = _noted(question, active, list(arrays))
         types = tuple(jax.typeof(x) for x in jax.tree.leaves(result) if eqx.is_array(x) and _has_slope(x))
         slopes = _slopes(*moving, at=_Known(question, active, list(arrays), notes, types))
     found, given = question.split(result), iter(slopes)
@@ -270,6 +301,8 @@ def _slopes_in_batch(tangents: Sequence[Array], axes: Sequence[Any], *, at: _Kno
 def _transposed(slopes: Sequence[Any], *_: Any, at: _Known) -> list[Array]:
     asked = tuple(not is_zero(slope) for slope in slopes)
     wanted = [slope for is_asked, slope in zip(asked, slopes, strict=True) if is_asked]
+    if at.question.function.reversed_anew:
+        return _pulled_anew(at.question, at.active, asked, at.arrays, wanted)
     return _pulled(at.question, at.active, asked, _types(at.arrays), at.notes, wanted)
 
 

@@ -33,11 +33,11 @@ def plain(x, shift=SHIFT):
     return wave(x, shift, "plain")
 
 
-@pytest.fixture
-def asked(tmp_path, monkeypatch):
+@pytest.fixture(params=[False, True], ids=["noted", "anew"])
+def asked(tmp_path, monkeypatch, request):
     """A function that asks as another process would: no program is held in memory, those on disk are."""
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
-    monkeypatch.setitem(globals(), "wave", programs.cached(wave))
+    monkeypatch.setitem(globals(), "wave", programs.cached(reversed_anew=request.param)(wave))
     cache.keep_programs(tmp_path)
 
     def forgetful(x, shift=SHIFT):
@@ -46,7 +46,8 @@ def asked(tmp_path, monkeypatch):
     def forget():
         traces.clear()
         programs._pullbacks.clear()
-        for function in (globals()["wave"], programs._pushed, programs._noted, programs._pulled, programs._mapped):
+        kinds = (programs._pushed, programs._noted, programs._pulled, programs._pulled_anew, programs._mapped)
+        for function in (globals()["wave"], *kinds):
             function.stored.ready.clear()
 
     forget()
@@ -153,6 +154,7 @@ def test_a_reverse_derivative_that_was_not_asked_for_before(asked):
     np.testing.assert_allclose(found, np.sin(X) + X * np.cos(X), rtol=1e-14)
 
 
+@pytest.mark.parametrize("asked", [False], indirect=True)
 def test_forms_of_reverse_derivatives_do_not_pile_up(asked, monkeypatch):
     function, _ = asked
     monkeypatch.setattr(programs, "_MOST", 2)
@@ -213,3 +215,14 @@ def test_what_lies_beneath_a_tracer_is_found(tracer):
     assert seen[0] is not None and not compat.traced(seen[0]) and float(jnp.ravel(seen[0])[0]) == float(SHIFT)
     jax.jit(lambda x: seen.append(compat.beneath(x)))(SHIFT)
     assert seen[1] is None
+
+
+@pytest.mark.parametrize("asked", [True], indirect=True)
+def test_what_is_reversed_anew_notes_nothing(asked):
+    function, _ = asked
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("_noted", "_pulled"):
+            patch.setattr(programs, name, None)
+        found = ROUTES["of two"](function)
+    for ours, theirs in zip(found, ROUTES["of two"](plain), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)

@@ -98,8 +98,8 @@ def jam_orbit(
         raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
     scene = checked(scene)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, omega, near)))
-    # What is known has no gradient to stop, and stays the scene that was checked.
-    frozen = scene if concrete else jax.lax.stop_gradient(scene)
+    # What is known has no gradient to stop: a scene that was checked stays itself, and numbers need no operation.
+    frozen = scene if concrete else jax.tree.map(lambda x: jax.lax.stop_gradient(x) if traced(x) else x, scene)
     floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     if accuracy is None:
         accuracy = 1e-9 if floor < 1e-9 else 1e-3
@@ -182,7 +182,7 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
     return fold_points(jammed_model(scene), _SEARCH)
 
 
-@cached
+@cached(reversed_anew=True)
 def _orbit(
     scene: Scene,
     value: Array,
