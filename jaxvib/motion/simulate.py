@@ -19,6 +19,7 @@ from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
@@ -26,6 +27,7 @@ from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -210,22 +212,34 @@ def _shrink(fine: StepControl, coarse: StepControl) -> Array:
 
 def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: list[Run]) -> Run:
     """The finer run with its estimated error, and what it and the runs `before` it cost."""
-    # A run that is compared with itself, or with one that failed, has an error that nobody knows.
-    known = coarse.status == RunStatus.done
-    if control.steps is not None:
-        known = known & (control.steps != coarser.steps)
-    ours, theirs = fine.window.state, coarse.window.state
-    theirs = turned(theirs, ours) if wrap_angles(scene, fine.error.dtype)[0] else theirs
-    difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
-    error = estimated_error(difference, _shrink(control, coarser), scene, fine.steps, _radians(scene, fine))
-    error = jnp.where(known & jnp.isfinite(error), error, jnp.inf)
+    fastest, _ = fastest_and_slowest(scene)
+    error = _error(scene, fastest, fine.window, fine.steps, coarse.window.state, coarse.status, control, coarser)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
     return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
 
 
-def _radians(scene: Scene, run: Run) -> Array:
-    """What moves fastest turns by so much in a run."""
-    return fastest_and_slowest(scene)[0] * run.window.time[-1]
+@cached
+def _error(
+    scene: Scene,
+    fastest: Array,
+    window: Trajectory,
+    steps: Array,
+    theirs: State,
+    status: RunStatus,
+    control: StepControl,
+    coarser: StepControl,
+) -> Array:
+    """The estimated error of a run, from its window and the states and the status of a coarser one; `fastest` see
+    `fastest_and_slowest`."""
+    # A run that is compared with itself, or with one that failed, has an error that nobody knows.
+    known = status == RunStatus.done
+    if control.steps is not None:
+        known = known & (control.steps != coarser.steps)
+    ours = window.state
+    theirs = turned(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
+    difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
+    error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
+    return jnp.where(known & jnp.isfinite(error), error, jnp.inf)
 
 
 def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
@@ -242,10 +256,8 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
         if float(found.error) <= accuracy:
             return found
         # Smaller steps only add to what rounding alone makes of the error.
-        if (
-            tolerance <= floor
-            or float(estimated_error(jnp.zeros(()), 0.0, scene, latest.steps, _radians(scene, latest))) > accuracy
-        ):
+        radians = fastest_and_slowest(scene)[0] * latest.window.time[-1]
+        if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, scene, latest.steps, radians)) > accuracy:
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2

@@ -9,9 +9,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.numerics.newton import damped_newton
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at
 
 __all__ = ["LOAD_SPEEDS", "AtSpeed", "at_speed", "load_speeds", "phases_near", "starts_of"]

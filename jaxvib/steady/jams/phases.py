@@ -18,11 +18,11 @@ from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, times
-from jaxvib.numerics.newton import damped_newton
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.units import traced
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.newton import _solve_definite, damped_newton
+from jaxvib.steady.jams.newton import _solve_definite, damped_newton
 
 
 def circle_and_line(x, radius):
