@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -14,7 +15,7 @@ from jax import Array
 from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import measure, trajectory
+from jaxvib.motion.analysis.measure import Measured, measure, trajectory
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.system import PackedSystem
@@ -117,8 +118,9 @@ def integrate(
     turns: Array,
     max_steps: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
+    wanted: Array | None = None,
 ) -> Run:
-    """A run from 0 to `end`, measured over a window at its end; see `simulate` for the arguments."""
+    """A run from 0 to `end`, measured over a window at its end, if `wanted`; see `simulate` for the other arguments."""
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
@@ -159,8 +161,8 @@ def integrate(
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
     whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if samples else None
-    seen = (measure(scene, field, times, states, unit), window, whole)
-    measured, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
+    numbers = _measured(lambda: measure(scene, field, times, states, unit), wanted)
+    numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
     ended = solution.result == diffrax.RESULTS.successful
@@ -171,7 +173,7 @@ def integrate(
         status=RunStatus.where(exists, _status(solution.result, bounded), RunStatus.no_start),
         trajectory=whole,
         window=window,
-        **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
+        **{name: getattr(numbers, name) for name in type(numbers).__dataclass_fields__},
         error=unknown,
         steps=steps,
         rejected=solution.stats["num_rejected_steps"],
@@ -180,6 +182,14 @@ def integrate(
         scene=scene,
         together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
     )
+
+
+def _measured(found: Callable[[], Measured], wanted: Array | None) -> Measured:
+    """What is measured, where it is wanted, else NaN: of a run that another is compared with nobody reads it."""
+    if wanted is None:
+        return found()
+    nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(found))
+    return jax.lax.cond(wanted, found, lambda: nothing)
 
 
 def _is_together(angle: Array) -> Array:

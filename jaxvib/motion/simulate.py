@@ -132,16 +132,18 @@ def simulate(
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
-    def run(chosen: StepControl | diffrax.AbstractStepSizeController) -> Run:
+    def run(chosen: StepControl | diffrax.AbstractStepSizeController, wanted: bool = True) -> Run:
         kept = samples if save == "all" else 0
         allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
+        measuring = None
         if known and adjoint is None:
             chosen, allowed = _limited(chosen, allowed)
+            measuring = jnp.asarray(wanted)
         stretches = _stretches(scene, end, state, save)
         if stretches > 1:
             return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, periods, allowed)
         begun = time.perf_counter()
-        found = integrate(scene, end, state, solver, chosen, adjoint, kept, periods, allowed, progress_meter)
+        found = integrate(scene, end, state, solver, chosen, adjoint, kept, periods, allowed, progress_meter, measuring)
         if traced(found.steps):
             return found
         jax.block_until_ready(found.steps)
@@ -155,7 +157,7 @@ def simulate(
     elif not isinstance(control, StepControl) or not (known if estimate is None else estimate):
         found = run(control)
     else:
-        coarse, found = run(_coarser(control)), run(control)
+        coarse, found = run(_coarser(control), wanted=False), run(control)
         found = _compared(scene, found, coarse, control, _coarser(control), [coarse])
     if throw and not traced(found.steps):
         _raise_if_failed(found, max_steps, stepsize_controller)

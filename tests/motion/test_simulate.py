@@ -117,6 +117,17 @@ def test_less_of_a_difference_is_counted_to_vanish_than_a_method_of_order_8_lets
     np.testing.assert_allclose(_shrink(adaptive(1e-8), adaptive(1e-6)), 100.0**-0.45, rtol=1e-12)
 
 
+def test_a_run_that_another_is_compared_with_measures_nothing(monkeypatch):
+    """Two runs for the estimate; that with larger steps has its window and its steps, and no amplitude."""
+    runs = []
+    monkeypatch.setattr("jaxvib.motion.simulate.integrate", lambda *given: runs.append(integrate(*given)) or runs[-1])
+    run = jv.simulate(small_machine(), 20.0, start=small_start(), save="window")
+    coarse, fine = runs
+    assert int(coarse.steps) < int(fine.steps) == int(run.steps)
+    assert np.all(np.isnan(coarse.amplitude)) and np.all(np.isfinite(fine.amplitude)) and float(run.error) < 1e-3
+    assert np.max(np.abs(coarse.window.state.displacement - fine.window.state.displacement)) < 1e-6
+
+
 class Asked(Exception):
     """What the engine was called with."""
 
