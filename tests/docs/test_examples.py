@@ -43,7 +43,7 @@ def run_alone(block):
     """In a process of its own, as a user's script: jaxvib prepares JAX by itself. As strict as `conftest.py` is."""
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     clean |= {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir), "JAX_NUMPY_RANK_PROMOTION": "raise"}
-    clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+    clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.0"}
     words = [sys.executable, "-W", "error", "-c", block]
     done = subprocess.run(words, env=clean, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
