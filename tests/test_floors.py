@@ -2,6 +2,7 @@
 
 import ast
 import collections
+import functools
 import pathlib
 
 import pytest
@@ -34,17 +35,23 @@ def sources():
     }
 
 
+@functools.cache
+def statements(text):
+    """The import statements of a module, those inside functions too."""
+    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, (ast.Import, ast.ImportFrom))]
+
+
 def imports(modules):
     """(module, imported module) for every import statement, those inside functions too."""
     found = set()
     for module, text in modules.items():
-        for node in ast.walk(ast.parse(text)):
+        for node in statements(text):
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 # `from package import module` imports the module, `from module import name` the module of the name.
                 for alias in node.names:
                     inner = f"{node.module}.{alias.name}"
                     found.add((module, inner if inner in modules else node.module))
-            elif isinstance(node, ast.Import):
+            else:
                 found |= {(module, alias.name) for alias in node.names}
     return {(module, other) for module, other in found if other.split(".")[0] in ("jaxvib", "optimize")}
 
