@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from swings import ROD, T, noisy, scipy_swing
+from swings import ROD, T, noisy, scipy_swing, scipy_swings
 
 import jaxvib as jv
 from jaxvib.study.bearing.decrement import turning_points
@@ -37,15 +37,17 @@ def many(records, t, dry, pendulum=ROD):
 
 def trials(count, t, rng, noise, dry=None):
     """Records with every number drawn at random, and the mu1, mu2 in them."""
-    records, truth = [], []
-    for k in range(count):
+    drawn = []
+    for _ in range(count):
         mu1 = rng.uniform(3e-4, 3e-3) if dry is None else rng.uniform(2e-4, 1e-3)
         mu2 = 0.0 if dry is None else rng.uniform(0.5, 1.5) * dry
-        angle, rate, offset = rng.uniform(0.15, 0.8), rng.uniform(-0.5, 0.5), rng.normal()
-        clean, _ = scipy_swing(ROD, t, angle, rate, mu1, mu2)
-        records.append(jv.Record(t, offset + noisy(clean, noise, k)))
-        truth.append((mu1, mu2))
-    return records, np.array(truth)
+        drawn.append((rng.uniform(0.15, 0.8), rng.uniform(-0.5, 0.5), rng.normal(), mu1, mu2))
+    angle, rate, offset, *truth = np.array(drawn).T
+    if dry is None:
+        clean = scipy_swings(ROD, t, angle, rate, truth[0])
+    else:
+        clean = [scipy_swing(ROD, t, *one)[0] for one in zip(angle, rate, *truth, strict=True)]
+    return [jv.Record(t, offset[k] + noisy(clean[k], noise, k)) for k in range(count)], np.stack(truth, axis=1)
 
 
 def coverage(fit, truth, names, samples):

@@ -11,6 +11,7 @@ from swings import ROD, T, scipy_swing
 
 import jaxvib as jv
 from jaxvib.machine.effects.friction import sliding_sign
+from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.swing import SwingStatus, controller_to, swing_states
 
 
@@ -72,6 +73,7 @@ def test_a_pendulum_let_go_in_the_dead_zone_stays():
     assert abs(float(goes.angle[-1])) < 0.1 * zone
 
 
+@no_host_checks()  # programs with these are compiled anew each time
 def test_derivatives_of_the_swing():
     """Central differences, step 1e-4 of each number: their own error is about 1e-6 at a tolerance of 1e-11."""
     t = jnp.linspace(0.0, 10.0, 60)
@@ -86,9 +88,10 @@ def test_derivatives_of_the_swing():
     around = jax.jit(jax.vmap(angles))(jnp.concatenate([at[None, :] + steps, at[None, :] - steps]))
     difference = (around[:4] - around[4:]) / (2.0 * jnp.diagonal(steps)[:, None])
     for k in range(4):
-        np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])))
+        np.testing.assert_allclose(forward[:, k], difference[k], atol=3e-5 * np.max(np.abs(difference[k])), equal_nan=False)
     weights = jnp.cos(jnp.arange(60.0))
-    np.testing.assert_allclose(jax.grad(lambda x: weights @ angles(x))(at), weights @ forward, rtol=1e-5)
+    reverse = jax.grad(lambda x: weights @ angles(x))(at)
+    np.testing.assert_allclose(reverse, weights @ forward, rtol=1e-5, equal_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -118,19 +121,25 @@ def test_too_few_steps_have_a_status():
     assert bool(swing.status == jv.SwingStatus.max_steps_reached) and np.isnan(swing.angle[-1])
 
 
-@pytest.mark.parametrize("wrong", [dict(angle=jnp.nan), dict(dry=jnp.inf), dict(g=-9.81)])
-def test_a_swing_that_does_not_exist_leaves_those_beside_it_alone(wrong):
-    """As where a fit's step leads into nothing; their stops and slopes are looked for together."""
-
+@jax.jit
+@jax.vmap
+def swings_with_slopes(x):
     def swing(x):
         pendulum = eqx.tree_at(lambda p: p.g, ROD, x["g"])
         given = (x["angle"], jnp.zeros(()), jnp.asarray(1e-3), x["dry"], jnp.asarray(1e-3))
         run = swing_states(pendulum, T[:200], *given, controller_to(1e-8), diffrax.Tsit5(), diffrax.ForwardMode(), 4096)
         return run.angle, run.status
 
+    return swing(x), jax.jacfwd(swing, has_aux=True)(x)[0]
+
+
+@pytest.mark.parametrize("wrong", [dict(angle=jnp.nan), dict(dry=jnp.inf), dict(g=-9.81)])
+@no_host_checks()  # a program with these is compiled anew each time
+def test_a_swing_that_does_not_exist_leaves_those_beside_it_alone(wrong):
+    """As where a fit's step leads into nothing; their stops and slopes are looked for together."""
     right = dict(angle=0.3, dry=0.02, g=9.81)
     both = {name: jnp.asarray([value, wrong.get(name, value)]) for name, value in right.items()}
-    (value, status), slope = jax.jit(jax.vmap(lambda x: (swing(x), jax.jacfwd(swing, has_aux=True)(x)[0])))(both)
+    (value, status), slope = swings_with_slopes(both)
     assert np.all(np.isfinite(value[0])) and np.all(np.isnan(value[1]))
     assert all(np.all(np.isfinite(s[0])) and np.any(s[0]) for s in jax.tree.leaves(slope))
     assert np.asarray(status == SwingStatus.no_start).tolist() == [False, True]
