@@ -8,6 +8,7 @@ import pytest
 from swings import ROD, T, noisy, scipy_swing, scipy_swings
 
 import jaxvib as jv
+from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.decrement import turning_points
 from jaxvib.study.bearing.identify import first_guess, fit_swing, steps_for, student_quantile
 
@@ -77,6 +78,7 @@ def test_both_frictions_are_held_in_their_intervals():
         assert 184 <= held <= 197 and 0.85 < spread < 1.15
 
 
+@no_host_checks()  # programs with these are compiled anew each time
 def test_a_whole_swing_down_to_rest_gives_both_frictions():
     clean, stop = scipy_swing(ROD, T, 0.2, 0.0, 8e-4, 0.09)
     found = jv.identify(ROD, jv.Record(T + 100.0, noisy(clean, 2e-4, 0)), dry=True)
