@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
@@ -29,6 +30,9 @@ __all__ = [
 
 _WRITTEN = 8
 """Up to so many equations `eliminate` is as fast as a library call for each system of a batch."""
+
+_compiled = functools.partial(jax.jit, inline=True)
+"""Asked for outside a program, a loop would be traced and compiled at every call; within one, nothing changes."""
 
 _Entry: TypeAlias = Array | float
 """Of a matrix: a number, or an array of those of many matrices."""
@@ -115,6 +119,7 @@ def hermitian_modes(square: Array) -> tuple[Array, Array]:
     return _small_modes(square)
 
 
+@_compiled
 def _small_modes(square: Array) -> tuple[Array, Array]:
     """Eigenvalues and vectors of real symmetric matrices up to 3 x 3 by Jacobi's rotations, written out.
 
@@ -253,6 +258,7 @@ def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tup
     return jax.lax.map(eigenvalues_in_turn, matrix), True
 
 
+@_compiled
 def eliminate(a: Array, b: Array) -> Array:
     """x (n,) or (n, m) of a x = b, by elimination with pivots.
 
