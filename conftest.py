@@ -1,17 +1,23 @@
 """Float64, strict promotion of ranks: what a test relies on is said here, never by importing jaxvib."""
 
+import functools
 import gc
 import os
 import pathlib
+import sys
 
 import equinox as eqx
 import jax
 import matplotlib
 import pytest
+from jax._src import traceback_util
 
 from jaxvib.runtime import startup
 from jaxvib.runtime.cpu import prepare_cpu
 
+# Modules, those of the tests too, are compiled to bytecode once, not in every worker and every process that a test starts.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Tests change parts of the package, which the key of a stored program does not know: every program is traced anew.
 startup.start = lambda: None
 jax.config.update("jax_enable_x64", True)
@@ -32,13 +38,32 @@ def pytest_configure(config):
     if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", "") and config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     prepare_cpu()
+    # Each run-time check that is traced asks of every frame of the stack whether its file is one of some thirty.
+    if hasattr(traceback_util, "include_filename"):
+        traceback_util.include_filename = functools.cache(traceback_util.include_filename)
     # Tracing makes millions of objects that stay: looking through all of them again and again took a sixth of the suite's time.
     gc.set_threshold(100_000, 50, 100)
 
 
+_compiled = 0
+"""How many programs since those before were forgotten."""
+
+
+def _count(event, seconds, **_):
+    global _compiled
+    _compiled += event == "/jax/core/compile/backend_compile_duration"
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget():
-    """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes."""
+    """A worker keeps what it compiled for the modules that come next, until it is five hundred programs: all of them fill
+    gigabytes."""
+    global _compiled
     yield
-    eqx.clear_caches()
-    jax.clear_caches()
+    if _compiled > 500:
+        eqx.clear_caches()
+        jax.clear_caches()
+        _compiled = 0
