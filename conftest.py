@@ -1,7 +1,9 @@
 """Float64, strict promotion of ranks: what a test relies on is said here, never by importing jaxvib."""
 
+import contextlib
 import functools
 import gc
+import importlib
 import os
 import pathlib
 import sys
@@ -10,7 +12,6 @@ import equinox as eqx
 import jax
 import matplotlib
 import pytest
-from jax._src import traceback_util
 
 from jaxvib.runtime import startup
 from jaxvib.runtime.cpu import prepare_cpu
@@ -39,8 +40,9 @@ def pytest_configure(config):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     prepare_cpu()
     # Each run-time check that is traced asks of every frame of the stack whether its file is one of some thirty.
-    if hasattr(traceback_util, "include_filename"):
-        traceback_util.include_filename = functools.cache(traceback_util.include_filename)
+    with contextlib.suppress(ImportError, AttributeError):  # a JAX that does it otherwise
+        frames = importlib.import_module("jax._src.traceback_util")
+        frames.include_filename = functools.cache(frames.include_filename)
     # Tracing makes millions of objects that stay: looking through all of them again and again took a sixth of the suite's time.
     gc.set_threshold(100_000, 50, 100)
 
