@@ -47,25 +47,10 @@ def pytest_configure(config):
     gc.set_threshold(100_000, 50, 100)
 
 
-_compiled = 0
-"""How many programs since those before were forgotten."""
-
-
-def _count(event, seconds, **_):
-    global _compiled
-    _compiled += event == "/jax/core/compile/backend_compile_duration"
-
-
-jax.monitoring.register_event_duration_secs_listener(_count)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _forget():
-    """A worker keeps what it compiled for the modules that come next, until it is five hundred programs: all of them fill
-    gigabytes."""
-    global _compiled
+    """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
+    finds compiled depends on no other module."""
     yield
-    if _compiled > 500:
-        eqx.clear_caches()
-        jax.clear_caches()
-        _compiled = 0
+    eqx.clear_caches()
+    jax.clear_caches()
