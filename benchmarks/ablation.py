@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -149,9 +150,19 @@ def samples(quick: bool) -> None:
 @contextlib.contextmanager
 def checkpointed() -> Iterator[None]:
     """Derivatives of adaptive steps by diffrax's own adjoint, which chooses the steps anew on the way back."""
-    plain = lambda inputs, controller, *rest: replay._solve(inputs, controller, diffrax.RecursiveCheckpointAdjoint(), *rest)  # noqa: E731
+
+    def plain(inputs: Any, controller: Any, solver: LoopDopri8, *rest: Any) -> diffrax.Solution:
+        solver = dataclasses.replace(solver, reuse=False)
+        return replay._solve(inputs, controller, diffrax.RecursiveCheckpointAdjoint(), solver, *rest)
+
     with mock.patch.object(replay, "_with_replay", plain):
         yield
+
+
+def term_by_term() -> Any:
+    """The sums over a step's stages differentiated as they are written."""
+    written = lambda weights, stages: sum(weights[j] * stages[j] for j in range(len(weights)))  # noqa: E731
+    return mock.patch.object(dopri8_loop, "_written_sum", written)
 
 
 def gradients(quick: bool) -> None:
@@ -169,7 +180,9 @@ def gradients(quick: bool) -> None:
     speed: Array = s.drive.speed
     exact = float(jax.jit(jax.jacfwd(lambda x: final(x, diffrax.ForwardMode())))(speed))
     base = None
-    for name, off in (("as it is", NONE), ("step replay: steps chosen anew", checkpointed)):
+    ways = {"as it is": NONE, "derivative of sums: term by term": term_by_term, "step replay: steps chosen anew": checkpointed}
+    for name, off in ways.items():
+        jax.clear_caches()  # programs within, traced with or without it
         with off():
             call = jax.jit(jax.grad(lambda x: final(x)))
             error = abs(float(call(speed)) / exact - 1.0)
