@@ -28,10 +28,10 @@ rounded.defvjp(lambda x: (x * (1.0 + 1e-13), None), lambda _, slope: (slope,))
 
 
 def forced(again, jump):
-    """A forced oscillator; from t = 7 on with `jump` more force."""
+    """A forced oscillator; from t = 7 on with `jump` more force, in proportion to what it is differentiated by."""
 
     def field(t, y, args):
-        force = args[0] * jnp.cos(1.7 * t) + jnp.where(t < 7.0, 0.0, jump)
+        force = args[0] * (jnp.cos(1.7 * t) + jnp.where(t < 7.0, 0.0, jump))
         return y[1], force - 0.05 * y[1] - args[1] * again(y[0])
 
     return diffrax.ODETerm(field)
