@@ -132,6 +132,19 @@ def test_one_direction_alone_and_values_alone():
     assert_close(value, jax.jit(lambda p: motion(p, slopes=False))(POINT), rtol=1e-13)
 
 
+def test_directions_in_a_batch_of_which_only_a_part_differs():
+    """f(a, b) = a b^2 by b, for several a: 2 a b on the diagonal."""
+
+    def beside(x, slopes):
+        (a, b), (_, slope) = x, slopes
+        return a * b**2, (2.0 * a * b)[:, None] * slope
+
+    product = multi_tangent_jvp(lambda x: x[0] * x[1] ** 2, beside)
+    a, b = jnp.asarray([1.0, 2.0, -3.0]), jnp.asarray([0.5, 4.0])
+    found = jax.jacfwd(lambda b: jax.vmap(lambda a: product((a, b)))(a))(b)
+    assert_close(found, [np.diag(2.0 * each * np.asarray(b)) for each in np.asarray(a)])
+
+
 def test_directions_lie_along_the_last_axis_and_fill_vectors():
     shapes = []
 
