@@ -127,6 +127,21 @@ def tangents(quick: bool) -> None:
     base = row("as it is", lambda: calls[0](x))
     row("multi_tangent_jvp: as jacfwd lays it out", lambda: calls[1](x), base)
 
+    print("\nforward derivatives of an adaptive run by 6 numbers, its window measured")
+    m = published()
+    names = ("stiffness", "damping", "link_stiffness", "link_damping")
+    numbers = [getattr(m.machine, name) for name in names]
+
+    def last(x: list[Array], tangents: bool) -> Array:
+        moved = eqx.tree_at(lambda s: [getattr(s.machine, name) for name in names], m, x)
+        given = dict(solver=LoopDopri8(tangents=tangents, reuse=True), adjoint=diffrax.ForwardMode(), max_steps=2**13)
+        found = jv.simulate(moved, 20.0 if quick else 200.0, start=thrown(), save="window", **given)
+        return found.window.state.displacement[-1, 1]
+
+    calls = [jax.jit(jax.jacfwd(lambda x, on=on: last(x, on))) for on in (True, False)]
+    base = row("as it is", lambda: calls[0](numbers))
+    row("multi_tangent_jvp: as jacfwd lays it out", lambda: calls[1](numbers), base)
+
 
 def samples(quick: bool) -> None:
     s = balls(3)

@@ -22,6 +22,7 @@ __all__ = [
     "root_or_zero",
     "small_inverse",
     "small_solve",
+    "solve_definite",
     "solve_in_turn",
     "times",
     "written_inverse",
@@ -256,6 +257,16 @@ def eigenvalues_in_turn(matrix: Array) -> Array:
 @eigenvalues_in_turn.def_vmap
 def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tuple[Array, bool]:
     return jax.lax.map(eigenvalues_in_turn, matrix), True
+
+
+def solve_definite(a: Array, b: Array) -> Array:
+    """x of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no branches."""
+    rows = jnp.concatenate([a, b[:, None]], axis=1)
+    for k in range(b.shape[0]):
+        line = rows[k, 1:] / rows[k, 0]
+        above, below = (part[:, 1:] - part[:, :1] * line[None] for part in (rows[:k], rows[k + 1 :]))
+        rows = jnp.concatenate([above, line[None], below])
+    return rows[:, 0]
 
 
 @_compiled

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.linalg import eigenvalues_in_turn, small_solve
+from jaxvib.numerics.linalg import eigenvalues_in_turn, small_solve, solve_definite
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 17])
@@ -55,3 +55,11 @@ def test_eigenvalues_of_a_batch_of_batches_call_the_library_for_one_matrix():
         np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(np.linalg.eigvals(matrix)), rtol=1e-9)
     assert re.search(r"geev[^\n]*tensor<5x5x", text := many.lower(matrices).as_text()), text
     assert not re.search(r"geev[^\n]*tensor<(\d+x)+5x5x", text)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_definite_equations_are_solved(n):
+    rng = np.random.default_rng(n)
+    root, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    a = root.T @ root + 0.1 * np.eye(n)
+    np.testing.assert_allclose(solve_definite(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12)

@@ -12,6 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from jaxvib.numerics.linalg import solve_definite
 from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, fenced, scalarized_program, scalars_of
 from jaxvib.runtime.compat import jaxpr_as_fun
 
@@ -51,7 +52,7 @@ def damped_newton(
         x, beside, value, size, slopes, damping = state
         normal = slopes.T @ slopes
         damped = normal + damping * one * (normal + jnp.finfo(x.dtype).tiny)
-        trial = x - jnp.clip(_solve_definite(damped, slopes.T @ value), -0.5, 0.5)
+        trial = x - jnp.clip(solve_definite(damped, slopes.T @ value), -0.5, 0.5)
 
         def along(way: ArrayLike) -> tuple[Array, Array, Beside]:
             return jax.jvp(lambda y: balance(y, given), (trial,), (way,), has_aux=True)
@@ -95,13 +96,3 @@ def _repeated(step: Callable[..., Sequence[Array]], begin: Sequence[Array], time
         return (now[0] <= times) & (now[1][-1] < jnp.inf)
 
     return jax.lax.while_loop(going, lambda now: (now[0] + 1, list(step(*now[1]))), (jnp.asarray(0), list(begin)))[1]
-
-
-def _solve_definite(a: Array, b: Array) -> Array:
-    """x of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no branches."""
-    rows = jnp.concatenate([a, b[:, None]], axis=1)
-    for k in range(b.shape[0]):
-        line = rows[k, 1:] / rows[k, 0]
-        above, below = (part[:, 1:] - part[:, :1] * line[None] for part in (rows[:k], rows[k + 1 :]))
-        rows = jnp.concatenate([above, line[None], below])
-    return rows[:, 0]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.steady.jams.newton import _solve_definite, damped_newton
+from jaxvib.steady.jams.newton import damped_newton
 
 
 def circle_and_line(x, radius):
@@ -53,11 +53,3 @@ def test_more_unknowns_than_numbers_are_written_for_stay_on_arrays():
         if e.primitive.name == "while"
     )
     assert any(v.aval.shape for v in loop.outvars)
-
-
-@pytest.mark.parametrize("n", [1, 2, 5])
-def test_definite_equations_are_solved(n):
-    rng = np.random.default_rng(n)
-    root, b = rng.normal(size=(n, n)), rng.normal(size=n)
-    a = root.T @ root + 0.1 * np.eye(n)
-    np.testing.assert_allclose(_solve_definite(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12)
