@@ -213,6 +213,39 @@ def starts_with(flags: list[str]) -> bool:
     return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
 
 
+_patching = threading.Lock()
+_patches: dict[tuple[str, str], tuple[list[int], Any]] = {}  # the threads that are inside, and what the attribute was
+
+
+@contextlib.contextmanager
+def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> Iterator[None]:
+    """In here, and in this thread, a function of a module is another one; of several threads each may come and go."""
+    key, thread = (module.__name__, name), threading.get_ident()
+    with _patching:
+        if key not in _patches:
+            inside: list[int] = []
+            original = getattr(module, name)
+            _patches[key] = inside, original
+            setattr(module, name, lambda *a, **k: (instead if threading.get_ident() in inside else original)(*a, **k))
+        _patches[key][0].append(thread)
+    try:
+        yield
+    finally:
+        with _patching:
+            inside, original = _patches[key]
+            inside.remove(thread)
+            if not inside:
+                del _patches[key]
+                setattr(module, name, original)
+
+
+def _unpatched(module: ModuleType | None, name: str) -> Any:
+    """A function of a module as it was before it was `_patched`; None where there is none."""
+    with _patching:
+        known = _patches.get((getattr(module, "__name__", ""), name))
+    return getattr(module, name, None) if known is None else known[1]
+
+
 @contextlib.contextmanager
 def no_host_checks() -> Iterator[None]:
     """What is traced in here has Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
@@ -222,9 +255,9 @@ def no_host_checks() -> Iterator[None]:
     the two attributes checks stay as they are.
     """
     errors = sys.modules.get("equinox._errors")
-    compiled = getattr(errors, "branched_error_if_impl_jit", None)
     plain = getattr(errors, "branched_error_if_impl", None)
-    if compiled is None or plain is None or getattr(errors, "EQX_ON_ERROR", None) != "raise":
+    unknown = errors is None or plain is None or not hasattr(errors, "branched_error_if_impl_jit")
+    if unknown or getattr(errors, "EQX_ON_ERROR", None) != "raise":
         yield
         return
 
@@ -232,11 +265,8 @@ def no_host_checks() -> Iterator[None]:
         # Not the compiled one: what it is traced to would be found again outside.
         return plain(*args, on_error="nan" if on_error == "default" else on_error)
 
-    setattr(errors, "branched_error_if_impl_jit", to_nan)  # noqa: B010
-    try:
+    with _patched(errors, "branched_error_if_impl_jit", to_nan):
         yield
-    finally:
-        setattr(errors, "branched_error_if_impl_jit", compiled)  # noqa: B010
 
 
 class _Instead:
@@ -266,8 +296,9 @@ def short_end() -> Iterator[None]:
     code does not read so, it stays as it is.
     """
     integrate = sys.modules.get("diffrax._integrate")
-    loop, internals = getattr(integrate, "loop", None), getattr(integrate, "eqxi", None)
-    if not (inspect.isfunction(loop) and inspect.ismodule(internals)) or len(_ULPS_ONE_BY_ONE.findall(_source(loop))) != 1:
+    loop, internals = _unpatched(integrate, "loop"), getattr(integrate, "eqxi", None)
+    readable = integrate is not None and inspect.isfunction(loop) and internals is not None
+    if not readable or len(_ULPS_ONE_BY_ONE.findall(_source(loop))) != 1:
         yield
         return
 
@@ -282,17 +313,15 @@ def short_end() -> Iterator[None]:
             return x if left else ulps_below(x, _ULPS)
 
         with _SHORTENING:  # another thread may trace a loop of its own
-            setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
+            internals = integrate.eqxi
+            integrate.eqxi = _Instead(internals, prevbefore=prevbefore)
             try:
                 return loop(**arguments)
             finally:
-                setattr(integrate, "eqxi", internals)  # noqa: B010
+                integrate.eqxi = internals
 
-    setattr(integrate, "loop", shorter)  # noqa: B010
-    try:
+    with _patched(integrate, "loop", shorter):
         yield
-    finally:
-        setattr(integrate, "loop", loop)  # noqa: B010
 
 
 @functools.cache

@@ -6,6 +6,7 @@ import pathlib
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
 
 import diffrax
 import equinox.internal
@@ -142,6 +143,36 @@ def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "jaxvib" / "flags-99.1.0.json").read_text()) == {flags[0]: True, flags[1]: False}
     monkeypatch.setattr(compat, "starts_with", lambda flags: pytest.fail("asked again"))
     assert compat.accepted_flags(flags) == flags[:1]
+
+
+def test_run_time_checks_are_left_out_by_the_threads_that_ask_for_it():
+    """equinox._errors: branched_error_if_impl_jit; while one thread leaves its checks out, others come, go, and have theirs."""
+    begun, ended = Barrier(2, timeout=60.0), Barrier(2, timeout=60.0)
+
+    def unchecked():
+        with compat.no_host_checks():
+            begun.wait()
+            answer = square_root(-1.0)
+            ended.wait()
+            return answer
+
+    before = equinox._errors.branched_error_if_impl_jit
+    with ThreadPoolExecutor(1) as pool:
+        theirs = pool.submit(unchecked)
+        begun.wait()
+        with pytest.raises(RuntimeError, match="negative"):
+            square_root(-1.0)
+        with compat.no_host_checks():
+            ended.wait()
+            assert jnp.isnan(theirs.result())
+            assert jnp.isnan(square_root(-2.0))
+    assert equinox._errors.branched_error_if_impl_jit is before
+    with pytest.raises(RuntimeError, match="negative"):
+        square_root(-1.0)
+
+
+def square_root(x):
+    return jax.jit(lambda x: jnp.sqrt(equinox.error_if(jnp.abs(x), x < 0.0, "negative")))(x)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
