@@ -14,19 +14,20 @@ import matplotlib
 import pytest
 
 from jaxvib.runtime import startup
+from jaxvib.runtime.cache import keep_programs, program_folder
 from jaxvib.runtime.cpu import prepare_cpu
+from jaxvib.runtime.stored import _functions
 
 # Modules, those of the tests too, are compiled to bytecode once, not in every worker and every process that a test starts.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# Tests change parts of the package, which the key of a stored program does not know: every program is traced anew.
-startup.start = lambda: None
+startup.start = lambda: None  # what it does is done here
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Workers share what they compile, and so do clones: JAX's key of a program holds the program, the flags and the versions.
+# Workers share what they trace and compile, and so do clones: keys of programs hold the sources, the flags and the versions.
+home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "jaxvib" / "tests"
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    jax.config.update("jax_compilation_cache_dir", str(pathlib.Path(home) / "jaxvib" / "tests"))
+    jax.config.update("jax_compilation_cache_dir", str(home))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 matplotlib.use("Agg")
 
@@ -48,9 +49,24 @@ def pytest_configure(config):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _forget():
+def _stored():
     """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
     finds compiled depends on no other module."""
+    (home / "programs").mkdir(parents=True, exist_ok=True)
+    keep_programs(home / "programs")
     yield
+    keep_programs(None)
+    for function in _functions:
+        function.ready.clear()
     eqx.clear_caches()
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _traced_anew(request):
+    """A test that changes parts of the package stores no program and finds none: their keys do not know of such changes."""
+    folder = program_folder()
+    if "monkeypatch" in request.fixturenames:
+        keep_programs(None)
+    yield
+    keep_programs(folder)

@@ -56,7 +56,7 @@ class StoredFunction(Generic[T]):
     """A function of trees of arrays and of what can be hashed, compiled, whose programs are stored on disk.
 
     The key of a program on disk holds all that it depends on: the shapes and types of arrays, the static parts of the
-    arguments, JAX's options, the versions, when the sources were changed, and the processor. The 512 programs that were used
+    arguments, JAX's options, the versions, the sources, and the processor. The 512 programs that were used
     last are held in memory, others are read or traced again.
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
@@ -238,12 +238,12 @@ def _digest(content: bytes) -> str:
 
 @functools.cache
 def _sources() -> str:
-    """Changes whenever a line of the code that programs are traced from may have changed."""
+    """Changes whenever a line of the code that programs are traced from does."""
     package = Path(__file__).parents[1]
     packages = [package, package.parent / "optimize"]
-    files = [file.stat() for each in packages for file in sorted(each.rglob("*.py"))]
+    files = [file.read_bytes() for each in packages for file in sorted(each.rglob("*.py"))]
     versions = [importlib.metadata.version(name) for name in _PACKAGES]
-    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {[(file.st_size, file.st_mtime_ns) for file in files]}"
+    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {_digest(b''.join(files))}"
 
 
 @functools.cache

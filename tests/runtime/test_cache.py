@@ -17,6 +17,7 @@ root_only = pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() != 0, rea
 
 @pytest.fixture(autouse=True)
 def _unchanged():
+    cache.keep_programs(None)
     yield
     cache.keep_programs(None)
 

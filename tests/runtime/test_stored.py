@@ -16,6 +16,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
+import optimize
 from jaxvib.runtime import cache, programs, stored, structure
 from jaxvib.steady.jams import jam
 
@@ -163,12 +164,15 @@ for count in range(1, 3001):
     assert max(row[2] for row in rows) < 10000, rows
 
 
-def test_the_key_holds_the_sources_of_the_whole_package_and_the_versions():
-    """Size and time of a module of any folder, and of one at the top."""
-    text = stored._sources()
-    for path in (pathlib.Path(jam.__file__), pathlib.Path(jv.__file__)):
-        assert str((path.stat().st_size, path.stat().st_mtime_ns)) in text
+@pytest.mark.parametrize("module", [jam, jv, optimize])
+def test_the_key_holds_every_source_and_the_versions(module, monkeypatch):
+    """A module of any folder, and those at the top of both packages."""
+    text, read, changed = stored._sources(), pathlib.Path.read_bytes, pathlib.Path(module.__file__)
     assert importlib.metadata.version("jaxlib") in text and importlib.metadata.version("diffrax") in text
+    monkeypatch.setattr(pathlib.Path, "read_bytes", lambda path: read(path) + b"#" * (path == changed))
+    assert stored._sources.__wrapped__() != text
+    monkeypatch.setattr(pathlib.Path, "read_bytes", read)
+    assert stored._sources.__wrapped__() == text
 
 
 @pytest.mark.parametrize(
