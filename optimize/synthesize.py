@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.linear import jammed_loads
+from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -210,8 +210,8 @@ def _searched(
     for loads in space.counts or (space.scene.loads.count,):
         here = space if loads == space.scene.loads.count else _with_loads(space, loads)
         problem = problem_of(here, objective, demands, options.starts)
-        if problem.keys and not float(jammed_loads(space.scene).drag_sum()) > 0.0:
-            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+        if problem.keys:
+            require_drag(jammed_loads(space.scene))
         found = choose(problem, options, tell)
         if found is None:
             continue

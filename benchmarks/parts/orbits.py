@@ -21,7 +21,7 @@ from parts.common import best, first, published, say
 
 import jaxvib as jv
 from jaxvib.equations.collected import collected_model
-from jaxvib.equations.linear import steady_displacement
+from jaxvib.equations.linear import jammed_model, steady_displacement
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.balance.monodromy import magnus
 from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
@@ -49,7 +49,7 @@ def chain(platforms: int) -> jv.Scene:
 @eqx.filter_jit
 def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: bool):
     """Batches of 100 orbits: rotor speeds, and multipliers where asked."""
-    model, grid = collected_model(scene), grid_of(points, True)
+    model, grid = collected_model(jammed_model(scene)), grid_of(points, True)
 
     def one(w):
         motion = periodic_motion(model, grid, "omega", w, rotor_speed_at(model.linear, w))
@@ -246,7 +246,7 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
     """Multipliers alone, of 100 motions: `floquet`, whose linearised equations are written by hand, and the full equations
     differentiated along the same motions, both by a Magnus method of order 6 over half a period."""
     group, omega = "multipliers of an exact orbit", jnp.linspace(0.6, 0.9, 100)
-    model, grid = collected_model(scene), grid_of(16, True)
+    model, grid = collected_model(jammed_model(scene)), grid_of(16, True)
     print(f"{group}; error: of the largest modulus, to many steps")
 
     @jax.jit

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, require_effects
-from jaxvib.machine.effects.base import Effect, total_gravity
+from jaxvib.equations.linear import JammedModel, jammed_loads, require_effects
+from jaxvib.machine.effects.base import Effect, has_half_turn, total_gravity
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["CollectedModel", "Points", "collected_model", "has_half_turn", "light_friction", "require_collected"]
+__all__ = ["CollectedModel", "Points", "collected_model", "light_friction", "require_collected"]
 
 Points = Array | np.ndarray
 
@@ -27,7 +27,7 @@ class CollectedModel(eqx.Module):
 
     **Attributes**: `linear` the carrier with its loads; `loads`, `effects` of the scene; `unbalance` S (G,) kg m, `inertia`
     I = sum kappa m R^2 and `drag` sum b_W R^2 (G,) of each body; `offsets` (count,) rad: where each load is on its body, an
-    angle ahead of the body's own; `half_turn` see `has_half_turn`.
+    angle ahead of the body's own; `half_turn` see `has_half_turn` of effects.
     """
 
     linear: JammedModel
@@ -91,29 +91,29 @@ class CollectedModel(eqx.Module):
         return by_angle, by_rate, jnp.stack(by_a)
 
 
-def collected_model(scene: Scene) -> CollectedModel:
-    """The scene's collected loads as bodies on its carrier. **Raises** `InputError` as `require_collected`."""
-    loads, linear = require_collected(scene), jammed_model(scene)
+def collected_model(linear: JammedModel) -> CollectedModel:
+    """The collected loads as bodies on their carrier. **Raises** `InputError` for a rotor out of balance."""
+    loads, effects = linear.loads, linear.scene.effects
+    _require_balance(effects)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
     if loads.alike:
         unbalance, whole, drag = linear.unbalance[None], loads.count * inertia[None], linear.drag[None]
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
         unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
-    return CollectedModel(linear, loads, scene.effects, unbalance, whole, drag, loads.offsets(), has_half_turn(scene))
+    return CollectedModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn(effects))
 
 
 def require_collected(scene: Scene) -> CircularLoads:
     """The loads of a scene whose jams repeat. **Raises** `InputError` for a rotor out of balance, and as `jammed_loads`."""
     loads = jammed_loads(scene)
-    shaking = [effect.kind for effect in scene.effects if effect.has_imbalance]
-    require_effects(shaking, "shakes|shake the machine at the rotor's own speed, so that no motion repeats", "or simulate")
+    _require_balance(scene.effects)
     return loads
 
 
-def has_half_turn(scene: Scene) -> bool:
-    """Whether the equations stay the same under phi + pi, -q: effects on the loads (gravity) break it."""
-    return all(effect.half_turn_symmetric for effect in scene.effects)
+def _require_balance(effects: tuple[Effect, ...]) -> None:
+    shaking = [effect.kind for effect in effects if effect.has_imbalance]
+    require_effects(shaking, "shakes|shake the machine at the rotor's own speed, so that no motion repeats", "or simulate")
 
 
 def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:

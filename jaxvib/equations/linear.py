@@ -8,6 +8,7 @@ from typing import cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
@@ -16,6 +17,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.units import traced
 
 __all__ = [
     "JammedModel",
@@ -26,6 +28,7 @@ __all__ = [
     "linear_model",
     "natural_frequencies",
     "peak_force",
+    "require_drag",
     "require_effects",
     "require_one_point",
     "steady_displacement",
@@ -175,6 +178,12 @@ def jammed_loads(scene: Scene) -> CircularLoads:
     loads = turning_loads(scene, friction=True)
     require_one_point(scene)
     return loads
+
+
+def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
+    """**Raises** `InputError` where it is known that no load has drag, or of `each` that one has none."""
+    if not traced(loads.drag) and not (np.all if each else np.any)(np.asarray(loads.drag) > 0.0):
+        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
 
 
 def require_one_point(scene: Scene) -> None:

@@ -151,10 +151,9 @@ def _small_modes(square: Array) -> tuple[Array, Array]:
         return tuple(tuple(row) for row in a), tuple(tuple(row) for row in v)
 
     a, v = jax.lax.fori_loop(0, (0, 0, 1, 6)[n], sweep, (entries, axes))
-    values = jnp.stack([a[i][i] for i in range(n)], axis=-1)
-    vectors = jnp.stack([jnp.stack(row, axis=-1) for row in v], axis=-2)
-    order = jnp.argsort(values, axis=-1)
-    return jnp.take_along_axis(values, order, -1), jnp.take_along_axis(vectors, order[..., None, :], -1)
+    numbers = [jnp.stack([a[i][i] for i in range(n)], axis=-1), *(jnp.stack(row, axis=-1) for row in v)]
+    values, *rows = jax.lax.sort(numbers, num_keys=1)  # each column goes with its value
+    return values, jnp.stack(rows, axis=-2)
 
 
 @hermitian_modes.defjvp

@@ -256,8 +256,8 @@ def no_host_checks() -> Iterator[None]:
     """
     errors = sys.modules.get("equinox._errors")
     plain = getattr(errors, "branched_error_if_impl", None)
-    unknown = errors is None or plain is None or not hasattr(errors, "branched_error_if_impl_jit")
-    if unknown or getattr(errors, "EQX_ON_ERROR", None) != "raise":
+    known = hasattr(errors, "branched_error_if_impl_jit") and getattr(errors, "EQX_ON_ERROR", None) == "raise"
+    if errors is None or plain is None or not known:
         yield
         return
 
@@ -297,8 +297,8 @@ def short_end() -> Iterator[None]:
     """
     integrate = sys.modules.get("diffrax._integrate")
     loop, internals = _unpatched(integrate, "loop"), getattr(integrate, "eqxi", None)
-    readable = integrate is not None and inspect.isfunction(loop) and internals is not None
-    if not readable or len(_ULPS_ONE_BY_ONE.findall(_source(loop))) != 1:
+    readable = inspect.isfunction(loop) and internals is not None and len(_ULPS_ONE_BY_ONE.findall(_source(loop))) == 1
+    if integrate is None or not readable:
         yield
         return
 
@@ -314,11 +314,11 @@ def short_end() -> Iterator[None]:
 
         with _SHORTENING:  # another thread may trace a loop of its own
             internals = integrate.eqxi
-            integrate.eqxi = _Instead(internals, prevbefore=prevbefore)
+            setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
             try:
                 return loop(**arguments)
             finally:
-                integrate.eqxi = internals
+                setattr(integrate, "eqxi", internals)  # noqa: B010
 
     with _patched(integrate, "loop", shorter):
         yield

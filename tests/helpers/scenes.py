@@ -5,6 +5,7 @@ import numpy as np
 
 import jaxvib as jv
 from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import jammed_model
 
 TWO_MASS = dict(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0)
 BALLS = dict(count=3, mass=0.8, radius=0.12, drag=1.5)
@@ -66,4 +67,4 @@ def some_state(s):
 
 def assembled(scene):
     """The scene's carrier with its collected loads, as exact jams take it."""
-    return collected_model(scene)
+    return collected_model(jammed_model(scene))

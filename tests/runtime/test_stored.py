@@ -287,7 +287,7 @@ def test_derivatives_go_through_cached_functions(folder):
 def test_jams_from_a_stored_program_are_the_same(folder):
     s = scene("two_mass", "balls")
     jv.jam_modes(s)
-    jam._jam_modes.stored.ready.clear()
+    jam.jams_of.stored.ready.clear()
     again = jv.jam_modes(s)
     cache.keep_programs(None)
     traced = jv.jam_modes(s)

@@ -25,6 +25,7 @@ __all__ = [
     "SlipLimit",
     "StaticImbalance",
     "Typical",
+    "has_half_turn",
     "total_gravity",
 ]
 
@@ -105,6 +106,11 @@ def total_gravity(effects: Iterable[Effect]) -> dict[int, Array]:
         for axis, g in effect.gravity.items():
             total[axis] = total[axis] + g if axis in total else g
     return total
+
+
+def has_half_turn(effects: Iterable[Effect]) -> bool:
+    """Whether equations with these `effects` stay the same under phi + pi, -q: gravity on the loads breaks it."""
+    return all(effect.half_turn_symmetric for effect in effects)
 
 
 class Effect(eqx.Module):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
@@ -112,7 +113,7 @@ def branch_pieces(model: JammedModel) -> Pieces:
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(jax.vmap(lambda w: branch_slope(frozen, w)), grid, 2 * nd)
     falling = slopes < 0.0
-    (change,) = jnp.nonzero(falling[1:] != falling[:-1], size=4 * nd, fill_value=grid.shape[0] - 1)
+    change = _first_of(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
@@ -185,7 +186,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     tiny = jnp.finfo(top.dtype).eps * 16.0
     width = jnp.maximum(jnp.abs(poles.real), tiny * top)[:, None]
     low = 1e-3 * jnp.min(jnp.where(fixed > 0.0, fixed, top))
-    s = jnp.linspace(0.0, 1.0, per_side)[None, :]
+    s = np.linspace(0.0, 1.0, per_side, dtype=width.dtype)[None, :]
 
     def crowded(reach: Array) -> Array:
         return width * jnp.sinh(s * jnp.arcsinh(reach / width))
@@ -205,6 +206,11 @@ def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
     return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
 
 
+def _first_of(there: Array, size: int, otherwise: int) -> Array:
+    """The first `size` places of what is there (n,), ascending, and where it is fewer `otherwise`, which comes after them."""
+    return jnp.sort(jnp.where(there, jnp.arange(there.shape[0]), otherwise))[:size]
+
+
 def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
     """The grid and the `slopes` at it, with points added where they come closest to 0 and turn back: two folds may hide in one
     interval."""
@@ -212,7 +218,7 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) 
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
     dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
-    (at,) = jnp.nonzero(dips, size=most, fill_value=0)
+    at = _first_of(dips, most, dips.shape[0] - 1)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
     side, lowest = jnp.sign(value[at + 1]), jnp.abs(value[at + 1])
@@ -228,5 +234,4 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) 
 
     added, least = jax.lax.fori_loop(0, 16, narrow, (grid[at], grid[at + 2], grid[at + 1], lowest))[2:]
     points, values = jnp.concatenate([grid, added]), jnp.concatenate([value, side * least])
-    order = jnp.argsort(points)
-    return points[order], values[order]
+    return jax.lax.sort((points, values), num_keys=1)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force
+from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -193,14 +193,13 @@ def jam_modes(scene: Scene) -> JamModes:
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
     scene = checked(scene)
-    drag = jammed_loads(scene).drag
-    if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
-    return _jam_modes(scene)
+    require_drag(jammed_loads(scene))
+    return jams_of(scene)
 
 
 @cached
-def _jam_modes(scene: Scene) -> JamModes:
+def jams_of(scene: Scene) -> JamModes:
+    """`jam_modes` of a scene that is known to be right."""
     n, model = scene.drive.speed, jammed_model(scene)
     pieces = branch_pieces(model)
     omega, exists = _solved_on_pieces(model, pieces)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
-from jaxvib.equations.linear import LinearModel, linear_model, peak_force, turning, turning_loads
+from jaxvib.equations.linear import LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
@@ -24,7 +24,6 @@ from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
-from jaxvib.units import traced
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -217,8 +216,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 def loads_with_drag(scene: Scene) -> CircularLoads:
     """The scene's loads. **Raises** `InputError` where one has no drag."""
     loads = turning_loads(scene)
-    if not traced(loads.drag) and not np.all(np.asarray(loads.drag) > 0.0):
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+    require_drag(loads, each=True)
     return loads
 
 

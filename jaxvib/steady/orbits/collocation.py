@@ -38,8 +38,13 @@ def receptance(model: CollectedModel, omega: Array, speed: Array, orders: np.nda
 
 def _answer(model: CollectedModel, grid: Grid, omega: Array, speed: Array) -> Array:
     """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
+    return _at_port(model, grid, omega, receptance(model, omega, speed, grid.orders))
+
+
+def _at_port(model: CollectedModel, grid: Grid, omega: Array, answer: Array) -> Array:
+    """`_answer` from the receptance at the orders of the grid, and others after these."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
-    return -(w**2)[:, None, None] * (model.linear.carrier.port @ receptance(model, omega, speed, grid.orders))
+    return -(w**2)[:, None, None] * (model.linear.carrier.port @ answer[: w.size])
 
 
 def _feedback(grid: Grid, answer: Array) -> Array:
@@ -199,7 +204,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
     def equations(model: CollectedModel, value: Array) -> Array:
         omega, speed = _both(given, value, x)
         residual = _balance(model, on, _answer(model, on, omega, speed), deviation, omega, speed).residual
-        return jnp.append(residual, 0.0)
+        return _then_zero(residual.ravel())
 
     change = eqx.filter_jvp(equations, (model, value), tangents[:2])[1]
     change = -jnp.linalg.solve(_linearised(model, on, given, value, deviation, x, None)[1], change)
@@ -227,12 +232,13 @@ def _linearised(
 class BranchTangent(NamedTuple):
     """`slope` dn/dOmega of the branch; `residual`: what is left of the torque balance at the points, relative to the torques in
     it; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`, rad: an estimate of what the
-    number of points leaves."""
+    number of points leaves; `receptance` (K, nd, np) of the carrier at the orders of the grid."""
 
     slope: Array
     residual: Array
     speed_error: Array
     deviation_error: Array
+    receptance: Array
 
 
 def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
@@ -242,34 +248,42 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     harmonic of psi for the deviation.
     """
     deviation, omega, speed = motion
+    # Its orders are those of the grid, and as many more.
+    fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
 
-    def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, _Balance]]:
-        answer = _answer(model, grid, w, n)
+    def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, Array, _Balance]]:
+        received = receptance(model, w, n, fine.orders)
+        answer = _at_port(model, grid, w, received)
         found = _balance(model, grid, answer, deviation, w, n)
-        return found.residual.ravel(), (answer, found)
+        return found.residual.ravel(), (received, answer, found)
 
-    def along(by_omega: Array, by_speed: Array) -> tuple[Array, Array, tuple[Array, _Balance]]:
+    def along(by_omega: Array, by_speed: Array) -> tuple[Array, Array, tuple[Array, Array, _Balance]]:
         return jax.jvp(residual, (omega, speed), (by_omega, by_speed), has_aux=True)
 
     both = jnp.eye(2, dtype=omega.dtype)
-    at, (by_omega, by_speed), (answer, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
+    at, (by_omega, by_speed), (received, answer, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
     matrix = _pinned(_jacobian(model, grid, answer, found, deviation, omega, speed), by_speed)
-    fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
     deviation_k = _deviation_harmonics(grid, deviation)
     there = (deviation_k @ np.exp(1j * grid.deviation_orders[:, None] * fine.theta)).real
-    between = _balance(model, fine, _answer(model, fine, omega, speed), there, omega, speed).residual
+    between = _balance(model, fine, _at_port(model, fine, omega, received), there, omega, speed).residual
     low = _deviation_harmonics(fine, between)[:, : grid.deviation_orders.shape[0]]
     seen = (low @ np.exp(1j * grid.deviation_orders[:, None] * grid.theta)).real.ravel()
     # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
-    slope = small_solve(matrix, -jnp.append(by_omega, 0.0))[-1]
-    error = solve_in_turn(*jax.lax.stop_gradient((matrix, jnp.append(seen, 0.0))))
+    slope = small_solve(matrix, -_then_zero(by_omega))[-1]
+    error = solve_in_turn(*jax.lax.stop_gradient((matrix, _then_zero(seen))))
     last = jnp.max(deviation_k[:, -1].real ** 2 + deviation_k[:, -1].imag ** 2)
     return BranchTangent(
         slope,
         jnp.max(jnp.abs(at)) / found.scale,
         jnp.abs(error[-1] / speed),
         jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)),
+        received[: grid.orders.size],
     )
+
+
+def _then_zero(residual: Array) -> Array:
+    """The right side of the whole Jacobian: psi has the mean 0."""
+    return jax.lax.pad(residual, np.zeros((), residual.dtype), [(0, 1, 0)])
 
 
 def _pinned(by_lag: Array, by_unknown: Array) -> Array:
@@ -295,12 +309,12 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> Harmonics:
-    """The harmonics of psi and of everything that the carrier does."""
+def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution, answer: Array | None = None) -> Harmonics:
+    """The harmonics of psi and of everything that the carrier does, whose receptance `answer` (K, nd, np) may be known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
     force = jnp.einsum("g,agi->ai", model.unbalance, point) @ grid.analysis
-    answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders)
+    answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders) if answer is None else answer
     displacement = jnp.einsum("kdp,pk->dk", answer, force)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import collected_model, has_half_turn
+from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.roots import next_share
@@ -161,7 +162,7 @@ class _Solver:
 
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
-        half = has_half_turn(self.scene)
+        half = has_half_turn(self.scene.effects)
         first, *more = _POINTS if half else [2 * p + 1 for p in _POINTS]
         found = self._batches(omega, first)
         for many in more:
@@ -188,7 +189,7 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
 
 @cached
 def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
-    model = collected_model(scene)
+    model = collected_model(jammed_model(scene))
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model.linear, omega, start))
     orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy)
@@ -213,7 +214,7 @@ def _tests(growth: Floquet) -> Array:
 def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[SpecialPoint, ...]:
     """Every sign change between neighbours that are both known, followed to its root."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS)]
-    if not has_half_turn(scene):
+    if not has_half_turn(scene.effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS)]
 
     def read(values: _Values) -> np.ndarray:

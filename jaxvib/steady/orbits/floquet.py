@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import CollectedModel, has_half_turn
+from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import LinearModel
+from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.ode.dopri8 import NODES, ROWS
@@ -49,7 +50,7 @@ def steps_for(model: LinearModel, omega: Array, speed: Array) -> Array:
     fastest = jnp.maximum(jnp.max(model.modes()[0]), decay)
     if carrier.gyroscopic is not None:
         fastest = fastest + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
-    turn = np.pi if has_half_turn(model.scene) else 2.0 * np.pi
+    turn = np.pi if has_half_turn(model.scene.effects) else 2.0 * np.pi
     return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
 
 

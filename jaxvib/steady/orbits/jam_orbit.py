@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import collected_model, has_half_turn
-from jaxvib.equations.linear import jammed_loads, jammed_model
+from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
-from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
@@ -105,15 +106,14 @@ def jam_orbit(
         accuracy = 1e-9 if floor < 1e-9 else 1e-3
     if not accuracy >= floor:
         raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    drag = jammed_loads(frozen).drag
-    if not traced(drag) and not np.any(np.asarray(drag) > 0.0):
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+    loads = jammed_loads(frozen)
+    require_drag(loads)
 
     exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
     if mode is not None:
         if frozen.machine.structure().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
-        jams = jam_modes(frozen)
+        jams = jams_of(frozen)
         light = jams.omega[jams.row(mode)]
         direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
         exists = jnp.isfinite(light)
@@ -127,29 +127,24 @@ def jam_orbit(
         which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
 
     if points is not None:
-        bodies = 1 if jammed_loads(frozen).alike else frozen.loads.count
+        bodies = 1 if loads.alike else loads.count
         count(points, "points", low=2, each=16.0 * bodies**2 * float(points if isinstance(points, int) else 1))
-    half = has_half_turn(scene)
+    half = has_half_turn(scene.effects)
     if points is None and not concrete:
         points = 16 if half else 33
     tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
     still = jax.lax.stop_gradient(value)
-    # Reverse-mode derivatives ask for a number of steps that is part of the program.
-    static = steps = 64
-    if concrete:
-        steps = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
-        static = 2 ** int(np.ceil(np.log2(float(steps))))
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
     many, found, settle = tried[0], None, False
 
     def attempt() -> Orbit:
         nonlocal many
         for many in tried[:-1]:
-            orbit = _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
+            orbit = _orbit(frozen, still, start, exists, direction, which, many, None, accuracy, settle)
             if not float(orbit.error) > accuracy:
                 return orbit
         many = tried[-1]
-        return _orbit(frozen, still, start, exists, direction, which, many, steps, accuracy, settle)
+        return _orbit(frozen, still, start, exists, direction, which, many, None, accuracy, settle)
 
     if concrete:
         found = attempt()
@@ -161,7 +156,12 @@ def jam_orbit(
             settle = True
             found = attempt()
     if found is None or differentiated:
-        found = _orbit(scene, value, start, exists, direction, which, many, static, accuracy, settle)
+        # Reverse-mode derivatives ask for a number of steps that is part of the program.
+        steps = 64
+        if concrete:
+            wanted = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
+            steps = 2 ** int(np.ceil(np.log2(float(wanted))))
+        found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, settle)
     elif throw and status_name(found.status) in ("absent", "not_converged"):
         raise failure(found.status)
     return found
@@ -191,16 +191,18 @@ def _orbit(
     direction: Array | None,
     given: Parameter,
     points: int,
-    steps: int | Array,
+    steps: int | None,
     accuracy: float,
     settle: bool = False,
 ) -> Orbit:
-    """One exact jam; to `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
-    model, deviation = collected_model(scene), None
+    """One exact jam; its multipliers by so many `steps`, or by those that the speeds ask for (no reverse derivatives then); to
+    `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
+    model, deviation = collected_model(jammed_model(scene)), None
     if settle:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
-    lanes, _ = orbits(model, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, steps, accuracy, deviation)
+    enough = steps_for(model.linear, *((value, start) if given == "omega" else (start, value))) if steps is None else steps
+    lanes, _ = orbits(model, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, enough, accuracy, deviation)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
     there = exists
@@ -282,7 +284,7 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
     none."""
-    model = collected_model(scene)
+    model = collected_model(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:

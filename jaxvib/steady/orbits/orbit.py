@@ -199,8 +199,9 @@ def orbits(
 
     def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
         motion = periodic_motion(model, grid, given, v, s, deviation)
-        harmonics = harmonics_of(model, grid, motion)
-        return motion, harmonics, _measured(model, grid, motion, harmonics)
+        branch = branch_tangent(model, grid, motion)
+        harmonics = harmonics_of(model, grid, motion, branch.receptance)
+        return motion, harmonics, (*branch[:-1], *_measured(model, grid, motion, harmonics))
 
     if value.shape[0] == 1:  # a program without an axis of length one is a smaller one
         alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
@@ -257,8 +258,7 @@ def orbits(
 
 
 def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
-    """Slope, residual, the two errors, amplitude, foundation force, power and push between loads of one motion."""
-    branch = branch_tangent(model, grid, motion)
+    """Amplitude, foundation force, power and push between loads of one motion."""
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
     acceleration = (harmonics.acceleration @ grid.synthesis).real
     drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
@@ -267,7 +267,7 @@ def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmo
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     push = _least_push(model, grid, motion, harmonics)
-    return (*branch, swings[:nd], force, motion.rotor_speed * drive, push)
+    return (swings[:nd], force, motion.rotor_speed * drive, push)
 
 
 def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.collected import has_half_turn
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
@@ -61,7 +61,7 @@ def usual_mode(scene: Scene) -> int:
 
 def collocation_points(scene: Scene, points: int) -> int:
     """So many points on half a period, or as close together on a whole one where that is needed."""
-    return points if has_half_turn(scene) else 2 * points + 1
+    return points if has_half_turn(scene.effects) else 2 * points + 1
 
 
 def slow_period(scene: Scene) -> float:

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import collected_model, has_half_turn
+from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.fields import in_unit
@@ -81,7 +83,7 @@ def harmonic_convergence(
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {points!r}; give numbers of points in ascending order")
     speeds = jnp.stack([number(w, "rad/s", "omega", low=0.0, open_low=True) for w in omega])
-    half = has_half_turn(scene)
+    half = has_half_turn(scene.effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]
     n, known = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))
     highest = np.array([grid_of(m, half).orders[-1] for m in points])
@@ -90,7 +92,7 @@ def harmonic_convergence(
 
 @cached
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    model = collected_model(scene)
+    model = collected_model(jammed_model(scene))
     grid = grid_of(points, model.half_turn)
 
     def one(w: Array) -> tuple[Array, Array]:
