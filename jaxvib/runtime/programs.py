@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import beneath, traced
+from jaxvib.runtime.compat import beneath, results_of, traced
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
@@ -179,11 +179,7 @@ def _pulled_anew(
 ) -> list[Array]:
     """`_pulled` of a function that is `reversed_anew`."""
     function, moving = _moving(question, active, arrays)
-
-    def wanted(*moving: Array) -> list[Array]:
-        return [x for is_asked, x in zip(asked, function(*moving)[0], strict=True) if is_asked]
-
-    return list(jax.vjp(wanted, *moving)[1](slopes))
+    return list(jax.vjp(results_of(lambda *moving: function(*moving)[0], asked, *moving), *moving)[1](slopes))
 
 
 def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
