@@ -10,6 +10,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import Spin, State, vector_field
@@ -38,9 +39,9 @@ _UNBOUNDED = 1e8
 class StepControl(eqx.Module):
     """How steps are chosen: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
 
-    tolerance: Array | None = None
-    steps: Array | None = None
-    max_steps: Array | None = None
+    tolerance: Array | np.ndarray | None = None
+    steps: Array | np.ndarray | None = None
+    max_steps: Array | np.ndarray | None = None
 
 
 def each_coordinate(unit: State, number: int) -> State:
@@ -118,7 +119,7 @@ def integrate(
     turns: Array,
     max_steps: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-    wanted: Array | None = None,
+    wanted: Array | np.ndarray | None = None,
 ) -> Run:
     """A run from 0 to `end`, measured over a window at its end, if `wanted`; see `simulate` for the other arguments."""
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
@@ -139,10 +140,10 @@ def integrate(
     first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
     if isinstance(controller, StepControl):
         if controller.steps is not None:
-            first = end / controller.steps
+            first = end / jnp.asarray(controller.steps)
         if controller.tolerance is not None:
             # As the error of a step of order 8 asks; two runs, one to a larger tolerance, then make other steps from the first.
-            first = 0.4 * controller.tolerance ** (1.0 / 9.0) / fastest
+            first = 0.4 * jnp.asarray(controller.tolerance) ** (1.0 / 9.0) / fastest
         controller = _controller(motion, state, unit, controller)
     solution = solve(
         motion.term,
@@ -184,7 +185,7 @@ def integrate(
     )
 
 
-def _measured(found: Callable[[], Measured], wanted: Array | None) -> Measured:
+def _measured(found: Callable[[], Measured], wanted: Array | np.ndarray | None) -> Measured:
     """What is measured, where it is wanted, else NaN: of a run that another is compared with nobody reads it."""
     if wanted is None:
         return found()

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeAlias, cast
 
 import diffrax
 import equinox as eqx
@@ -31,6 +31,8 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
+
+_Control: TypeAlias = "StepControl | diffrax.AbstractStepSizeController"
 
 _MOST_STEPS = 2**31 - 1
 
@@ -132,23 +134,22 @@ def simulate(
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
-    def run(chosen: StepControl | diffrax.AbstractStepSizeController, wanted: bool = True) -> Run:
-        kept = samples if save == "all" else 0
-        allowed = min(count(max_steps, "max_steps"), _MOST_STEPS)
-        measuring = None
-        if known and adjoint is None:
-            chosen, allowed = _limited(chosen, allowed)
-            measuring = jnp.asarray(wanted)
-        stretches = _stretches(scene, end, state, save)
-        if stretches > 1:
-            return _in_stretches(scene, end, stretches, state, solver, chosen, adjoint, periods, allowed)
-        begun = time.perf_counter()
-        found = integrate(scene, end, state, solver, chosen, adjoint, kept, periods, allowed, progress_meter, measuring)
-        if traced(found.steps):
-            return found
-        jax.block_until_ready(found.steps)
-        return _with(found, seconds=time.perf_counter() - begun)
+    kept, allowed = samples if save == "all" else 0, min(count(max_steps, "max_steps"), _MOST_STEPS)
+    stretches = _stretches(scene, end, state, save)
 
+    def stretch(span: Array, state: State, chosen: _Control, wanted: bool) -> Run:
+        most, measuring = allowed, None
+        if known and adjoint is None:
+            chosen, most = _limited(chosen, allowed)
+            measuring = np.asarray(wanted)
+        return integrate(scene, span, state, solver, chosen, adjoint, kept, periods, most, progress_meter, measuring)
+
+    def run(chosen: _Control, wanted: bool = True) -> Run:
+        if stretches > 1:
+            return _in_stretches(scene, end, stretches, state, chosen, stretch)
+        return stretch(end, state, chosen, wanted)
+
+    begun = time.perf_counter()
     if isinstance(stepsize_controller, Accuracy):
         if not known:
             raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
@@ -159,22 +160,24 @@ def simulate(
     else:
         coarse, found = run(_coarser(control), wanted=False), run(control)
         found = _compared(scene, found, coarse, control, _coarser(control), [coarse])
-    if throw and not traced(found.steps):
+    if traced(found.steps):
+        return found
+    jax.block_until_ready(found.steps)
+    found = _with(found, seconds=time.perf_counter() - begun)
+    if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
     return found
 
 
-def _limited(
-    chosen: StepControl | diffrax.AbstractStepSizeController, most: int
-) -> tuple[StepControl | diffrax.AbstractStepSizeController, int]:
+def _limited(chosen: _Control, most: int) -> tuple[_Control, int]:
     """The control with the limit of its steps as a number of the program, as far as it can be, and what limits the loop."""
     if not isinstance(chosen, StepControl) or (chosen.steps is not None and float(chosen.steps) > most):
         return chosen, most
-    limit = None if chosen.tolerance is None else jnp.asarray(most, jnp.int32)
+    limit = None if chosen.tolerance is None else np.asarray(most, np.int32)
     return StepControl(chosen.tolerance, chosen.steps, limit), _MOST_STEPS
 
 
-def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> StepControl | diffrax.AbstractStepSizeController:
+def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> _Control:
     """What was asked for, checked: nothing that the dtype cannot deliver."""
     require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
     if isinstance(chosen, diffrax.AbstractStepSizeController):
@@ -183,26 +186,27 @@ def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> St
             raise InputError("estimate", problem)
         return chosen
     if isinstance(chosen, EqualSteps):
-        return StepControl(steps=jnp.asarray(count(chosen.number, "steps"), end.dtype))
+        return StepControl(steps=np.asarray(count(chosen.number, "steps"), end.dtype))
     precision = float(jnp.finfo(end.dtype).eps)
     if isinstance(chosen, Accuracy):
         if estimate is False:
             raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a Tolerance")
         accuracy = small_number(chosen.error, "accuracy", end, 1e3)
-        return StepControl(tolerance=jnp.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
+        return StepControl(tolerance=np.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
     default = 1e-8 if precision < 1e-10 else 1e-5
     tolerance = default if chosen is None else small_number(chosen.tolerance, "tolerance", end, 10.0)
-    return StepControl(tolerance=jnp.asarray(tolerance, end.dtype))
+    return StepControl(tolerance=np.asarray(tolerance, end.dtype))
 
 
 def _coarser(control: StepControl) -> StepControl:
     if control.steps is not None:
-        return StepControl(steps=jnp.ceil(control.steps / 2.0))
+        return StepControl(steps=np.asarray(np.ceil(control.steps / 2.0), control.steps.dtype))
     assert control.tolerance is not None
-    return StepControl(tolerance=jnp.minimum(_COARSER * control.tolerance, jnp.sqrt(control.tolerance)))
+    larger = np.minimum(_COARSER * control.tolerance, np.sqrt(control.tolerance))
+    return StepControl(tolerance=np.asarray(larger, control.tolerance.dtype))
 
 
-def _shrink(fine: StepControl, coarse: StepControl) -> Array:
+def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
     """What share of the difference between two runs is the error of the finer one, where the motion is smooth: for a method of
     order 8 the error falls with the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.45 and 3, so that the
     estimate errs upward."""
@@ -217,7 +221,7 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
     fastest, _ = fastest_and_slowest(scene)
     error = _error(scene, fastest, fine.window, fine.steps, coarse.window.state, coarse.status, control, coarser)
     evaluations = sum((run.evaluations for run in before), fine.evaluations)
-    return _with(fine, error=error, evaluations=evaluations, seconds=sum((run.seconds for run in before), fine.seconds))
+    return _with(fine, error=error, evaluations=evaluations)
 
 
 @cached
@@ -265,7 +269,7 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
         before, coarse = latest, control
         tried.append(latest)
-        control = StepControl(tolerance=jnp.asarray(max(share * tolerance, floor), found.error.dtype))
+        control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), found.error.dtype))
     return eqx.tree_at(lambda r: r.status, found, RunStatus.not_accurate)
 
 
@@ -287,23 +291,20 @@ def _in_stretches(
     end: Array,
     number: int,
     state: State,
-    solver: diffrax.AbstractSolver | None,
-    controller: diffrax.AbstractStepSizeController | StepControl,
-    adjoint: diffrax.AbstractAdjoint | None,
-    turns: Array,
-    max_steps: int,
+    controller: _Control,
+    integrated: Callable[[Array, State, _Control, bool], Run],
 ) -> Run:
-    """The run of the last of several stretches; each begins at time 0 after whole turns of the rotor, angles within one."""
-    begun = time.perf_counter()
+    """The run of the last of several stretches, each `integrated` from a state over a time, measured if that is wanted; each
+    begins at time 0 after whole turns of the rotor, angles within one."""
     if isinstance(controller, StepControl) and controller.steps is not None:
-        controller = StepControl(steps=jnp.ceil(controller.steps / number))
+        controller = StepControl(steps=np.asarray(np.ceil(controller.steps / number), controller.steps.dtype))
     length = whole_turns(scene, float(end) / number)
     last = float(end) - (number - 1) * length
     taken, rejected, evaluations, together = 0, 0, 0, True
     found = None
     for k in range(number):
         span = jnp.asarray(length if k < number - 1 else last, end.dtype)
-        found = integrate(scene, span, state, solver, controller, adjoint, 0, turns, max_steps, None)
+        found = integrated(span, state, controller, k == number - 1)
         state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
         evaluations, together = evaluations + int(found.evaluations), found.together & together
@@ -313,7 +314,7 @@ def _in_stretches(
     counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
-    return _with(found, seconds=time.perf_counter() - begun, together=together)
+    return _with(found, together=together)
 
 
 def whole_turns(scene: Scene, stretch: float) -> float:

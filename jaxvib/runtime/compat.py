@@ -70,8 +70,9 @@ try:
     HAS_JAXPRS = True
 except ImportError:
     HAS_JAXPRS = False
-    if not TYPE_CHECKING:
-        ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
+    if TYPE_CHECKING:
+        raise
+    ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
 """Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
 
 

@@ -234,4 +234,5 @@ def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) 
 
     added, least = jax.lax.fori_loop(0, 16, narrow, (grid[at], grid[at + 2], grid[at + 1], lowest))[2:]
     points, values = jnp.concatenate([grid, added]), jnp.concatenate([value, side * least])
-    return jax.lax.sort((points, values), num_keys=1)
+    points, values = jax.lax.sort((points, values), num_keys=1)
+    return points, values
