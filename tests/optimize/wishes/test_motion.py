@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -36,6 +37,11 @@ def test_the_amplitude_settles_within_a_share(within, size):
 def test_what_still_changes_settles_at_the_end():
     falling = answers(2.0 - 0.1 * TIME)
     np.testing.assert_allclose(settling_time(until=10.0, spin_up=2.0, within=0.001, of=2).read(falling), 10.0, atol=0.006)
+    # Where not even the last sample is near enough, the end of the run is the answer, and nothing moves it.
+    still = lambda slope: settling_time(until=10.0, spin_up=2.0, within=1e-6, of=2).read(answers(2.0 - slope * TIME))  # noqa: E731
+    time, by_slope = jax.value_and_grad(still)(0.1)
+    np.testing.assert_allclose(time, 10.0, atol=0.006)
+    assert by_slope == 0.0
     with pytest.raises(jv.InputError, match="platforms 1 to 2"):
         settling_time(until=10.0, spin_up=2.0, of=3).read(falling)
     for within in (0.0, 1.0):
