@@ -1,5 +1,7 @@
 """Where jams at unequal phases are looked for, and what Newton's method says of phases at a load speed."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +43,8 @@ def test_load_speeds_crowd_about_the_resonance():
 def test_regular_phases_are_every_split_into_two():
     splits = _regular(parts(count=3))
     assert {tuple(np.round(row / np.pi).astype(int)) for row in splits} == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)}
+    five = {tuple(np.round(row / np.pi).astype(int)) for row in _regular(parts(count=5))}
+    assert five == {(*four, 0) for four in itertools.product((0, 1), repeat=4)}
 
 
 @pytest.mark.parametrize("omega", [150.0, 170.0, 200.0])
