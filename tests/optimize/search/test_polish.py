@@ -63,8 +63,10 @@ SPACE = DesignSpace(SCENE, {**FREE, "machine.link_stiffness": (1e5, 4e5), "loads
 MANY = problem_of(SPACE, NEAR, [FIRST < 4.0, FIRST < 5.0], starts=2)
 
 
-def test_multipliers_are_those_that_the_slopes_were_made_of():
-    """One held, two demands, a number at each kind of bound: the objective's slope is put together of known multipliers."""
+@pytest.mark.parametrize("scale", [1.0, 1e-6])
+def test_multipliers_are_those_that_the_slopes_were_made_of(scale):
+    """One held, two demands, a number at each kind of bound: the objective's slope is put together of known multipliers, and
+    multipliers are ratios of slopes, whatever the size of these."""
     random = np.random.default_rng(0)
     rows = random.normal(size=(6, 3, 4))
     held, first, second = random.normal(size=6), random.uniform(1.0, 2.0, 6), random.uniform(1.0, 2.0, 6)
@@ -75,10 +77,10 @@ def test_multipliers_are_those_that_the_slopes_were_made_of():
     second[:3] = 0.0  # a demand with room has no multiplier, whatever its slope
     values = np.stack([np.full(6, 3.0), np.zeros(6), np.zeros(6), np.where(second > 0.0, 0.0, -0.5)], axis=1)
     slope = -np.einsum("ms,smd->sd", np.stack([held, first, second]), rows) - bounds
-    found = optimality(MANY, point_of(z, values, np.concatenate([slope[:, None], rows], axis=1)))
+    found = optimality(MANY, point_of(z, values, scale * np.concatenate([slope[:, None], rows], axis=1)))
     np.testing.assert_allclose(found.held[:, 0], held, rtol=1e-9)
     np.testing.assert_allclose(found.demands, np.stack([first, second], axis=1), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.bounds, bounds, atol=1e-9)
+    np.testing.assert_allclose(found.bounds / scale, bounds, atol=1e-9)
     assert np.all(found.kkt < 1e-9)
 
 
