@@ -44,6 +44,13 @@ CASES = {
         "opposite",
         0,
     ),
+    "imbalance is balanced": (
+        dict(phase=3.8 + np.pi / 3.0 * np.array([1, -1, -1, 1]), speed=460.0, effects=(jv.StaticImbalance(8e-3, 3.8 - np.pi),)),
+        "balanced",
+        None,
+        0,
+    ),
+    "hardly slower than the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=0.9975 * 460.0), "unbalanced", "together", 0),
     "parted": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=[170.0, 170.0, 460.0, 460.0]), "parted", None, 0),
     "unsettled": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=200.0, slow=5.0), "unsettled", None, 0),
 }
