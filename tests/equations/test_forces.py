@@ -21,3 +21,16 @@ def test_energy_changes_by_the_power_that_comes_and_goes(name):
     size = abs(float(supplied)) + abs(float(lost))
     assert float(lost) > 0.0
     np.testing.assert_allclose(change, supplied - lost, atol=1e-11 * size)
+
+
+def test_every_support_pushes_on_the_bed():
+    """Springs and dampers 15 - 6 + 0.8 + 1 N, a spring 2e12 x^3, a stop 1e6 (x - 1e-4) + 500 x', one that is not reached."""
+    machine = jv.two_mass(mass=(12.0, 9.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
+    supports = (
+        jv.CubicSupport(2e12, platform=2),
+        jv.Stop(1e6, gap=1e-4, damping=500.0, side="above", platform=1),
+        jv.Stop(3e6, gap=1e-4, damping=700.0, side="below", platform=1),
+    )
+    s = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0), supports)
+    state = jv.State(jnp.array([3e-4, -2e-4]), jnp.array([0.02, 0.05]), (jnp.ones(1),), (jnp.zeros(1),))
+    np.testing.assert_allclose(jv.foundation_force(s, state), [10.8 - 16.0 + 200.0 + 10.0], rtol=1e-12)
