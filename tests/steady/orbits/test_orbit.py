@@ -170,6 +170,21 @@ def test_error_falls_exponentially_and_is_known():
     assert errors[1] < 1e-8 < 1e-4 * errors[0]
 
 
+def test_jams_are_found_from_load_speeds_that_are_far_from_theirs():
+    """Steps of Newton's method that lead away are shortened: from every load speed to one at which the rotor has its speed."""
+    scene = published(eps=0.05, speed=3.0).scene()
+    model, grid = assembled(scene), grid_of(16, True)
+
+    def found(start):
+        motion = periodic_motion(model, grid, "rotor_speed", scene.drive.speed, start)
+        known = periodic_motion(model, grid, "omega", motion.omega, jam_rotor_speed(scene, motion.omega))
+        return branch_tangent(model, grid, motion).residual, known.rotor_speed
+
+    residual, speed = jax.jit(jax.vmap(found))(jnp.linspace(0.5, 2.0, 31))
+    assert np.max(residual) < 1e-12
+    np.testing.assert_allclose(speed, 3.0, rtol=1e-9)
+
+
 def test_figure_of_convergence():
     found = jv.harmonic_convergence(published(eps=0.05).scene(), [0.34, 0.97], points=(4, 8))
     assert found.harmonics.tolist() == [3, 7] and np.all(found.error[1] < 1e-4 * found.error[0])
