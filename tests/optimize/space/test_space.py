@@ -1,5 +1,6 @@
 """Design spaces: scales, catalogues, ties, what is refused."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -98,3 +99,11 @@ def test_wrong_spaces_are_said_in_one_sentence(make, says):
     with pytest.raises(jv.InputError) as caught:
         make()
     assert says in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_tie_keeps_no_ratio_to_what_is_nothing():
+    """Nor where only one of several numbers is."""
+    half = eqx.tree_at(lambda s: s.machine.damping, SCENE, jnp.array([0.0, 9.0]))
+    ties = {"machine.stiffness": ("machine.damping", "keep")}
+    with np.errstate(divide="ignore"), pytest.raises(jv.InputError, match=r"machine\.damping, which is 0 in the scene"):
+        DesignSpace(half, {"loads.drag": (1.0, 2.0)}, ties=ties)
