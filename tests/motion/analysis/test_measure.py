@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from small_machine import small_run
 
 import jaxvib as jv
-from jaxvib.motion.analysis.measure import measure
+from jaxvib.motion.analysis.measure import mean_speeds, measure
 from jaxvib.motion.analysis.scaled_error import estimated_error, natural_units
 
 
@@ -116,6 +116,14 @@ def test_a_change_of_the_loads_speed_is_told_relative_to_it():
     # Speeds grow evenly: their mean over the second half is that at 15 s, over all of it that at 10 s, but for part of a turn.
     np.testing.assert_allclose(measured.drift, 0.0025 / 1.005, rtol=0.02)
     assert not bool(measured.settled)
+
+
+def test_the_mean_speed_of_a_load_that_rests_has_a_derivative():
+    """phi = 0.3 + p t: its speed is p, at p = 0 too."""
+    t = jnp.linspace(0.0, 4.0, 9)
+    speed, slope = jax.value_and_grad(lambda p: mean_speeds(t, 0.3 + p * t[:, None], jnp.full((9, 1), p), [0])[0, 0])(0.0)
+    assert speed == 0.0
+    np.testing.assert_allclose(slope, 1.0, rtol=1e-12)
 
 
 def test_rounding_counts_for_every_step_and_radian():
