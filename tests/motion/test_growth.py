@@ -1,5 +1,10 @@
 """How disturbances grow: chaos is named, and its exponent is right."""
 
+import itertools
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,6 +34,23 @@ def test_a_linear_oscillator_is_regular():
     found = jv.growth(scene, 100.0, start=start, stretches=8)
     assert found.status_name == "regular" and np.isinf(found.horizon) and found.rates.shape == (8,)
     assert -0.026 < found.exponent < 1e-3
+
+
+def test_angles_that_are_kept_within_a_turn_are_compared_across_its_end(monkeypatch):
+    """In single precision of two motions that are 2 pi - 6.2 apart one may end at 3.1 rad, the other at -3.1 rad."""
+    ends = itertools.cycle([3.1, -3.1])
+
+    def run(scene, stretch, *, start, **_):
+        end = eqx.tree_at(lambda s: s.angle, start, (jnp.full(1, next(ends)),))
+        return SimpleNamespace(status=jv.RunStatus.done, window=SimpleNamespace(state=jax.tree.map(lambda x: x[None], end)))
+
+    monkeypatch.setattr("jaxvib.motion.growth.simulate", run)
+    with jax.enable_x64(False):
+        scene, start = forced(0.0, 1.0)
+        found = jv.growth(scene, 100.0, start=start, stretches=8)
+    # From 0.01 apart, of which what is no angle stays.
+    grown = 0.01 * np.exp(found.rates * found.time[0])
+    assert np.all((grown > 2.0 * np.pi - 6.2 - 1e-5) & (grown < np.hypot(2.0 * np.pi - 6.2, 0.01) + 1e-5))
 
 
 @pytest.mark.parametrize(
