@@ -118,6 +118,19 @@ def test_a_change_of_the_loads_speed_is_told_relative_to_it():
     assert not bool(measured.settled)
 
 
+def test_a_mean_speed_is_that_over_whole_turns():
+    """phi = w t + e t^2/2 up to T: from where whole turns are left, between two samples, by a quadratic equation."""
+    w, e, end = 7.0, 0.5, 5.0
+    t = jnp.linspace(0.0, end, 401)
+    turns = np.floor((w * end + e * end**2 / 2.0) / (2.0 * np.pi))
+    left = w * end + e * end**2 / 2.0 - 2.0 * np.pi * turns
+    start = (np.sqrt(w**2 + 2.0 * e * left) - w) / e
+    assert turns == 6.0 and 0.01 < start / (end / 400.0) % 1.0 < 0.99
+    for sign in (1.0, -1.0):
+        found = mean_speeds(t, sign * (w * t + e * t**2 / 2.0)[:, None], sign * (w + e * t)[:, None], [0])[0, 0]
+        np.testing.assert_allclose(found, sign * 2.0 * np.pi * turns / (end - start), rtol=1e-10)
+
+
 def test_the_mean_speed_of_a_load_that_rests_has_a_derivative():
     """phi = 0.3 + p t: its speed is p, at p = 0 too."""
     t = jnp.linspace(0.0, 4.0, 9)
