@@ -1,6 +1,7 @@
 """Averaged runs against time integration of the full equations, and what they can do."""
 
 import functools
+from types import SimpleNamespace
 from typing import ClassVar
 
 import diffrax
@@ -12,7 +13,7 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
-from jaxvib.motion.envelope.envelope import _Tolerance
+from jaxvib.motion.envelope.envelope import _measure, _Tolerance
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
 
@@ -247,6 +248,26 @@ class Wind(jv.Effect):
 def test_what_cannot_be_averaged_is_refused(change, says):
     with pytest.raises(jv.InputError, match=says):
         jv.envelope(**{"scene": small(), "until": 10.0, **change})
+
+
+def test_what_is_measured_of_a_window():
+    """Amplitudes of millimetres, the larger one 3 % larger in the later half; loads that speed up, the mean of the later half
+    1 % above that of all."""
+    late = np.arange(8) >= 4
+    window = SimpleNamespace(
+        time=np.arange(8.0),
+        amplitude=jnp.asarray(np.stack([np.where(late, 1.03e-3, 1e-3), np.full(8, 2e-4)], axis=1)),
+        foundation_force=jnp.asarray(np.stack([np.where(late, 4.0, 3.0), np.where(late, 2.0, 3.0)], axis=1)),
+        load_speed=jnp.full((8, 2), 50.0),
+    )
+    found = _measure(published().scene(), window)
+    np.testing.assert_allclose(found.drift, 0.03 / 1.03, rtol=1e-9)
+    np.testing.assert_allclose(found.amplitude, [1.03e-3, 2e-4])
+    np.testing.assert_allclose(found.foundation_force, 5.0)
+    np.testing.assert_allclose([found.omega, *found.load_speed], 50.0)
+    window.load_speed = jnp.asarray(np.where(late, 50.5, 49.5)[:, None] + np.zeros(2))
+    window.amplitude = jnp.full((8, 2), 1e-3)
+    np.testing.assert_allclose(_measure(published().scene(), window).drift, 0.01, rtol=1e-9)
 
 
 def test_a_run_that_does_not_finish_says_so():
