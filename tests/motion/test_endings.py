@@ -10,7 +10,7 @@ from scenes import published, scene
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.integrate import _grew, is_finite
+from jaxvib.motion.integrate import _grew, _status, is_finite
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
@@ -21,6 +21,21 @@ def test_a_run_that_does_not_finish_says_so():
     assert error.value.status == "max_steps_reached"
     run = jv.simulate(published().scene(), 20.0, max_steps=16, throw=False)
     assert bool(run.status == jv.RunStatus.max_steps_reached)
+
+
+@pytest.mark.parametrize(
+    ("result", "status"),
+    [
+        ("successful", "done"),
+        ("max_steps_reached", "max_steps_reached"),
+        ("dt_min_reached", "not_finite"),  # what is not finite makes every step too large
+        ("nonlinear_divergence", "no_step"),
+    ],
+)
+def test_what_the_integrator_says_is_the_status(result, status):
+    for bounded in (True, False):
+        found = _status(getattr(diffrax.RESULTS, result), jnp.asarray(bounded))
+        assert bool(found == getattr(jv.RunStatus, status if bounded else "not_finite"))
 
 
 def test_a_lane_whose_start_does_not_exist_says_so():
