@@ -194,6 +194,8 @@ def test_folds_are_looked_for_on_both_sides_of_every_pole():
         below, above = pole.imag - grid[grid < pole.imag - 1e-12], grid[grid > pole.imag + 1e-12] - pole.imag
         for side in (below, above):
             assert np.min(side) < 0.5 * -pole.real and np.sum(side < 10.0 * -pole.real) > 6
+            away = np.sort(side[side > -pole.real])  # beyond a width each is at most a third further away
+            assert np.max(away[1:] / away[:-1]) < 4.0 / 3.0
 
 
 def test_two_folds_in_one_interval_are_found():
