@@ -8,12 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import torus
 from scenes import published, scene, some_state
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
 from jaxvib.motion.integrate import StepControl, fastest_and_slowest, integrate
-from jaxvib.motion.simulate import _control, _enough_samples, _raise_if_failed, _shrink, _to_accuracy, enough_steps
+from jaxvib.motion.simulate import (
+    _control,
+    _enough_samples,
+    _raise_if_failed,
+    _sample_size,
+    _shrink,
+    _to_accuracy,
+    enough_steps,
+)
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
 
@@ -43,6 +52,14 @@ def test_wrong_arguments_are_one_sentence(arguments, sentence):
     with pytest.raises(jv.InputError) as error:
         jv.simulate(published().scene(), **{"until": 10.0, **arguments})
     assert str(error.value).startswith(sentence)
+
+
+@pytest.mark.parametrize("s", [scene("two_mass", "balls"), torus.scene()], ids=["angles", "angles and places in a tube"])
+def test_a_sample_takes_what_is_kept_of_it(s):
+    """The state, the force on the bed, time, angle and speed of the rotor, 8 bytes each, three times; two more may be spare."""
+    force = s.machine.carrier().bed_stiffness.shape[0]
+    kept = sum(leaf.size for leaf in jax.tree.leaves(jv.initial_state(s))) + force + 3
+    assert 24.0 * kept <= _sample_size(s) <= 24.0 * (kept + 2)
 
 
 @pytest.mark.parametrize(
