@@ -1,6 +1,7 @@
 """The arguments of a run, and runs in batches."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import diffrax
 import equinox as eqx
@@ -13,7 +14,7 @@ from scenes import published, scene, some_state
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.integrate import StepControl, fastest_and_slowest, integrate
+from jaxvib.motion.integrate import StepControl, added_rate, fastest_and_slowest, integrate
 from jaxvib.motion.simulate import (
     _control,
     _enough_samples,
@@ -52,6 +53,16 @@ def test_wrong_arguments_are_one_sentence(arguments, sentence):
     with pytest.raises(jv.InputError) as error:
         jv.simulate(published().scene(), **{"until": 10.0, **arguments})
     assert str(error.value).startswith(sentence)
+
+
+def test_steps_resolve_what_effects_add_to_the_fastest_load():
+    quick, none = (
+        SimpleNamespace(own_rate=lambda loads, speed, rate=rate: rate) for rate in (jnp.array([9.0, 30.0, 20.0]), None)
+    )
+    motion = SimpleNamespace(effects=(none, quick), loads=None, drive=jv.ConstantSpeed(5.0))
+    assert added_rate(motion) == 30.0
+    motion.effects = (none,)
+    assert added_rate(motion) == 0.0
 
 
 @pytest.mark.parametrize("s", [scene("two_mass", "balls"), torus.scene()], ids=["angles", "angles and places in a tube"])
