@@ -46,6 +46,17 @@ def test_special_points_of_light_loads_are_the_published_folds():
     np.testing.assert_allclose([p.rotor_speed for p in special], [0.7978, 0.4141, 5.1829, 1.3932], rtol=2e-4)
 
 
+def test_every_fold_of_a_coarse_diagram_is_found_to_its_last_digits():
+    """However soon others are found: what is left of dn/dOmega there, beside what is left 1e-6 away."""
+    scene = published(eps=0.05).scene()
+    found = jv.branches(scene, exact=True, points=25, least=0.25, most=2.0)
+    folds = [point.omega for point in found.special if point.kind == "fold"]
+    assert len(folds) == 4
+    for omega in folds:
+        at, beside = (abs(float(jv.jam_orbit(scene, omega=omega * away).slope)) for away in (1.0, 1.0 + 1e-6))
+        assert at < 1e-2 * beside
+
+
 def test_heavy_loads_lose_stability_at_a_torus_and_by_symmetry():
     found = diagram(0.3)
     kinds = [(p.kind, round(p.omega, 3)) for p in found.special]
