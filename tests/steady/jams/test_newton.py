@@ -53,3 +53,9 @@ def test_more_unknowns_than_numbers_are_written_for_stay_on_arrays():
         if e.primitive.name == "while"
     )
     assert any(v.aval.shape for v in loop.outvars)
+
+
+def test_a_small_residual_is_no_reason_to_stop_where_a_step_leads_too_far():
+    """1e-9 arctan(20 x) from 0.3: full steps leap over the zero ever further, what is left is 1e-9 all the time."""
+    x, _ = damped_newton(lambda x, _: (1e-9 * jnp.arctan(20.0 * x), x), jnp.array([0.3]), jnp.zeros(1))
+    np.testing.assert_allclose(x, 0.0, atol=1e-9)
