@@ -126,6 +126,22 @@ def test_states_that_were_not_noted_are_computed_again(right, max_steps):
     np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
 
 
+def test_states_within_the_first_step_have_derivatives():
+    """By where the motion begins: a state that is saved there moves with it, one within the first step as forward mode says."""
+
+    def value(y0, adjoint=None):
+        save = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.asarray([0.0, 0.06]))])
+        given = dict(first_step=jnp.asarray(0.1), max_steps=32, controller=diffrax.ConstantStepSize(), adjoint=adjoint)
+        solution = solve(forced(plain, 0.0), diffrax.Dopri8(), end=jnp.asarray(1.0), y0=y0, args=ARGS, saveat=save, **given)
+        return jnp.stack(solution.ys[0])
+
+    start = (jnp.asarray(1.0), jnp.asarray(0.5))
+    reverse = jnp.stack(jax.jit(jax.jacrev(value))(start), axis=-1)
+    np.testing.assert_array_equal(reverse[:, 0], np.eye(2))
+    forward = jnp.stack(jax.jit(jax.jacfwd(lambda y0: value(y0, diffrax.ForwardMode())))(start), axis=-1)
+    np.testing.assert_allclose(reverse, forward, atol=1e-13)
+
+
 @pytest.mark.parametrize("controller", [diffrax.ConstantStepSize(), diffrax.PIDController(rtol=1e-7, atol=1e-7)])
 def test_slopes_by_the_end_and_by_constant_steps(controller):
     """Saved states follow their times, the last step its end; constant steps move all together, chosen ones do not."""
