@@ -213,6 +213,16 @@ def test_two_folds_in_one_interval_are_found():
         assert np.min(np.abs(np.asarray(wide) - closest)) < 1e-3
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_two_folds_in_the_interval_beside_another_are_found(sign):
+    """A fold at 2.2, and slopes of the other sign from 3.17 to 3.37, between points at 3 and 3.5."""
+    slope = lambda w: sign * (w - 2.2) * ((w - 3.27) ** 2 - 0.01)  # noqa: E731
+    wide, values = folds._with_close_folds(slope, jnp.linspace(0.0, 10.0, 21), 4)
+    between = (wide > 3.17) & (wide < 3.37)
+    assert np.any(between) and np.all(sign * values[between] < 0.0)
+    np.testing.assert_allclose(values, slope(wide), rtol=1e-12)
+
+
 def test_a_point_that_is_closest_already_is_kept():
     slope = lambda w: jnp.abs(w - 3.5) + 0.1  # noqa: E731
     wide, values = folds._with_close_folds(slope, jnp.linspace(0.0, 10.0, 21), 1)
