@@ -208,6 +208,18 @@ def test_each_operation_is_done_once_and_none_for_nothing():
     np.testing.assert_allclose(jax.core.eval_jaxpr(program.jaxpr, program.consts, *x), [wasteful(jnp.asarray(x))], rtol=1e-15)
 
 
+def test_programs_within_a_program_are_not_taken_for_each_other():
+    """They read alike where nothing but the arrays that they hold differs."""
+
+    def function(x):
+        one, other = (jax.jit(lambda y, held=held: held * y) for held in np.array([[1.0, 2.0], [3.0, 4.0]]))
+        return one(x) + 10.0 * other(x)
+
+    program = module._without_repeats(jax.make_jaxpr(function)(jnp.ones(2)))
+    found = jax.core.eval_jaxpr(program.jaxpr, program.consts, jnp.array([0.5, 0.7]))
+    np.testing.assert_allclose(found, [[15.5, 29.4]], rtol=1e-15)
+
+
 def names_and_values(program, *x):
     names = sorted(equation.primitive.name for equation in program.jaxpr.eqns)
     return names, jax.core.eval_jaxpr(program.jaxpr, program.consts, *x)
