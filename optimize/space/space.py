@@ -277,7 +277,8 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         if source.size not in (1, target.size):
             raise InputError(f"ties.{name}", f"has {target.size} entries and {source_name} {source.size}; name one of them")
         if factor == "keep":
-            ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))
+            with np.errstate(divide="ignore", invalid="ignore"):  # told below
+                ratio = np.asarray(target.read(scene)) / np.asarray(source.read(scene))
         elif isinstance(factor, (int, float)) and not isinstance(factor, bool) and factor > 0.0:
             ratio = np.full(target.size, float(factor))
         else:

@@ -141,7 +141,7 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
     """
     nd = resonances.shape[0]
     owners: list[Array] = []
-    later = jnp.sum(found) // 2 - 1
+    later = jnp.sum(found[1::2]) - 1
     for k, peak in enumerate(cuts[0::2]):
         nearest = 1 + jnp.argmin(jnp.abs(resonances - peak))
         free = jnp.clip(nd - (later - k), 1, nd)

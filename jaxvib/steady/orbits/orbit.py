@@ -292,7 +292,7 @@ _PARTS = 16
 
 def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included."""
-    each = max(4, int(orders[-1]) // 4)
+    each = max(16, int(orders[-1]) // 4)
     width = 2.0 * np.pi / _PARTS
     samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
     still, k = jax.lax.stop_gradient(harmonics), np.asarray(orders, harmonics.real.dtype)[None]
@@ -305,7 +305,7 @@ def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
     def newton(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
         first, second = at(slopes, wave).T
-        step = first / jnp.where(second < 0.0, second, -jnp.inf)
+        step = first / jnp.where(second < 0.0, second, -jnp.finfo(second.dtype).tiny)  # uphill in any case
         theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
         return theta, jax.lax.complex(*sine_and_cosine(k * theta[:, None])[::-1])
 
