@@ -20,6 +20,7 @@ from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root
 from jaxvib.units import traced
 
 __all__ = [
+    "AbstractLinearModel",
     "JammedModel",
     "LinearModel",
     "circular_loads",
@@ -37,7 +38,7 @@ __all__ = [
 ]
 
 
-class LinearModel(eqx.Module):
+class AbstractLinearModel(eqx.Module):
     """A scene, its carrier, and the carrier's mass with the loads on it: assembled once a question, and handed on.
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
@@ -45,9 +46,9 @@ class LinearModel(eqx.Module):
     **Attributes**: `scene`; `carrier`, see `Carrier`; `mass` M (nd, nd) kg, the loads' masses at the port or at their stations.
     """
 
-    scene: Scene
-    carrier: Carrier
-    mass: Array
+    scene: eqx.AbstractVar[Scene]
+    carrier: eqx.AbstractVar[Carrier]
+    mass: eqx.AbstractVar[Array]
 
     @property
     def direction(self) -> Array:
@@ -74,6 +75,14 @@ class LinearModel(eqx.Module):
         return root_or_zero(values), inverse.T @ vectors
 
 
+class LinearModel(AbstractLinearModel):
+    """A linear model whose loads may move in any way, see `AbstractLinearModel`."""
+
+    scene: Scene
+    carrier: Carrier
+    mass: Array
+
+
 def linear_model(scene: Scene) -> LinearModel:
     """The scene's carrier with the loads on it, see `LinearModel`."""
     carrier = scene.machine.carrier()
@@ -86,13 +95,16 @@ def linear_model(scene: Scene) -> LinearModel:
     return LinearModel(scene, carrier, mass)
 
 
-class JammedModel(LinearModel):
+class JammedModel(AbstractLinearModel):
     """A linear model whose loads are jammed: checked, and what is the same at all load speeds computed, once a question.
 
-    **Attributes**, besides those of `LinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2, N m s;
-    `push` (nd,) complex, the `direction` of their force.
+    **Attributes**, besides those of `AbstractLinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2,
+    N m s; `push` (nd,) complex, the `direction` of their force.
     """
 
+    scene: Scene
+    carrier: Carrier
+    mass: Array
     unbalance: Array
     drag: Array
     push: Array

@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
-from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
+from jaxvib.equations.linear import AbstractLinearModel, JammedModel, jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
@@ -172,7 +172,7 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
     return jax.lax.fori_loop(0, most // 2, fewer, (index, count))[0][:most]
 
 
-def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
+def fold_points(model: AbstractLinearModel, per_side: int) -> tuple[Array, Array]:
     """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances,
     of which alone there are derivatives.
 

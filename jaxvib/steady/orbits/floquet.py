@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
-from jaxvib.equations.linear import LinearModel
+from jaxvib.equations.linear import AbstractLinearModel
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import small_solve
@@ -42,7 +42,7 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-def steps_for(model: LinearModel, omega: Array, speed: Array) -> Array:
+def steps_for(model: AbstractLinearModel, omega: Array, speed: Array) -> Array:
     """How many integration steps a turn of the grid asks for at load speeds `omega` and the rotor's `speed` (rad/s)."""
     carrier = model.carrier
     half = jnp.linalg.inv(jnp.linalg.cholesky(model.mass))
