@@ -3,9 +3,11 @@
 import contextlib
 import functools
 import gc
+import hashlib
 import importlib
 import os
 import pathlib
+import shutil
 import sys
 
 import equinox as eqx
@@ -16,7 +18,7 @@ import pytest
 from jaxvib.runtime import startup
 from jaxvib.runtime.cache import keep_programs, program_folder
 from jaxvib.runtime.cpu import prepare_cpu
-from jaxvib.runtime.stored import _functions
+from jaxvib.runtime.stored import _functions, _sources
 
 # Modules, those of the tests too, are compiled to bytecode once, not in every worker and every process that a test starts.
 sys.dont_write_bytecode = False
@@ -29,6 +31,8 @@ home = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     jax.config.update("jax_compilation_cache_dir", str(home))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+PROGRAMS = home / "programs" / hashlib.sha256(_sources().encode()).hexdigest()[:16]
+"""The traced programs of these sources; those of the last three others are kept beside them, 50 MB each."""
 matplotlib.use("Agg")
 
 
@@ -40,6 +44,11 @@ def pytest_configure(config):
     if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", "") and config.option.markexpr == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
     prepare_cpu()
+    with contextlib.suppress(OSError):  # a home that cannot be written to, other tests that remove the same
+        PROGRAMS.mkdir(parents=True, exist_ok=True)
+        os.utime(PROGRAMS)
+        for old in sorted(PROGRAMS.parent.iterdir(), key=lambda place: place.stat().st_mtime)[:-4]:
+            shutil.rmtree(old)
     # Each run-time check that is traced asks of every frame of the stack whether its file is one of some thirty.
     with contextlib.suppress(ImportError, AttributeError):  # a JAX that does it otherwise
         frames = importlib.import_module("jax._src.traceback_util")
@@ -52,8 +61,7 @@ def pytest_configure(config):
 def _stored():
     """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
     finds compiled depends on no other module."""
-    (home / "programs").mkdir(parents=True, exist_ok=True)
-    keep_programs(home / "programs")
+    keep_programs(PROGRAMS)
     yield
     keep_programs(None)
     for function in _functions:

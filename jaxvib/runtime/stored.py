@@ -209,7 +209,9 @@ def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
-    run.__name__ = path.stem  # part of the key in JAX's compilation cache, which does not hold the processor
+    # Part of the key in JAX's compilation cache, which holds the program, but not the processor. It does not name the sources:
+    # what a change of theirs leaves alone need not be compiled again.
+    run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
     # Without a word on where, JAX compiles once for arrays that it may move and once for those that another program gave.
     return jax.jit(run, in_shardings=home)
 

@@ -175,6 +175,18 @@ def test_the_key_holds_every_source_and_the_versions(module, monkeypatch):
     assert stored._sources.__wrapped__() == text
 
 
+def test_what_a_change_of_the_sources_leaves_alone_is_not_compiled_again(folder, monkeypatch):
+    """JAX finds what it compiled by the program and its name."""
+    texts = []
+    for sources in ("these", "others"):
+        monkeypatch.setattr(stored, "_sources", lambda sources=sources: sources)
+        function = programs.cached(doubled)
+        function(Pair(jnp.arange(3.0), "a"), 2.0)
+        (program,) = function.stored.ready.values()
+        texts.append(program.run.lower(jnp.arange(3.0)).as_text())
+    assert len(traces) == len(list(folder.iterdir())) == 2 and texts[0] == texts[1]
+
+
 @pytest.mark.parametrize(
     "damage",
     [
