@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import platform
 import re
@@ -81,6 +82,7 @@ def _has_wide_vectors() -> bool:
     return re.search(r"\bavx512f\b", processor()) is not None
 
 
+@functools.cache
 def processor() -> str:
     """The kind of processor this is, with its instruction sets where the system lists them."""
     features = ""
