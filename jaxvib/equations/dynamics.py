@@ -230,7 +230,7 @@ class Dynamics(eqx.Module):
         self, found: Kinematics, drag: Array, force: Sequence[Array], kappa: Array, friction: Sequence[Friction]
     ) -> _Eliminated:
         loads, axes, force = self.loads, self.axes, list(force)
-        columns, curvature = found
+        columns, curvature = found.columns, found.curvature
         pulls: list[dict[int, Array]] = [{} for _ in force]
         for each in friction:
             rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
@@ -241,8 +241,10 @@ class Dynamics(eqx.Module):
                     pulls[i] = {axis: lever * each.normal[axis] + pulls[i].get(axis, 0.0) for axis in axes}
         m = loads.mass
         inertia = kappa * m
-        solve = small_inverse([[inertia * dot(a, b) for b in columns] for a in columns])
-        free = solve(tuple(f - inertia * dot(column, curvature) for f, column in zip(force, columns, strict=True)))
+        solve = small_inverse([[inertia * g for g in row] for row in found.metric])
+        if found.turning is not None:
+            force = [f - inertia * turned for f, turned in zip(force, found.turning, strict=True)]
+        free = solve(tuple(force))
         rows = {axis: [m * column[axis] for column in columns] for axis in axes}
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, pulls, strict=True)] for axis, row in rows.items()}
         answers = {axis: solve(tuple(row)) for axis, row in rows.items()}

@@ -21,15 +21,33 @@ Coordinates: TypeAlias = tuple[Array, ...]
 
 
 class Kinematics(NamedTuple):
-    """Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x, a y and, where loads move so, a z."""
+    """Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x, a y and, where loads move so, a z.
+
+    `lengths` are those of the columns, where they are the same all along the track: see `Loads.tangent_lengths`.
+    """
 
     columns: list[tuple[Array, ...]]
     curvature: tuple[Array, ...]
+    lengths: tuple[Array, ...] | None
 
     @property
     def sizes(self) -> list[Array]:
         """|dp/du_i|, m."""
+        if self.lengths is not None:
+            return list(self.lengths)
         return [jnp.sqrt(dot(column, column)) for column in self.columns]
+
+    @property
+    def metric(self) -> list[list[Array | float]]:
+        """J^T J, m^2."""
+        if self.lengths is not None:
+            return [[length**2 if i == k else 0.0 for k in range(len(self.columns))] for i, length in enumerate(self.lengths)]
+        return [[dot(a, b) for b in self.columns] for a in self.columns]
+
+    @property
+    def turning(self) -> list[Array] | None:
+        """J^T c, m^2/s^2; None where it is 0 for any motion."""
+        return None if self.lengths is not None else [dot(column, self.curvature) for column in self.columns]
 
 
 def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
@@ -39,7 +57,7 @@ def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
         return lambda *v: jax.jvp(loads.position, v, direction)[1]
 
     columns = [along(_unit(u, i))(*u) for i in range(len(u))]
-    return Kinematics(columns, jax.jvp(along(rate), u, rate)[1])
+    return Kinematics(columns, jax.jvp(along(rate), u, rate)[1], loads.tangent_lengths())
 
 
 def missing_force(
@@ -51,10 +69,10 @@ def missing_force(
 
     `change` u''; `a` the acceleration of what carries the loads, by axis; `kappa` 1 for the loads' mass alone.
     """
-    columns, curvature = found
-    needed = []
-    for column, f, size in zip(columns, force, found.sizes, strict=True):
-        inertial = dot(column, curvature) + total(dot(column, other) * x for other, x in zip(columns, change, strict=True))
+    turning, needed = found.turning, []
+    for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
+        inertial = total(g * x for g, x in zip(metric, change, strict=True))
+        inertial = inertial if turning is None else turning[i] + inertial
         carried = total(column[axis] * x for axis, x in a.items())
         needed.append((loads.mass * (kappa * inertial + carried) - f) / size)
     return needed

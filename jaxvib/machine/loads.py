@@ -83,6 +83,13 @@ class Loads(eqx.Module):
     def position(self, *u: Array) -> tuple[Array, ...]:
         """The load's own position p(u), m: (across, up) in the rotor's plane, and along its axis where it moves there."""
 
+    def tangent_lengths(self) -> tuple[Array, ...] | None:
+        """|dp/du_i| m, where they are the same all along the track and the tangents square to each other; else None.
+
+        J^T J is then a constant diagonal, and J^T (dJ/dt) u' = 0, J = dp/du: the equations need compute neither.
+        """
+        return None
+
     @abc.abstractmethod
     def rest(self) -> tuple[Array, ...]:
         """The coordinates u of loads at rest, all at one point, (count,) each."""
@@ -173,6 +180,10 @@ class CircularLoads(Loads):
         """R (cos phi, sin phi)."""
         (phi,) = u
         return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
+
+    def tangent_lengths(self) -> tuple[Array]:
+        """R."""
+        return (self.radius,)
 
     def rest(self) -> tuple[Array]:
         """At the bottom of the track, phi = -pi/2."""
