@@ -36,7 +36,9 @@ from parts.loads import scene as balls  # noqa: E402
 
 from jaxvib.motion import system  # noqa: E402
 from jaxvib.motion.system import PackedSystem  # noqa: E402
+from jaxvib.numerics.fence import fence  # noqa: E402
 from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
+from jaxvib.ode.dopri8 import UnrolledDopri8  # noqa: E402
 from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
 
 LANES, STEP = 64, 0.2
@@ -45,11 +47,18 @@ NONE = contextlib.nullcontext
 OFF: dict[str, Callable[[], Any]] = {
     "unrolled step: always looped": lambda: mock.patch.object(system, "_MOST_WRITTEN", 0),
     "scalarize: on arrays": lambda: mock.patch.object(system, "MAX_SCALARS", 0),
-    "inverses: quotients": lambda: mock.patch.object(system, "with_inverses", lambda program: program),
     "polynomial sine and cosine: jnp.sin, jnp.cos": lambda: mock.patch.object(
         scalarize, "sine_and_cosine", lambda x: (jnp.sin(x), jnp.cos(x))
     ),
-    "fence in the step: none": lambda: mock.patch.object(dopri8, "_fence_of", lambda lanes, one: lambda y: y),
+    "fences in the equations: none": lambda: mock.patch.object(
+        system, "fenced", lambda program, x: core.jaxpr_as_fun(program)(*x)
+    ),
+    "fences between stages: none": lambda: mock.patch.object(
+        UnrolledDopri8, "_fenced", lambda self, values, *rest, **known: values
+    ),
+    "through memory: a division for each number": lambda: mock.patch.object(
+        dopri8, "through_memory", lambda values, one: [fence(value, one) for value in values]
+    ),
 }
 
 

@@ -43,14 +43,14 @@ def forward_run(k):
 
 
 BUDGETS = {
-    "vector field": (field, 140),
+    "vector field": (field, 134),
     "jam_modes": (modes, 1400),
     "jam_modes, gradient": (jax.grad(modes), 2050),
     "jam_orbit": (orbit, 3290),
     "jam_orbit, gradient": (jax.grad(orbit), 3770),
-    "simulate": (run, 2490),
-    "simulate, forward derivatives": (jax.jacfwd(forward_run), 4830),
-    "simulate, reverse derivatives": (jax.grad(run), 4430),
+    "simulate": (run, 2420),
+    "simulate, forward derivatives": (jax.jacfwd(forward_run), 4600),
+    "simulate, reverse derivatives": (jax.grad(run), 4190),
 }
 
 

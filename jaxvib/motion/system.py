@@ -18,7 +18,8 @@ from jaxtyping import PyTree
 from jaxvib.equations.dynamics import State
 from jaxvib.ode.dopri8 import UnrolledDopri8, ravel
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of, with_inverses
+from jaxvib.ode.scalar_programs import fenced
+from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, RealScalarLike
 from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 
@@ -59,6 +60,7 @@ class PackedSystem(eqx.Module):
     is_scalarized: bool = eqx.field(static=True)
     size: int = eqx.field(static=True)
     apart: bool = eqx.field(static=True)
+    fences: bool = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
@@ -89,11 +91,8 @@ class PackedSystem(eqx.Module):
         if program is not None:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
             self.args = scalars_of(field)
-            # In lanes, and in a loop over stages, a quotient is a fence as well: it is not computed anew for each use.
-            # Derivatives, for which a solver is named, would take more operations.
-            if is_written and solver is None and not lanes:
-                self.program = with_inverses(program)
         self.apart = self.is_scalarized and (lanes or is_written)
+        self.fences = self.apart and solver is None
 
     @property
     def term(self) -> diffrax.ODETerm:
@@ -166,7 +165,8 @@ class PackedSystem(eqx.Module):
         if not self.is_scalarized:
             return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
         numbers = y if self.apart else jnp.unstack(y)
-        rates = run(jnp.asarray(t, numbers[0].dtype), *numbers, *args)
+        given = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
+        rates = fenced(self.program, given) if self.fences else run(*given)
         return tuple(rates) if self.apart else jnp.stack(rates)
 
 

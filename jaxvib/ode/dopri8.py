@@ -6,7 +6,7 @@ import abc
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import ClassVar, TypeAlias, TypeVar
+from typing import ClassVar, TypeVar
 
 import diffrax
 import equinox as eqx
@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from jaxvib.numerics.fence import fence, hidden_one, through_memory
 from jaxvib.ode.interpolation import StepInterpolation
 from jaxvib.ode.types import VF, Args, BoolScalarLike, RealScalarLike, StepResult, Terms, Y
 
@@ -33,7 +34,6 @@ __all__ = [
 ]
 
 Tree = TypeVar("Tree")
-_Fence: TypeAlias = Callable[[Y], Y]
 
 _TABLEAU = diffrax.Dopri8.tableau
 _LATE = 5
@@ -171,9 +171,9 @@ class UnrolledDopri8(AbstractDopri8):
 
     Compiling takes longer than for `LoopDopri8`, several times as long where derivatives are taken.
 
-    **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them; the fence is then
-    a division by a 1 that the compiler cannot know, otherwise a detour through memory that costs less for single numbers;
-    `wrap` what is done to the state after each step, such as taking whole turns out of its angles.
+    **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them: fences are then
+    those for arrays, otherwise those for single numbers; `wrap` what is done to the state after each step, such as taking whole
+    turns out of its angles.
 
     >>> import diffrax, jax, jax.numpy as jnp
     >>> jax.config.update("jax_enable_x64", True)
@@ -205,15 +205,28 @@ class UnrolledDopri8(AbstractDopri8):
         """See `AbstractDopri8.advance`."""
         # Where the field may jump between steps (then `made_jump` is traced) its value is computed anew.
         first = solver_state if made_jump is False else terms.vf(t0, y0, args)
-        fence = _fence_of(self.lanes, jnp.where(t1 >= t0, 1.0, t1 - t0))
+        one = hidden_one(jnp.asarray(t1, jax.tree.leaves(y0)[0].dtype))
         dt = terms.contr(t0, t1)
         stages = [first]
         y = y0
         for row, c in zip(ROWS, NODES, strict=True):
-            y = fence(_stage_state(y0, dt, row[: len(stages)], stages))
-            stages.append(_fenced(fence, terms.vf(t0 + float(c) * dt, y, args), y))
+            y = self._fenced(_stage_state(y0, dt, row[: len(stages)], stages), one)
+            stages.append(self._fenced(terms.vf(t0 + float(c) * dt, y, args), one, known=y))
         error = jax.tree.map(lambda *k: dt * _weighted(ERROR, k), *stages)
         return y, jnp.stack([ravel(k) for k in stages]), error, stages[-1]
+
+    def _fenced(self, values: Y, one: Array, known: Y = ()) -> Y:
+        """Values behind fences, but those that are `known` and have been behind one, as velocities are among rates."""
+        leaves, rest = jax.tree.flatten(values)
+        new = [k for k, leaf in enumerate(leaves) if not any(leaf is each for each in jax.tree.leaves(known))]
+        found = [leaves[k] for k in new]
+        if self.lanes or any(jnp.ndim(leaf) for leaf in found):
+            found = [fence(leaf, one) for leaf in found]
+        elif found:
+            found = through_memory(found, one)
+        for k, leaf in zip(new, found, strict=True):
+            leaves[k] = leaf
+        return jax.tree.unflatten(rest, leaves)
 
 
 def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:
@@ -223,42 +236,3 @@ def _weighted(weights: np.ndarray, values: Sequence[Array]) -> Array:
 
 def _stage_state(y0: Y, dt: Array, weights: np.ndarray, stages: Sequence[VF]) -> Y:
     return jax.tree.map(lambda y, *k: y + dt * _weighted(weights, k), y0, *stages)
-
-
-def _fenced(fence: _Fence, rates: VF, y: Y) -> VF:
-    """Rates behind a fence, but those that are part of `y`, as velocities are, and have been behind one."""
-    leaves, rest = jax.tree.flatten(rates)
-    new = [k for k, leaf in enumerate(leaves) if not any(leaf is known for known in jax.tree.leaves(y))]
-    for k, leaf in zip(new, fence([leaves[k] for k in new]) if new else [], strict=True):
-        leaves[k] = leaf
-    return jax.tree.unflatten(rest, leaves)
-
-
-def _fence_of(lanes: bool, one: Array) -> _Fence:
-    one = jax.lax.stop_gradient(one)
-
-    def through_memory(y: Y) -> Y:
-        leaves, rest = jax.tree.flatten(y)
-        if len(leaves) == 1 or any(jnp.ndim(leaf) for leaf in leaves):
-            return divided(y)
-        return jax.tree.unflatten(rest, _from_bits(jnp.stack(leaves), one.astype(leaves[0].dtype)))
-
-    def divided(y: Y) -> Y:
-        return jax.tree.map(lambda leaf: leaf / one.astype(leaf.dtype), y)
-
-    return divided if lanes else through_memory
-
-
-@jax.custom_jvp
-def _from_bits(stack: Array, one: Array) -> list[Array]:
-    """The numbers of a stack, each read as bits: the compiler puts what a number was made of in place of one that it reads as
-    what it is. Tangents have no bits to be read, and are multiplied by a 1 that the compiler cannot know."""
-    bits = jax.lax.bitcast_convert_type(stack, jnp.dtype(f"uint{8 * stack.dtype.itemsize}"))
-    return [jax.lax.bitcast_convert_type(bits[i], stack.dtype) for i in range(len(stack))]
-
-
-@_from_bits.defjvp
-def _from_bits_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[list[Array], list[Array]]:
-    stack, one = primals
-    moved = tangents[0] * one
-    return _from_bits(stack, one), [moved[i] for i in range(len(stack))]

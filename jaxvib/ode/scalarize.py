@@ -18,6 +18,8 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from jaxvib.numerics.sincos import sine_and_cosine
+from jaxvib.ode.scalar_programs import fenced, is_floating, without_repeats
 from jaxvib.ode.scalar_rules import (
     NotScalarizable,
     Scalar,
@@ -30,7 +32,6 @@ from jaxvib.ode.scalar_rules import (
     rules,
 )
 from jaxvib.ode.scalar_rules import to_scalars as _to_scalars
-from jaxvib.ode.sincos import sine_and_cosine
 from jaxvib.runtime.compat import (
     HAS_JAXPRS,
     Atoms,
@@ -42,7 +43,6 @@ from jaxvib.runtime.compat import (
     Primitive,
     Var,
     operation_like,
-    rewritten,
     substituted,
 )
 
@@ -50,12 +50,10 @@ __all__ = [
     "MAX_SCALARS",
     "NotScalarizable",
     "arrays_program",
-    "fenced",
     "scalarize",
     "scalarized_program",
     "scalarized_vmap",
     "scalars_of",
-    "with_inverses",
 ]
 
 X = TypeVar("X")
@@ -71,15 +69,12 @@ MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
 _BLOCK = 4096
 """So many entries of a batch go through a program on scalars together: it may hold a thousand values of each in memory."""
 
-_MAX_RECOMPUTED = 8
-"""A value used more than once that takes more operations than these is fenced: see `fenced`."""
-
 
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:
     """`function`, traced for arguments of these shapes, on single numbers.
 
     **Returns** a function of the same arguments in which every array is an object array of scalars; so is what it returns.
-    Sines and cosines are those of `jaxvib.ode.sincos`. A product with a 0 that the program itself holds is left out.
+    Sines and cosines are those of `jaxvib.numerics.sincos`. A product with a 0 that the program itself holds is left out.
 
     **Raises** `NotScalarizable` where an operation of the program has no rule on scalars, here or when the function that is
     returned is called. A function with a derivative of its own (`jax.custom_jvp`) has none: its derivative would be lost.
@@ -136,72 +131,12 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
         program = jax.make_jaxpr(run)(*shapes)
     except NotScalarizable:
         return None
-    program = _without_repeats(program)
+    program = without_repeats(program)
     return program if len(program.jaxpr.eqns) <= _MAX_OPERATIONS else None
 
 
-def _without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program, each operation on the same numbers done once, and none whose result nobody reads.
-
-    Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
-    """
-    first: dict[Var, Var | Literal] = {}
-    done: dict[tuple[object, ...], JaxprEqn] = {}
-    kept: list[tuple[JaxprEqn, list[Var | Literal]]] = []
-
-    def known(atoms: Sequence[Var | Literal]) -> list[Var | Literal]:
-        return [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in atoms]
-
-    def name(atom: Var | Literal) -> str:
-        return f"{np.asarray(atom.val).tobytes()!r} {atom.aval}" if isinstance(atom, Literal) else str(id(atom))
-
-    for equation in program.jaxpr.eqns:
-        inputs = known(equation.invars)
-        names = [name(atom) for atom in inputs]
-        if equation.primitive in _commutative():
-            names.sort()
-        key = (equation.primitive, *names, *(f"{k}={v!r}" for k, v in equation.params.items()))
-        # What has an effect is done as often as it stands there; parameters that are programs are not compared.
-        alone = bool(equation.effects) or any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
-        if key in done and not alone:
-            first.update(zip(equation.outvars, done[key].outvars, strict=True))
-        else:
-            done[key] = equation
-            kept.append((equation, inputs))
-    results = known(program.jaxpr.outvars)
-    read = {atom for atom in results if isinstance(atom, Var)}
-    live = []
-    for equation, inputs in reversed(kept):
-        if equation.effects or any(atom in read for atom in equation.outvars):
-            live.append((equation, inputs))
-            read.update(atom for atom in inputs if isinstance(atom, Var))
-    return rewritten(program, live[::-1], results)
-
-
-def with_inverses(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program, each quotient the product with an inverse; results change by their rounding.
-
-    A division takes as long as ten products. What several numbers are divided by is inverted once, and an inverse does not wait
-    for what is divided.
-    """
-    inverse: dict[Var, Var] = {}
-
-    def product(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
-        if equation.primitive != _division() or not isinstance(divisor := inputs[1], Var) or not _is_floating(divisor):
-            return None
-        made: list[tuple[JaxprEqn, Atoms]] = []
-        if divisor not in inverse:
-            inverted = operation_like(lambda x: 1.0 / x, divisor)
-            made.append((inverted, [inverted.invars[0], divisor]))
-            (inverse[divisor],) = inverted.outvars
-        times = operation_like(lax.mul, divisor, divisor)
-        return [*made, (times, [inputs[0], inverse[divisor]])], times.outvars[0]
-
-    return substituted(program, product)
-
-
 def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
-    """`function`, traced as it is, on arrays, but for its sines and cosines, which are those of `jaxvib.ode.sincos`.
+    """`function`, traced as it is, on arrays, but for its sines and cosines, which are those of `jaxvib.numerics.sincos`.
 
     **Returns** None where this version of JAX lets nobody read its programs.
     """
@@ -211,7 +146,7 @@ def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
 
     def polynomial(equation: JaxprEqn, inputs: Atoms) -> Instead | None:
         place = _angles().get(equation.primitive)
-        if place is None or not isinstance(angle := inputs[0], Var) or not _is_floating(angle):
+        if place is None or not isinstance(angle := inputs[0], Var) or not is_floating(angle):
             return None
         made: list[tuple[JaxprEqn, Atoms]] = []
         if angle not in known:
@@ -221,21 +156,6 @@ def arrays_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Ar
         return made, known[angle][place]
 
     return substituted(jax.make_jaxpr(function)(*jax.eval_shape(lambda *a: a, *arguments)), polynomial)
-
-
-def _is_floating(x: Any) -> bool:
-    return jnp.issubdtype(x.aval.dtype, jnp.floating)
-
-
-@functools.cache
-def _division() -> Primitive:
-    return primitive_of(lax.div, np.float32(1.0), np.float32(2.0))
-
-
-@functools.cache
-def _commutative() -> set[Primitive]:
-    """The operations that give the same for their arguments in either order."""
-    return {primitive_of(operation, np.float32(1.0), np.float32(2.0)) for operation in (lax.add, lax.mul)}
 
 
 def scalars_of(tree: PyTree[Array]) -> list[Array]:
@@ -283,47 +203,6 @@ def scalarized_vmap(function: Callable[[X, Shared], Out]) -> Callable[[X, Shared
         return jax.tree.unflatten(structure, parts)
 
     return run
-
-
-def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
-    """The results of a program on scalars, none of whose values the compiler computes many times over.
-
-    XLA's fusion on a CPU computes a value anew for each use of it. Where shared parts are made of shared parts, as in a
-    derivative of equations, that grows without bounds: 4096 samples of 3000 operations took 8 s. It does not do so to the
-    result of a division; so every value that is used more than once and would take more than a few operations is divided by
-    a 1 that the compiler cannot know. The first argument must be finite.
-    """
-    first = arguments[0]
-    one = lax.stop_gradient(jnp.where(jnp.abs(first) < jnp.inf, jnp.ones_like(first), first))
-    cost: dict[int, int] = {}
-
-    def run(jaxpr: Jaxpr, consts: Sequence[Array], given: Sequence[Array]) -> list[Array]:
-        uses: dict[Var, int] = {}
-        for atom in (*(a for equation in jaxpr.eqns for a in equation.invars), *jaxpr.outvars):
-            if isinstance(atom, Var):
-                uses[atom] = uses.get(atom, 0) + 1
-        known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *given), strict=True))
-        read = lambda atom: atom.val if isinstance(atom, Literal) else known[atom]  # noqa: E731
-        for equation in jaxpr.eqns:
-            values = [read(atom) for atom in equation.invars]
-            inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
-            if inner is not None:
-                results = run(inner.jaxpr, inner.consts, values)
-            else:
-                found = equation.primitive.bind(*values, **equation.params)
-                results = found if equation.primitive.multiple_results else [found]
-                spent = 1 + sum(cost.get(id(value), 0) for value in {id(v): v for v in values}.values())
-                cost.update((id(result), spent) for result in results)
-            for k, atom in enumerate(equation.outvars):
-                spent = cost.get(id(results[k]), 0)
-                if uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and jnp.issubdtype(results[k].dtype, jnp.floating):
-                    results[k] = results[k] / one
-            kept.extend(results)  # a cost belongs to an id only as long as its value lives
-            known.update(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    kept: list[Array] = []
-    return run(program.jaxpr, program.consts, arguments)
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from scenes import loads, machines, published, scene
 
 import jaxvib as jv
 from jaxvib.equations.dynamics import Dynamics
+from jaxvib.equations.sliding import kinematics
 
 
 def random_state(s, seed=0):
@@ -260,3 +261,16 @@ def test_two_directional_port_is_euler_lagrange(load):
     field = evaluate(s, state)
     found = jnp.concatenate([field.velocity, field.rate[0]])
     np.testing.assert_allclose(found, accelerations(x, v), rtol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["balls", "pendulums"])
+def test_a_circles_tangents_are_as_long_as_its_loads_say(kind):
+    """What the equations leave out for loads with `tangent_lengths` is what they would compute."""
+    load = loads()[kind]
+    u, rate = (jnp.linspace(-2.0, 3.0, load.count),), (jnp.linspace(7.0, -5.0, load.count),)
+    told = kinematics(load, u, rate)
+    computed = told._replace(lengths=None)
+    for ours, theirs in ((told.sizes, computed.sizes), (told.metric[0], computed.metric[0])):
+        np.testing.assert_allclose(jnp.broadcast_to(ours[0], u[0].shape), theirs[0], rtol=1e-14)
+    assert told.turning is None
+    np.testing.assert_allclose(computed.turning[0], 0.0, atol=1e-13)

@@ -10,6 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.motion.start import initial_state
 from jaxvib.ode import scalarize as module
+from jaxvib.ode.scalar_programs import fenced, without_repeats
 from jaxvib.ode.scalar_rules import primitive_of, rules, to_scalars
 from jaxvib.ode.scalarize import (
     NotScalarizable,
@@ -18,7 +19,6 @@ from jaxvib.ode.scalarize import (
     scalarized_program,
     scalarized_vmap,
     scalars_of,
-    with_inverses,
 )
 
 X = np.array([[0.3, -0.7, 0.2], [0.9, -0.1, 0.5]])
@@ -154,8 +154,8 @@ def test_shared_parts_of_shared_parts_are_not_computed_again_and_again():
     program = scalarized_program(chain, jnp.asarray(0.1), jnp.asarray(0.2))
     assert program is not None
     assert expanded(program.jaxpr) > 1e10
-    fenced = jax.make_jaxpr(lambda *x: module.fenced(program, x))(0.1, 0.2)
-    assert expanded(fenced.jaxpr) < 200
+    program_of = jax.make_jaxpr(lambda *x: fenced(program, x))(0.1, 0.2)
+    assert expanded(program_of.jaxpr) < 200
     for ours, theirs in zip(scalarized_vmap(chain)(jnp.full(3, 0.1), jnp.asarray(0.2)), chain(0.1, 0.2), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-13)
 
@@ -172,7 +172,7 @@ def test_a_batch_has_the_shapes_and_derivatives_that_vmap_gives():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14), ours, theirs)
 
 
-@pytest.mark.parametrize(("machine", "load"), [("one_mass", "rollers"), ("two_mass", "balls")])
+@pytest.mark.parametrize(("machine", "load"), [("one_mass", "balls"), ("two_mass", "balls")])
 def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machine, load):
     """Without fences that of the rotor with four pendulums took ten seconds at 4096 samples."""
 
@@ -184,7 +184,7 @@ def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machi
     program = scalarized_program(second, moment, field)
     assert program is not None
     numbers = [*scalars_of(moment), *scalars_of(field)]
-    assert expanded(jax.make_jaxpr(lambda *x: module.fenced(program, x))(*numbers).jaxpr) < 200 < expanded(program.jaxpr)
+    assert expanded(jax.make_jaxpr(lambda *x: fenced(program, x))(*numbers).jaxpr) < 200 < expanded(program.jaxpr)
 
 
 def test_without_readable_programs_everything_stays_on_arrays(monkeypatch):
@@ -215,7 +215,7 @@ def test_programs_within_a_program_are_not_taken_for_each_other():
         one, other = (jax.jit(lambda y, held=held: held * y) for held in np.array([[1.0, 2.0], [3.0, 4.0]]))
         return one(x) + 10.0 * other(x)
 
-    program = module._without_repeats(jax.make_jaxpr(function)(jnp.ones(2)))
+    program = without_repeats(jax.make_jaxpr(function)(jnp.ones(2)))
     found = jax.core.eval_jaxpr(program.jaxpr, program.consts, jnp.array([0.5, 0.7]))
     np.testing.assert_allclose(found, [[15.5, 29.4]], rtol=1e-15)
 
@@ -223,16 +223,6 @@ def test_programs_within_a_program_are_not_taken_for_each_other():
 def names_and_values(program, *x):
     names = sorted(equation.primitive.name for equation in program.jaxpr.eqns)
     return names, jax.core.eval_jaxpr(program.jaxpr, program.consts, *x)
-
-
-def test_what_divides_several_numbers_is_inverted_once():
-    x = np.array([0.3, -0.7, 1.9])
-    program = scalarized_program(lambda x: x[0] / x[2] - (x[1] + 2.0) / x[2] + x[0] / 3.0, jnp.ones(3))
-    names, before = names_and_values(program, *x)
-    assert names == ["add", "add", "div", "div", "div", "sub"]
-    names, after = names_and_values(with_inverses(program), *x)
-    assert names == ["add", "add", "div", "div", "mul", "mul", "sub"]  # 3 is a number of the program
-    np.testing.assert_allclose(after, before, rtol=1e-15)
 
 
 def test_on_arrays_sines_and_cosines_are_computed_once_together():

@@ -13,7 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxvib.numerics.linalg import solve_definite
-from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, fenced, scalarized_program, scalars_of
+from jaxvib.ode.scalar_programs import fenced
+from jaxvib.ode.scalarize import MAX_SCALARS, arrays_program, scalarized_program, scalars_of
 from jaxvib.runtime.compat import jaxpr_as_fun
 
 __all__ = ["damped_newton"]

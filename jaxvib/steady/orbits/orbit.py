@@ -15,7 +15,7 @@ from jaxvib.equations.linear import JammedModel
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, grid_of
 from jaxvib.numerics.roots import bracketed_root
-from jaxvib.ode.sincos import sine_and_cosine
+from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.steady.jams.folds import rotor_speed_at

@@ -1,0 +1,128 @@
+"""Programs on single numbers, as `jaxvib.ode.scalarize` makes them, in other forms that give the same results in less time."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jaxvib.numerics.fence import fence, hidden_one
+from jaxvib.numerics.sincos import unfenced_sine_and_cosine
+from jaxvib.ode.scalar_rules import primitive_of
+from jaxvib.runtime.compat import (
+    ClosedJaxpr,
+    JaxprEqn,
+    Literal,
+    Primitive,
+    Var,
+    jaxpr_as_fun,
+    rewritten,
+)
+
+__all__ = ["fenced", "is_floating", "without_repeats"]
+
+_MAX_RECOMPUTED = 8
+"""A value used more than once that takes more operations than these is fenced: see `fenced`."""
+
+
+def without_repeats(program: ClosedJaxpr) -> ClosedJaxpr:
+    """The same program, each operation on the same numbers done once, and none whose result nobody reads.
+
+    Equations written by automatic differentiation ask for the same parts again and again: a third to a half of them go.
+    """
+    first: dict[Var, Var | Literal] = {}
+    done: dict[tuple[object, ...], JaxprEqn] = {}
+    kept: list[tuple[JaxprEqn, list[Var | Literal]]] = []
+
+    def known(atoms: Sequence[Var | Literal]) -> list[Var | Literal]:
+        return [first.get(atom, atom) if isinstance(atom, Var) else atom for atom in atoms]
+
+    def name(atom: Var | Literal) -> str:
+        return f"{np.asarray(atom.val).tobytes()!r} {atom.aval}" if isinstance(atom, Literal) else str(id(atom))
+
+    for equation in program.jaxpr.eqns:
+        inputs = known(equation.invars)
+        names = [name(atom) for atom in inputs]
+        if equation.primitive in _commutative():
+            names.sort()
+        key = (equation.primitive, *names, *(f"{k}={v!r}" for k, v in equation.params.items()))
+        # What has an effect is done as often as it stands there; parameters that are programs are not compared.
+        alone = bool(equation.effects) or any(hasattr(v, "jaxpr") or callable(v) for v in equation.params.values())
+        if key in done and not alone:
+            first.update(zip(equation.outvars, done[key].outvars, strict=True))
+        else:
+            done[key] = equation
+            kept.append((equation, inputs))
+    results = known(program.jaxpr.outvars)
+    read = {atom for atom in results if isinstance(atom, Var)}
+    live = []
+    for equation, inputs in reversed(kept):
+        if equation.effects or any(atom in read for atom in equation.outvars):
+            live.append((equation, inputs))
+            read.update(atom for atom in inputs if isinstance(atom, Var))
+    return rewritten(program, live[::-1], results)
+
+
+def fenced(program: ClosedJaxpr, arguments: Sequence[Array]) -> list[Array]:
+    """The results of a program on scalars, none of whose values the compiler computes many times over.
+
+    Every value that is used more than once and would take more than a few operations is fenced, see `jaxvib.numerics.fence`.
+    Where shared parts are made of shared parts, as in a derivative of equations, the time grows without bounds otherwise: 4096
+    samples of 3000 operations took 8 s.
+    """
+    jaxpr = program.jaxpr
+    uses: dict[Var, int] = {}
+    for atoms in (*(equation.invars for equation in jaxpr.eqns), jaxpr.outvars):
+        for atom in _variables(atoms):
+            uses[atom] = uses.get(atom, 0) + 1
+    known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.consts, *arguments), strict=True))
+    read = lambda atom: atom.val if isinstance(atom, Literal) else known[atom]  # noqa: E731
+    cost: dict[Var, int] = {}
+    one = hidden_one(arguments[0])
+    for equation in jaxpr.eqns:
+        results = _computed(equation, [read(atom) for atom in equation.invars])
+        spent = _size(equation) + sum(cost.get(atom, 0) for atom in _variables(equation.invars))
+        if equation.primitive == _division():
+            spent = 0  # its result is not computed anew
+        for atom, result in zip(equation.outvars, results, strict=True):
+            dear = uses.get(atom, 0) > 1 and spent > _MAX_RECOMPUTED and is_floating(atom)
+            known[atom], cost[atom] = (fence(result, one), 0) if dear else (result, spent)
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _size(equation: JaxprEqn) -> int:
+    inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
+    return 1 if inner is None else sum(_size(each) for each in getattr(inner, "jaxpr", inner).eqns)
+
+
+def _computed(equation: JaxprEqn, values: list[Array]) -> Sequence[Array]:
+    inner = equation.params.get("jaxpr", equation.params.get("call_jaxpr"))
+    if inner is None:
+        found = equation.primitive.bind(*values, **equation.params)
+        return found if equation.primitive.multiple_results else [found]
+    # The one operation with a derivative of its own that these programs have.
+    return unfenced_sine_and_cosine(*values) if "call_jaxpr" in equation.params else jaxpr_as_fun(inner)(*values)
+
+
+@functools.cache
+def _division() -> Primitive:
+    return primitive_of(lax.div, np.float32(1.0), np.float32(2.0))
+
+
+@functools.cache
+def _commutative() -> set[Primitive]:
+    """The operations that give the same for their arguments in either order."""
+    return {primitive_of(operation, np.float32(1.0), np.float32(2.0)) for operation in (lax.add, lax.mul)}
+
+
+def is_floating(x: Any) -> bool:
+    return jnp.issubdtype(x.aval.dtype, jnp.floating)
+
+
+def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
+    """Those of the atoms that are no numbers, each once, in order."""
+    return list(dict.fromkeys(atom for atom in atoms if isinstance(atom, Var)))
