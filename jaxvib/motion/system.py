@@ -32,7 +32,7 @@ _TURN = 2.0 * math.pi
 
 _LONG = 4
 """With so many entries in an array of the state, derivatives take less time on arrays than on its numbers, and all compiles
-sooner; runs take 0.7 to 1.2 times as long, from 8 entries on 0.4 to 0.8 times."""
+sooner; runs take as long, from 8 entries on two thirds of it."""
 
 _MOST_WRITTEN = 8
 """With more numbers in a state, the method's stages written out one after another take too long to compile as well."""
