@@ -18,6 +18,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
+from jaxvib.runtime.devices import on_device
 from jaxvib.units import count
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Found, Options, Searcher, choose, require_searcher
@@ -105,7 +106,7 @@ def synthesize(
     space, problem, found = _searched(space, objective, demands, options, tell)
     best = found.best
     others = made(problem, neighbours(problem, found))
-    scene = checked(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), others))
+    scene = checked(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
     kept = found.violation < 10.0 * FEASIBLE
     done = kept & (found.left < _CONVERGED)
     values = np.where(kept, found.point.values[:, 0], np.inf)

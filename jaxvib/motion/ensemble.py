@@ -29,6 +29,7 @@ from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
@@ -165,18 +166,18 @@ def ensemble(
     lanes = min(count(lanes, "lanes"), runs)
     made = _made(make, values)
     require_start(made[0], made[1].angle)
-    known = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
+    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.
-    shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf[:1]))) for leaf in jax.tree.leaves(made)]
+    shared = [concrete and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in jax.tree.leaves(made)]
     shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
     leaves, treedef = jax.tree.flatten(made)
     form = Skeleton.of(leaves, treedef)
     own = [leaf for leaf, same in zip(leaves, shared, strict=True) if not same]
-    common = [leaf[0] for leaf, same in zip(leaves, shared, strict=True) if same]
+    common = [np.asarray(np.asarray(leaf)[0]) for leaf, same in zip(leaves, shared, strict=True) if same]
     require(stepsize_controller, EqualSteps)
     if stepsize_controller is not None:
         steps = stepsize_controller.number
-    elif not known:
+    elif not concrete:
         raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
     else:
         steps = max(16, math.ceil(4.0 * float(end) * float(np.max(np.asarray(_fastest(made[0]))))))
@@ -184,24 +185,24 @@ def ensemble(
     coarse = -(-each // 2)
     # A run of one step in each part has no coarser one beside it.
     compared = estimate and coarse < each
-    counts = jnp.asarray([each, coarse] if compared else [each], end.dtype)
+    counts = np.asarray([each, coarse] if compared else [each], end.dtype)
 
     def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         return _together(own, common, end, counts, tuple(shared), form, equations)
 
     ends = in_chunks(lanes, together, own, shared=(common, end, counts))
-    last, load_speed, apart, finite, detached, taken = jax.tree.map(jnp.asarray, ends)
+    last, load_speed, apart, finite, detached, taken = ends
     # What a method of order 3 would leave of the difference; this one is of order 8.
     share = (coarse / each) ** 3
     unknown = np.inf if estimate else np.nan
-    error = jnp.asarray(np.full(runs, unknown, end.dtype))
+    error = np.full(runs, unknown, end.dtype)
     if compared:
         error = estimated_error(apart, share, made[0])
-    found = Ensemble(last, load_speed, error, finite, detached, taken[0], jnp.asarray(jnp.nan, end.dtype))
-    if not known:
+    found = on_device(Ensemble(last, load_speed, error, finite, detached, taken[0], np.asarray(np.nan, end.dtype)))
+    if not concrete:
         return found
     jax.block_until_ready(found)
-    return dataclasses.replace(found, seconds=jnp.asarray(time.perf_counter() - begun, end.dtype))
+    return dataclasses.replace(found, seconds=on_device(np.asarray(time.perf_counter() - begun, end.dtype)))
 
 
 @eqx.filter_jit

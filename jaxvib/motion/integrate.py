@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -16,7 +15,7 @@ from jax import Array
 from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import Measured, measure, trajectory
+from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.system import PackedSystem
@@ -162,7 +161,10 @@ def integrate(
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
     whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if samples else None
-    numbers = _measured(lambda: measure(scene, field, times, states, unit), wanted)
+    if wanted is None:
+        numbers = measure(scene, field, times, states, unit)
+    else:  # of a run that another is compared with nobody reads it
+        numbers = jax.lax.cond(wanted, lambda: measure(scene, field, times, states, unit), lambda: unmeasured(states))
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
@@ -183,14 +185,6 @@ def integrate(
         scene=scene,
         together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
     )
-
-
-def _measured(found: Callable[[], Measured], wanted: Array | np.ndarray | None) -> Measured:
-    """What is measured, where it is wanted, else NaN: of a run that another is compared with nobody reads it."""
-    if wanted is None:
-        return found()
-    nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(found))
-    return jax.lax.cond(wanted, found, lambda: nothing)
 
 
 def _is_together(angle: Array) -> Array:

@@ -16,7 +16,9 @@ from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
-from jaxvib.results.status import member
+from jaxvib.results.status import member, status_name
+from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import count, number
 
@@ -36,6 +38,7 @@ _FALLS = -3.0
 
 
 @refuse_former(tolerance=FORMER["tolerance"])
+@compiled_together
 def settle(
     scene: Scene,
     *,
@@ -93,23 +96,24 @@ def settle(
         state = initial_state(scene, start, mode=mode, apart=_APART if start == "jam" else 0.0, throw=throw)
     _, slowest = fastest_and_slowest(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
-    stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
+    slow = float(slowest) or float(scene.drive.speed)  # 0 where programs are compiled only, see `compiled_together`
+    stretch = whole_turns(scene, 2.0 * math.pi * periods / slow)
     remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
     seen: list[list[float]] = []
     run, together = None, True
     for _ in range(count(stretches, "stretches")):
         run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
-        together = run.together & together
-        run = dataclasses.replace(run, together=together)
-        if float(run.drift) < drift or not bool(run.status == RunStatus.done):
+        together = together and bool(run.together)
+        if float(run.drift) < drift or status_name(run.status) != "done":
             break
-        seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *map(float, run.amplitude)])
+        seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
         if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
             run = dataclasses.replace(run, status=member(RunStatus, "beating"))
             break
         state = last_state(scene, run)
     assert run is not None
-    if throw and not (float(run.drift) < drift or bool(run.status == RunStatus.beating)):
+    run = dataclasses.replace(run, together=on_device(np.asarray(together)))
+    if throw and not (float(run.drift) < drift or status_name(run.status) == "beating"):
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
@@ -143,7 +147,8 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:
     """Whether the loads still turn at the speed of the jam mode they started in, and not at that of another one."""
     modes = jam_modes(scene)
-    away = {k: abs(float(modes.select(k).omega) - float(run.omega)) for k in modes.mode_numbers()}
+    speeds = np.asarray(modes.omega)
+    away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}
     away[0] = abs(float(scene.drive.speed) - float(run.omega))
     nearest = min(away, key=lambda k: away[k])
     if nearest != mode:

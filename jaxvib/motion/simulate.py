@@ -27,7 +27,10 @@ from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.compat import known
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -49,6 +52,7 @@ _STRETCH = 2.0e4
 
 
 @refuse_former(**FORMER)
+@compiled_together
 def simulate(
     scene: Scene,
     until: Number,
@@ -118,7 +122,7 @@ def simulate(
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
-    periods = jnp.asarray(count(turns, "turns"), end.dtype)
+    periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
@@ -128,8 +132,8 @@ def simulate(
     if max_steps is None:
         max_steps = enough_steps(scene, end)
 
-    known = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
-    if solver is None and not known and end.dtype.itemsize >= 8:
+    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
+    if solver is None and not concrete and end.dtype.itemsize >= 8:
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
@@ -139,7 +143,7 @@ def simulate(
 
     def stretch(span: Array, state: State, chosen: _Control, wanted: bool) -> Run:
         most, measuring = allowed, None
-        if known and adjoint is None:
+        if concrete and adjoint is None:
             chosen, most = _limited(chosen, allowed)
             measuring = np.asarray(wanted)
         return integrate(scene, span, state, solver, chosen, adjoint, kept, periods, most, progress_meter, measuring)
@@ -151,11 +155,11 @@ def simulate(
 
     begun = time.perf_counter()
     if isinstance(stepsize_controller, Accuracy):
-        if not known:
+        if not concrete:
             raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
         assert isinstance(control, StepControl)
         found = _to_accuracy(scene, run, control, stepsize_controller.error)
-    elif not isinstance(control, StepControl) or not (known if estimate is None else estimate):
+    elif not isinstance(control, StepControl) or not (concrete if estimate is None else estimate):
         found = run(control)
     else:
         coarse, found = run(_coarser(control), wanted=False), run(control)
@@ -220,7 +224,7 @@ def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarse
     """The finer run with its estimated error, and what it and the runs `before` it cost."""
     fastest, _ = fastest_and_slowest(scene)
     error = _error(scene, fastest, fine.window, fine.steps, coarse.window.state, coarse.status, control, coarser)
-    evaluations = sum((run.evaluations for run in before), fine.evaluations)
+    evaluations = sum(known(run.evaluations) for run in (fine, *before))
     return _with(fine, error=error, evaluations=evaluations)
 
 
@@ -238,14 +242,14 @@ def _error(
     """The estimated error of a run, from its window and the states and the status of a coarser one; `fastest` see
     `fastest_and_slowest`."""
     # A run that is compared with itself, or with one that failed, has an error that nobody knows.
-    known = status == RunStatus.done
+    found = status == RunStatus.done
     if control.steps is not None:
-        known = known & (control.steps != coarser.steps)
+        found = found & (control.steps != coarser.steps)
     ours = window.state
     theirs = turned(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
     error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
-    return jnp.where(known & jnp.isfinite(error), error, jnp.inf)
+    return jnp.where(found & jnp.isfinite(error), error, jnp.inf)
 
 
 def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
@@ -256,7 +260,7 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
     for _ in range(_ATTEMPTS - 1):
         latest = run(control)
         found = _compared(scene, latest, before, control, coarse, tried)
-        if not bool(found.status == RunStatus.done):
+        if status_name(found.status) != "done":
             return found
         tolerance = float(cast(Array, control.tolerance))
         if float(found.error) <= accuracy:
@@ -274,7 +278,8 @@ def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepC
 
 
 def _with(run: Run, **values: Any) -> Run:
-    return dataclasses.replace(run, **{name: jnp.asarray(value, getattr(run, name).dtype) for name, value in values.items()})
+    typed = {name: known(value).astype(getattr(run, name).dtype) for name, value in values.items()}
+    return dataclasses.replace(run, **on_device(typed))
 
 
 def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
@@ -308,7 +313,7 @@ def _in_stretches(
         state = last_state(scene, found)
         taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
         evaluations, together = evaluations + int(found.evaluations), found.together & together
-        if not bool(found.status == RunStatus.done):
+        if status_name(found.status) != "done":
             break
     assert found is not None
     counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
@@ -325,7 +330,7 @@ def whole_turns(scene: Scene, stretch: float) -> float:
 
 def last_state(scene: Scene, run: Run) -> State:
     """Where a run under a constant speed ended, as a state to go on from: angles within a turn keep their digits."""
-    last = jax.tree.map(lambda leaf: np.asarray(leaf[-1]), run.window.state)
+    last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, together = wrap_angles(scene, last.displacement.dtype)
     first = np.ravel(last.azimuth)[0]
     inside = tuple(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi)) for x in last.angle)
@@ -334,8 +339,10 @@ def last_state(scene: Scene, run: Run) -> State:
 
 def _enough_samples(scene: Scene, end: Array) -> int:
     """So many that a picture shows the vibration and no beat of it with the samples; two numbers, so two programs, will do."""
-    wanted = PER_TURN * end * scene.drive.speed / (2.0 * jnp.pi)
-    return 2000 if traced(wanted) else _FEW_SAMPLES if float(wanted) <= _FEW_SAMPLES else _MANY_SAMPLES
+    if traced(end) or traced(scene.drive.speed):
+        return 2000
+    wanted = PER_TURN * float(end) * float(scene.drive.speed) / (2.0 * math.pi)
+    return _FEW_SAMPLES if wanted <= _FEW_SAMPLES else _MANY_SAMPLES
 
 
 def _sample_size(scene: Scene) -> float:
@@ -347,19 +354,20 @@ def _sample_size(scene: Scene) -> float:
 
 def enough_steps(scene: Scene, end: Array) -> int:
     """500 steps for each turn of what moves fastest, rounded up to a power of 2: few programs where it is part of one."""
-    turns = end * fastest_and_slowest(scene)[0] / (2.0 * jnp.pi)
-    if traced(turns):
+    fastest, _ = fastest_and_slowest(scene)
+    if traced(end) or traced(fastest):
         return 2**20
-    steps = 4096 + 500 * float(turns)
+    turns = float(end) * float(fastest) / (2.0 * math.pi)
+    steps = 4096 + 500 * turns
     if not steps <= _MOST_STEPS:
-        raise InputError("until", f"is {float(end):g} s, {float(turns):.2g} turns of what moves fastest; run shorter stretches")
+        raise InputError("until", f"is {float(end):g} s, {turns:.2g} turns of what moves fastest; run shorter stretches")
     return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
 
 
 def _raise_if_failed(run: Run, max_steps: int, chosen: StepChoice | None) -> None:
-    if bool(run.status == RunStatus.done):
-        return
     name, hint = status_name(run.status), ""
+    if name == "done":
+        return
     kept = run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):

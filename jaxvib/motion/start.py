@@ -16,6 +16,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.compat import known
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced
@@ -70,24 +72,25 @@ def initial_state(
     scene = checked(scene)
     n = scene.loads.count
     mass = scene.machine.structure().mass
-    zero = jnp.zeros(mass.shape[:1], mass.dtype)
+    zero = np.zeros(mass.shape[:1], mass.dtype)
 
     half = number(apart, "rad", "apart", low=0.0)
-    spread = half * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
+    spread = known(half) * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
 
     def phases(value: float | Array) -> Array:
         if angles is not None:
-            return numbers(angles, "rad", "angles", n) + spread
+            return known(numbers(angles, "rad", "angles", n)) + spread
         if any(effect.couples_loads for effect in scene.effects):
-            return value + scene.loads.offsets() + spread
-        return value + spread
+            return known(value) + known(scene.loads.offsets()) + spread
+        return known(value) + spread
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])
         first, *others = scene.loads.rest()
         angle = (phases(first), *others)
         require_start(scene, angle)
-        return with_spin(scene, State(zero, zero, angle, tuple(jnp.zeros((n,), zero.dtype) for _ in angle), rotor))
+        still = tuple(np.zeros(n, zero.dtype) for _ in angle)
+        return with_spin(scene, on_device(State(zero, zero, angle, still, rotor)))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:

@@ -6,11 +6,11 @@ from typing import TypeGuard, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.errors import ComputationError
 from jaxvib.runtime.compat import enumeration_names, enumeration_of, traced
+from jaxvib.runtime.devices import on_device
 
 __all__ = ["Computed", "failure", "is_status", "member", "sentence", "status_name", "status_names"]
 
@@ -36,8 +36,8 @@ def member(enumeration: type[Status], names: str | np.ndarray) -> Status:
     True
     """
     of_name = {name: k for k, name in enumerate(enumeration_names(enumeration))}
-    numbers = jnp.asarray(np.vectorize(of_name.__getitem__, otypes=[np.int32])(names))
-    return jax.tree.unflatten(jax.tree.structure(getattr(enumeration, next(iter(of_name)))), [numbers])
+    numbers = np.vectorize(of_name.__getitem__, otypes=[np.int32])(names)
+    return jax.tree.unflatten(jax.tree.structure(getattr(enumeration, next(iter(of_name)))), [on_device(numbers)])
 
 
 def status_names(status: eqx.Enumeration) -> np.ndarray:

@@ -24,7 +24,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -47,9 +49,12 @@ __all__ = [
     "enumeration_of",
     "evaluating",
     "jaxpr_as_fun",
+    "known",
     "no_host_checks",
+    "no_places",
     "operation_like",
     "results_of",
+    "resuming",
     "rewritten",
     "short_end",
     "substituted",
@@ -173,6 +178,11 @@ def traced(value: object) -> bool:
         return True
 
 
+def known(value: ArrayLike) -> Any:
+    """A value as NumPy has it, if it has a number yet: arithmetic with it then needs no program compiled."""
+    return value if traced(value) else np.asarray(value)
+
+
 def beneath(tracer: object) -> object | None:
     """What a derivative or a batch is taken of where `tracer` stands for it; None where that is not known, as under `jit`."""
     kind = type(tracer).__name__
@@ -183,6 +193,34 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
     """In here known numbers are computed with at once, whatever JAX is transforming; without it they are part of that."""
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
+
+
+def resuming() -> Callable[[], contextlib.AbstractContextManager[None]]:
+    """Contexts in which JAX transforms what it transforms here: the rules of its transformations run outside of them. Without
+    JAX's own two names they change nothing."""
+    core = sys.modules.get("jax._src.core")
+    here, change = getattr(core, "trace_ctx", None), getattr(core, "set_current_trace", None)
+    return contextlib.nullcontext if here is None or change is None else functools.partial(change, here.trace)
+
+
+@contextlib.contextmanager
+def no_places() -> Iterator[None]:
+    """What is traced in here does not note for each operation from where it was called, and does not ask anew for each check at
+    run time which of the callers' files are JAX's own: a tenth of the time until a program is compiled. Without JAX's names for
+    these it does."""
+    limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
+    frames = sys.modules.get("jax._src.traceback_util")
+    with contextlib.ExitStack() as stack:
+        if limit is not None:
+            stack.enter_context(limit(0))
+        if frames is not None and hasattr(frames, "include_filename"):
+            stack.enter_context(_patched(frames, "include_filename", _is_shown))
+        yield
+
+
+@functools.cache
+def _is_shown(filename: str) -> bool:
+    return _unpatched(sys.modules.get("jax._src.traceback_util"), "include_filename")(filename)
 
 
 def backend_started() -> bool:

@@ -10,8 +10,10 @@ import tempfile
 import threading
 
 import jax
+import numpy as np
+from jaxtyping import PyTree
 
-__all__ = ["shared_devices", "take_a_device"]
+__all__ = ["on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """What restricts a process to some of its machine's accelerators."""
@@ -27,6 +29,17 @@ def shared_devices() -> list[object]:
     found = jax.local_devices()
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
+
+
+def on_device(tree: PyTree) -> PyTree:
+    """A tree with NumPy's arrays and numbers moved to JAX's device; `jnp.asarray` compiles a program for each shape.
+
+    >>> on_device({"a": np.arange(2.0), "b": None})
+    {'a': Array([0., 1.], dtype=float64), 'b': None}
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    moved = iter(jax.device_put([leaf for leaf in leaves if isinstance(leaf, (np.ndarray, np.generic))]))
+    return structure.unflatten(next(moved) if isinstance(leaf, (np.ndarray, np.generic)) else leaf for leaf in leaves)
 
 
 def take_a_device() -> None:

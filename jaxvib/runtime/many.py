@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
-from jaxvib.runtime.devices import shared_devices
+from jaxvib.runtime.devices import on_device, shared_devices
+from jaxvib.runtime.stored import is_rehearsing
 
 __all__ = ["cores", "in_chunks", "in_parallel"]
 
@@ -121,8 +122,8 @@ def in_chunks(
     plain = jax.tree.map(np.asarray, cases)
 
     def computed(chunk: int) -> PyTree[np.ndarray]:
-        out = function(*jax.tree.map(lambda leaf: jnp.asarray(leaf[index[chunk]]), plain), *shared)
+        out = function(*on_device(jax.tree.map(lambda leaf: leaf[index[chunk]], plain)), *shared)
         return jax.tree.map(np.asarray, out)
 
-    parts = dict(in_parallel(computed, range(chunks)))
+    parts = dict.fromkeys(range(chunks), computed(0)) if is_rehearsing() else dict(in_parallel(computed, range(chunks)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *(parts[k] for k in range(chunks)))

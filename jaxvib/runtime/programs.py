@@ -22,6 +22,7 @@ from jax import Array
 
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import beneath, results_of, traced
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
@@ -66,7 +67,7 @@ class CachedFunction(Generic[P, T]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
         start()
         leaves, treedef = jax.tree.flatten((args, kwargs))
-        leaves = [jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
+        leaves = [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         moved = [leaf for leaf in leaves if traced(leaf)]
         if not moved:
             return self.stored(leaves, treedef)
@@ -262,7 +263,7 @@ def _differentiated(arrays: Sequence[Array], tangents: Sequence[Any], *, questio
 
 def _in_batch(arrays: Sequence[Array], axes: Sequence[Any], *, question: _Question) -> tuple[list[Array], list[Any]]:
     batched = tuple(axis is not None for axis in axes)
-    first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
+    first = [x if axis is None or axis == 0 else jnp.moveaxis(x, axis, 0) for x, axis in zip(arrays, axes, strict=True)]
     result = _mapped(question, batched, first)
     found = question.split(result)
     shared = sum(map(eqx.is_array, jax.tree.leaves(result[0]))) if _shares_result(question, batched) else 0

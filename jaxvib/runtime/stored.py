@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import gc
 import hashlib
 import importlib.metadata
 import itertools
@@ -17,23 +18,26 @@ import os
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import evaluating, no_host_checks
+from jaxvib.runtime.compat import evaluating, no_host_checks, no_places, resuming
 from jaxvib.runtime.cpu import processor
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
-__all__ = ["StoredFunction"]
+__all__ = ["StoredFunction", "compiled_together", "is_rehearsing"]
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 _PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
@@ -89,10 +93,14 @@ class StoredFunction(Generic[T]):
                     program = self.ready[asked] = self._program(folder, leaves, treedef, home)
             _forget_oldest()
         if program is None:
+            if is_rehearsing():
+                raise _Unstored
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
+        if program.is_new and (_rest.question is not None or is_rehearsing()):
+            program.compile_beside(_rehearse)
         with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
-            return program(leaf for leaf in leaves if eqx.is_array(leaf))
+            return program.unknown() if is_rehearsing() else program(leaf for leaf in leaves if eqx.is_array(leaf))
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
         args, kwargs = jax.tree.unflatten(treedef, leaves)
@@ -130,13 +138,14 @@ class StoredFunction(Generic[T]):
 
         jitted = jax.jit(flat)
         try:
-            exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
-            stored = bytes(exported.serialize())
+            with no_places(), _uncollected():
+                exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
+                stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
-        program = _Program.of(_compiled(path, exported, home), structure[0])
+        program = _Program.of(_compiled(path, exported, home), structure[0], exported, is_new=True)
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
@@ -145,22 +154,136 @@ class StoredFunction(Generic[T]):
 
 @dataclasses.dataclass
 class _Program:
-    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used."""
+    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used;
+    types of the arguments and results of one that is stored, whether it was traced in this process and has not been run, and
+    the thread that compiles it."""
 
     run: Callable[..., list[Array]]
     result: Skeleton
+    arguments: Sequence[jax.ShapeDtypeStruct] = ()
+    results: Sequence[jax.ShapeDtypeStruct] | None = None
+    is_new: bool = False
     used: int = dataclasses.field(default_factory=lambda: next(_clock))
+    compiling: threading.Thread | None = None
 
     @classmethod
-    def of(cls, run: Callable[..., list[Array]], structure: Description) -> _Program:
+    def of(
+        cls,
+        run: Callable[..., list[Array]],
+        structure: Description,
+        exported: export.Exported | None = None,
+        *,
+        is_new: bool = False,
+    ) -> _Program:
         places = itertools.count()
         result = Skeleton(rebuild(structure, map(Slot, places)))
         if result.size != next(places):
             raise Undescribable("an array of the result is in a static field")
-        return cls(run, result)
+        if exported is None:
+            return cls(run, result)
+        return cls(run, result, *(list(map(_type_of, avals)) for avals in (exported.in_avals, exported.out_avals)), is_new)
 
     def __call__(self, arrays: Iterable[Array]) -> Any:
+        compiling, self.compiling, self.is_new = self.compiling, None, False
+        if compiling is not None:
+            compiling.join()
         return self.result.filled(self.run(*arrays))
+
+    def compile_beside(self, what: Callable[[], None]) -> None:
+        """Begins to compile a new program in a thread, and does what is to be done beside."""
+        if self.compiling is None:
+            lowered = self.run.lower(*self.arguments)  # pyright: ignore[reportFunctionMemberAccess]
+            self.compiling = threading.Thread(target=_compile, args=(lowered,))
+            self.compiling.start()
+            what()
+
+    def unknown(self) -> Any:
+        """Zeros in place of results that have not been computed."""
+        if self.results is None:
+            raise _Unstored
+        return self.result.filled(on_device([np.zeros(x.shape, x.dtype) for x in self.results]))
+
+
+def _type_of(aval: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
+
+
+def _compile(lowered: jax.stages.Lowered) -> None:
+    with contextlib.suppress(Exception):  # the compiler fails once more where the program is run
+        lowered.compile()
+
+
+class _Rest(threading.local):
+    """Of a thread: the question that asks for programs, if it is one that is `compiled_together`, and whether it is
+    gone through with zeros."""
+
+    question: Callable[[], object] | None = None
+    resuming: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
+    rehearsing: bool = False
+
+
+_rest = _Rest()
+
+
+class _Unstored(Exception):
+    """Ends a rehearsal: what comes next depends on numbers of a program that can only be run."""
+
+
+def compiled_together(question: Callable[P, T]) -> Callable[P, T]:
+    """A question that asks for several programs, one after the other: those that are new are compiled at the same time.
+
+    Where the first new one is met, the question is asked once more with zeros for results of all programs, only to trace them
+    and to begin to compile them: tracing takes one core, compiling others. That ends at the first error, and where a program
+    depends on numbers, in which case it may be one that nobody needs.
+    """
+
+    @functools.wraps(question)
+    def asked(*args: P.args, **kwargs: P.kwargs) -> T:
+        if _rest.question is not None:  # a part of another question
+            return question(*args, **kwargs)
+        _rest.question, _rest.resuming = functools.partial(question, *args, **kwargs), resuming()
+        try:
+            return question(*args, **kwargs)
+        finally:
+            _rest.question = None
+
+    return asked
+
+
+def is_rehearsing() -> bool:
+    """Whether programs are only traced and compiled here, see `compiled_together`."""
+    return _rest.rehearsing
+
+
+def _rehearse() -> None:
+    if _rest.question is None or _rest.rehearsing:
+        return
+    _rest.rehearsing = True
+    try:
+        with contextlib.suppress(Exception), np.errstate(all="ignore"), _rest.resuming():
+            _rest.question()
+    finally:
+        _rest.rehearsing = False
+
+
+_pausing = threading.Lock()
+_tracing: list[bool] = []
+"""An entry for each trace that is under way, the first of them whether Python looked for garbage before."""
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """In here Python does not look for garbage in circles: tracing makes very many objects that stay, and to look through them
+    again and again takes a fifteenth of the time until a program is compiled."""
+    with _pausing:
+        _tracing.append(gc.isenabled() if not _tracing else _tracing[0])
+        gc.disable()
+    try:
+        yield
+    finally:
+        with _pausing:
+            if _tracing.pop() and not _tracing:
+                gc.enable()
 
 
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
@@ -202,7 +325,7 @@ def _read(path: Path, home: Sharding) -> _Program | None:
         exported = export.deserialize(bytearray(stored))
     except (OSError, ImportError):
         return None
-    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"])
+    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], exported)
 
 
 def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:

@@ -12,6 +12,7 @@ import optax
 from jax import Array
 
 from jaxvib.numerics.linalg import small_solve
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Point, Problem, derive
@@ -150,12 +151,12 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
     **Returns** `Descended`.
     """
     schedule = optax.cosine_decay_schedule(rate, steps, alpha=0.01)
-    rates = np.asarray(schedule(jnp.arange(steps)))
+    rates = np.asarray(jax.jit(schedule)(np.arange(steps)))
     rates = np.pad(rates, (0, -steps % STRETCH)).reshape(-1, STRETCH)
     lanes = in_chunks(problem.lanes, _begun, point, np.zeros((len(point.z), len(problem.demands))))
     history: list[np.ndarray] = []
     for k, part in enumerate(rates):
-        each = jnp.asarray(part)
+        each = on_device(part)
         lanes, values = in_chunks(problem.lanes, lambda lane, each=each: _stretch(problem, lane, each), lanes)
         history.append(values)
         tell((k + 1) / len(rates), _point(lanes))

@@ -16,7 +16,7 @@ from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 
-__all__ = ["LEAST", "STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure"]
+__all__ = ["LEAST", "STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure", "unmeasured"]
 
 LEAST = 1e-4
 """Changes of amplitudes below this share of the unbalance radius S/M, such as a balanced rotor's, are told relative to that."""
@@ -112,6 +112,13 @@ def measure(scene: Scene, field: Field, times: Array, states: State, unit: State
         foundation_force=whole[nd] if whole.shape[0] == nd + 1 else jnp.sqrt(jnp.sum(whole[nd:] ** 2)),
         drift=jnp.maximum(drift, speed_drift),
     )
+
+
+def unmeasured(states: State) -> Measured:
+    """NaN in place of what `measure` reads off these states."""
+    nd, loads = states.displacement.shape[1], states.azimuth.shape[1]
+    shapes = {"omega": (), "load_speed": (loads,), "amplitude": (nd,), "foundation_force": (), "drift": ()}
+    return Measured(**{name: jnp.full(shape, jnp.nan, states.displacement.dtype) for name, shape in shapes.items()})
 
 
 @eqx.filter_custom_jvp

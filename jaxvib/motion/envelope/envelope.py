@@ -34,6 +34,7 @@ from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -113,6 +114,7 @@ class _Units(eqx.Module):
 
 
 @refuse_former(tolerance=FORMER["tolerance"], controller=FORMER["controller"])
+@compiled_together
 def envelope(
     scene: Scene,
     until: Number,
@@ -174,7 +176,7 @@ def envelope(
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
-        chosen = jnp.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
+        chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     scene = brought_up(scene, end, start, spin_up)
     if isinstance(start, State):
         state = whole_state(scene, start, mode)
@@ -345,11 +347,12 @@ def _units(scene: Scene) -> _Units:
 
 
 def _raise_if_failed(run: Envelope, max_steps: int) -> None:
-    if bool(run.status == EnvelopeStatus.done):
+    name = status_name(run.status)
+    if name == "done":
         return
     hint = {
         "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
         "no_step": "; give a smaller tolerance, or leave the solver out",
         "not_turning": "; integrate the full equations with simulate",
     }
-    raise failure(run.status, hint.get(status_name(run.status), ""))
+    raise failure(run.status, hint.get(name, ""))

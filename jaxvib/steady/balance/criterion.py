@@ -15,6 +15,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.speeds import CharacteristicSpeeds, CriterionStatus, characteristic_speeds, port_receptance
 
 if TYPE_CHECKING:
@@ -134,7 +135,11 @@ def criterion(scene: Scene) -> Criterion:
         if effect.has_load_potential and not effect.couples_loads:
             problem = "pulls at each load by its angle (property has_load_potential), which the criterion knows nothing of"
             raise InputError(f"effects.{effect.kind}", f"{problem}; leave it out, or simulate")
-    speeds = characteristic_speeds(scene)
+    return _judged(characteristic_speeds(scene))
+
+
+@cached
+def _judged(speeds: CharacteristicSpeeds) -> Criterion:
     return Criterion(
         status=speeds.status,
         speeds=speeds,

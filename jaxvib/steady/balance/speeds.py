@@ -161,12 +161,15 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """
     scene = checked(scene)
     require_one_point(scene)
-    _require_port_that_moves(scene)
-    return _characteristic_speeds(scene)
+    found, *parts = _characteristic_speeds(scene)
+    if not any(map(traced, parts)):
+        _require_port_that_moves(scene, *map(np.asarray, parts))
+    return found
 
 
 @cached
-def _characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
+def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, Array, Array]:
+    """The speeds, and the port, stiffness and mass of the carrier with its loads."""
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)
     if carrier.gyroscopic is None:
@@ -181,7 +184,8 @@ def _characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
     changes = _sign_changes(model, direction, resonances, additional, shapes)
-    return CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
+    found = CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
+    return found, carrier.port, carrier.stiffness, model.mass
 
 
 def _direction(model: LinearModel) -> Array:
@@ -189,14 +193,9 @@ def _direction(model: LinearModel) -> Array:
     return model.carrier.port[0] if len(model.carrier.axes) == 1 else model.direction
 
 
-def _require_port_that_moves(scene: Scene) -> None:
-    """Input checks, for concrete numbers only."""
-    model = linear_model(scene)
-    carrier = model.carrier
-    parts = (carrier.port, carrier.stiffness, model.mass)
-    if any(traced(part) for part in parts):
-        return
-    port, stiffness, mass = (np.asarray(part) for part in parts)
+def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
+    """Input checks."""
+    carrier = scene.machine.structure()
     if not np.any(port):
         problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
         raise InputError("machine.port", problem)

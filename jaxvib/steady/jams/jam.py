@@ -18,6 +18,7 @@ from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, Pieces, branch_pieces, branch_tangent, rotor_speed_at
 from jaxvib.units import traced
@@ -110,7 +111,7 @@ class JamModes(AbstractJam):
 
     def mode_numbers(self) -> list[int]:
         """The numbers of the modes that exist."""
-        return [int(k) for k, there in zip(np.asarray(self.mode), np.asarray(self.exists), strict=True) if there]
+        return [int(k) for k, name in zip(np.asarray(self.mode), status_names(self.status), strict=True) if name != "absent"]
 
     def row(self, mode: int, *, throw: bool = False) -> int:
         """Where the numbers of the jam mode of that number stand in the arrays, whether it exists or not.
@@ -120,7 +121,7 @@ class JamModes(AbstractJam):
         most = self.mode.shape[0]
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
-        if throw and not traced(self.omega) and not np.asarray(self.exists)[int(mode) - 1]:
+        if throw and not traced(self.omega) and status_names(self.status)[int(mode) - 1] == "absent":
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",

@@ -16,16 +16,17 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
-from jaxvib.results.status import sentence
+from jaxvib.results.status import sentence, status_names
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
     PhaseJam,
-    PhaseStatus,
     balanced,
     influence_of,
     jam_from,
@@ -151,7 +152,12 @@ def phase_jams(
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
     parts = _parts(scene)
     rng = np.random.default_rng(count(seed, "seed", low=0))
-    omega, phase = starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count)))
+    return _jams_near(scene, parts, *starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count))))
+
+
+@compiled_together
+def _jams_near(scene: Scene, parts: Parts, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
+    """The jams that are found from these load speeds (n,) and phases (n, count)."""
     omega, phase = in_chunks(_STARTS, lambda w, a: _balanced_many(parts, w, a), omega, phase)
     groups = _equal_loads(parts)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
@@ -160,13 +166,13 @@ def phase_jams(
     # With nothing to solve from, one that is no jam: the arrays have their shapes, and end up empty.
     first = (omega[starts_at[places]], phase[starts_at[places]]) if places else (np.array([float(parts.speed)]), phase[:1])
     jams = in_chunks(_JAMS, lambda w, a: _jams_from(scene, w, a), *first)
-    found = np.flatnonzero(np.asarray(jams.status == PhaseStatus.found)) if places else np.zeros(0, dtype=int)
+    found = np.flatnonzero(status_names(jams.status) == "found") if places else np.zeros(0, dtype=int)
     places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]
     order = sorted(range(keep.size), key=lambda i: (-round(float(jams.omega[keep[i]]), 6), not jams.stable[keep[i]]))
     fields = {name: getattr(jams, name) for name in PhaseJam.__dataclass_fields__}
-    sorted_fields = jax.tree.map(lambda leaf: jnp.asarray(leaf[keep[order]]), fields)
-    return PhaseJams(**sorted_fields, starts=jnp.asarray(reached[order], dtype=int), scene=scene)
+    sorted_fields = on_device(jax.tree.map(lambda leaf: leaf[keep[order]], fields))
+    return PhaseJams(**sorted_fields, starts=on_device(reached[order]), scene=scene)
 
 
 def _distinct(
@@ -260,8 +266,9 @@ def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Ar
 
 def _equal_loads(parts: Parts) -> list[np.ndarray]:
     """Groups of loads that are alike in every number, by their places."""
+    direction = np.asarray(parts.direction)
     rows = np.concatenate(
-        [parts.direction.real, parts.direction.imag, np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
+        [direction.real, direction.imag, np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
     )
     _, which = np.unique(rows, axis=0, return_inverse=True)
     return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]

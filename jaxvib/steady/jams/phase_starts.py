@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.numerics.linalg import magnitude
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
@@ -98,7 +99,7 @@ def _at_each(parts: Parts, omega: Array) -> AtSpeed:
 def _at_speeds(parts: Parts, omega: np.ndarray) -> AtSpeed:
     """At load speeds (n,), filled up to whole chunks: another number of them needs no other program."""
     filled = omega[np.minimum(np.arange(-(-omega.size // _SPEEDS) * _SPEEDS), omega.size - 1)]
-    return jax.tree.map(jnp.asarray, in_chunks(_SPEEDS, lambda w: _at_each(parts, w), filled))
+    return on_device(in_chunks(_SPEEDS, lambda w: _at_each(parts, w), filled))
 
 
 def _followed(parts: Parts, at: AtSpeed, row: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -23,6 +23,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.folds import fold_points
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, steps_for
@@ -94,6 +95,7 @@ class ExactBranches(Result):
         return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
 
 
+@compiled_together
 def exact_branches(
     scene: Scene,
     *,
@@ -122,13 +124,13 @@ def exact_branches(
     [('fold', 0.3342), ('fold', 0.3811), ('torus', 0.3953), ('fold', 1.0023), ('fold', 1.217)]
     """
     count(points, "points", low=2, each=1e4)
-    crowded, resonances = _fold_points(scene)
-    lowest = jnp.min(jnp.where(resonances > 0.0, resonances, jnp.max(resonances)))
-    low = 0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True)
-    high = scene.drive.speed * 4.0 / 3.0 if most is None else number(most, "rad/s", "most", low=0.0, open_low=True)
-    if not float(high) > float(low):
-        raise InputError("most", f"is {float(high):.6g} rad/s; it must be above the least, {float(low):.6g} rad/s")
-    inside = np.asarray(crowded)
+    inside, resonances = map(np.asarray, _fold_points(scene))
+    lowest = np.min(resonances[resonances > 0.0], initial=np.max(resonances))
+    low = float(0.2 * lowest if least is None else number(least, "rad/s", "least", low=0.0, open_low=True))
+    speed = float(scene.drive.speed)
+    high = speed * 4.0 / 3.0 if most is None else float(number(most, "rad/s", "most", low=0.0, open_low=True))
+    if not high > low:
+        raise InputError("most", f"is {high:.6g} rad/s; it must be above the least, {low:.6g} rad/s")
     inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
     omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
     values = _Solver(scene, accuracy)(omega)

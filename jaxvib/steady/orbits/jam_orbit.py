@@ -16,7 +16,9 @@ from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.compat import known
 from jaxvib.runtime.programs import cached
+from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
@@ -42,6 +44,7 @@ _FAR = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 
+@compiled_together
 def jam_orbit(
     scene: Scene,
     *,
@@ -109,15 +112,16 @@ def jam_orbit(
     loads = jammed_loads(frozen)
     require_drag(loads)
 
-    exists, direction, start = jnp.asarray(True), None, frozen.drive.speed
+    exists, direction, start = np.asarray(True), None, frozen.drive.speed
     if mode is not None:
         if frozen.machine.structure().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
         jams = jams_of(frozen)
-        light = jams.omega[jams.row(mode)]
-        direction = jnp.asarray(1.0 if mode % 2 == 1 else -1.0)
-        exists = jnp.isfinite(light)
-        start = jnp.where(exists, light, frozen.drive.speed)
+        light, speed = known(jams.omega)[jams.row(mode)], known(frozen.drive.speed)
+        direction = np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype)
+        within = jnp if traced(light) or traced(speed) else np
+        exists = within.asarray(within.isfinite(light))
+        start = within.asarray(within.where(exists, light, speed))
     elif near is not None:
         start = number(near, "rad/s", "near", low=0.0, open_low=True)
     which: Parameter = "rotor_speed"

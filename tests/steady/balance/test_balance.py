@@ -14,7 +14,7 @@ from scenes import machines
 
 import jaxvib as jv
 from jaxvib.steady.balance import states
-from jaxvib.steady.balance.speeds import _require_port_that_moves
+from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
 
 POINTS = 112
@@ -336,5 +336,5 @@ def test_every_change_of_stability_is_halved_to_the_same_part(monkeypatch):
 def test_a_motion_without_a_spring_is_refused_whatever_holds_the_others():
     gyroscopic = rotor(0.1, stiffness=(1.1e6, 0.0))
     with pytest.raises(jv.InputError, match="leaves a motion of the rotor without a spring"):
-        _require_port_that_moves(gyroscopic)
-    _require_port_that_moves(rotor(0.1))
+        characteristic_speeds(gyroscopic)
+    characteristic_speeds(rotor(0.1))
