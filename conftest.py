@@ -9,6 +9,7 @@ import os
 import pathlib
 import shutil
 import sys
+import threading
 
 import equinox as eqx
 import jax
@@ -53,6 +54,23 @@ def pytest_configure(config):
     with contextlib.suppress(ImportError, AttributeError):  # a JAX that does it otherwise
         frames = importlib.import_module("jax._src.traceback_util")
         frames.include_filename = functools.cache(frames.include_filename)
+    # Where an operation was called from is written into no program.
+    jax.config.update("jax_traceback_in_locations_limit", 0)
+    # JAX makes a context of MLIR, with all its dialects, for each program that it lowers: a sixth of the suite's time. One that
+    # is in use, by a program within which another one is lowered, is left alone.
+    with contextlib.suppress(ImportError, AttributeError):
+        mlir = importlib.import_module("jax._src.interpreters.mlir")
+        made, held, context = mlir.make_ir_context, threading.local(), mlir.ir.Context
+
+        def make_ir_context():
+            with contextlib.suppress(ValueError):  # there is none
+                if context.current is not None:
+                    return made()
+            if not hasattr(held, "context"):
+                held.context = made()
+            return held.context
+
+        mlir.make_ir_context = make_ir_context
     # Tracing makes millions of objects that stay: looking through all of them again and again took a sixth of the suite's time.
     gc.set_threshold(100_000, 50, 100)
 

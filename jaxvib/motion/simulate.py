@@ -27,8 +27,7 @@ from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
-from jaxvib.runtime.compat import known
-from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
 from jaxvib.units import Number, count, number, traced

@@ -16,8 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.scene import Scene
-from jaxvib.runtime.compat import known
-from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, number, numbers, traced

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,9 @@ from jaxvib.numerics.fence import fence, hidden_one
 from jaxvib.numerics.sincos import unfenced_sine_and_cosine
 from jaxvib.ode.scalar_rules import primitive_of
 from jaxvib.runtime.compat import (
+    Atoms,
     ClosedJaxpr,
+    Instead,
     JaxprEqn,
     Literal,
     Primitive,
@@ -22,7 +24,7 @@ from jaxvib.runtime.compat import (
     rewritten,
 )
 
-__all__ = ["fenced", "is_floating", "without_repeats"]
+__all__ = ["fenced", "is_floating", "substituted", "without_repeats"]
 
 _MAX_RECOMPUTED = 8
 """A value used more than once that takes more operations than these is fenced: see `fenced`."""
@@ -126,3 +128,20 @@ def is_floating(x: Any) -> bool:
 def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
     """Those of the atoms that are no numbers, each once, in order."""
     return list(dict.fromkeys(atom for atom in atoms if isinstance(atom, Var)))
+
+
+def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
+    """A program in which others stand for those operations of one result for which `chosen` gives some."""
+    instead: dict[int, Var] = {}
+    equations: list[tuple[JaxprEqn, Atoms]] = []
+
+    def known(atoms: Sequence[Var | Literal]) -> Atoms:
+        return [instead.get(id(atom), atom) for atom in atoms]
+
+    for equation in program.jaxpr.eqns:
+        inputs = known(equation.invars)
+        found = chosen(equation, inputs)
+        equations += [(equation, inputs)] if found is None else found[0]
+        if found is not None:
+            instead[id(equation.outvars[0])] = found[1]
+    return rewritten(program, equations, known(program.jaxpr.outvars))

@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxvib.numerics.sincos import sine_and_cosine
-from jaxvib.ode.scalar_programs import fenced, is_floating, without_repeats
+from jaxvib.ode.scalar_programs import fenced, is_floating, substituted, without_repeats
 from jaxvib.ode.scalar_rules import (
     NotScalarizable,
     Scalar,
@@ -43,7 +43,6 @@ from jaxvib.runtime.compat import (
     Primitive,
     Var,
     operation_like,
-    substituted,
 )
 
 __all__ = [

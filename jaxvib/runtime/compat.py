@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -49,7 +47,6 @@ __all__ = [
     "enumeration_of",
     "evaluating",
     "jaxpr_as_fun",
-    "known",
     "no_host_checks",
     "no_places",
     "operation_like",
@@ -57,7 +54,6 @@ __all__ = [
     "resuming",
     "rewritten",
     "short_end",
-    "substituted",
     "traced",
     "user_folder",
     "wide_vectors_are_right",
@@ -117,23 +113,6 @@ Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
 """Operations, each with its inputs, that stand for another one, and the variable that stands for its result."""
 
 
-def substituted(program: ClosedJaxpr, chosen: Callable[[JaxprEqn, Atoms], Instead | None]) -> ClosedJaxpr:
-    """A program in which others stand for those operations of one result for which `chosen` gives some."""
-    instead: dict[int, Var] = {}
-    equations: list[tuple[JaxprEqn, Atoms]] = []
-
-    def known(atoms: Sequence[Var | Literal]) -> Atoms:
-        return [instead.get(id(atom), atom) for atom in atoms]
-
-    for equation in program.jaxpr.eqns:
-        inputs = known(equation.invars)
-        found = chosen(equation, inputs)
-        equations += [(equation, inputs)] if found is None else found[0]
-        if found is not None:
-            instead[id(equation.outvars[0])] = found[1]
-    return rewritten(program, equations, known(program.jaxpr.outvars))
-
-
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
     """The one operation of a function of such arguments, with variables of its own."""
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
@@ -176,11 +155,6 @@ def traced(value: object) -> bool:
         return isinstance(value, jax.Array) and not value.devices()
     except jax.errors.ConcretizationTypeError:
         return True
-
-
-def known(value: ArrayLike) -> Any:
-    """A value as NumPy has it, if it has a number yet: arithmetic with it then needs no program compiled."""
-    return value if traced(value) else np.asarray(value)
 
 
 def beneath(tracer: object) -> object | None:

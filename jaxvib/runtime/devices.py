@@ -8,12 +8,16 @@ import itertools
 import os
 import tempfile
 import threading
+from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-__all__ = ["on_device", "shared_devices", "take_a_device"]
+from jaxvib.runtime.compat import traced
+
+__all__ = ["known", "on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """What restricts a process to some of its machine's accelerators."""
@@ -29,6 +33,11 @@ def shared_devices() -> list[object]:
     found = jax.local_devices()
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return list(found) if chosen is None and len(found) > 1 and found[0].platform != "cpu" else [None]
+
+
+def known(value: ArrayLike) -> Any:
+    """A value as NumPy has it, if it has a number yet: arithmetic with it then needs no program compiled."""
+    return value if traced(value) else np.asarray(value)
 
 
 def on_device(tree: PyTree) -> PyTree:

@@ -16,7 +16,7 @@ from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
-from jaxvib.runtime.compat import known
+from jaxvib.runtime.devices import known
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
