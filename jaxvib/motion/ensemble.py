@@ -198,7 +198,8 @@ def ensemble(
     error = np.full(runs, unknown, end.dtype)
     if compared:
         error = estimated_error(apart, share, made[0])
-    found = on_device(Ensemble(last, load_speed, error, finite, detached, taken[0], np.asarray(np.nan, end.dtype)))
+    unknown = np.asarray(np.nan, end.dtype)
+    found = Ensemble(*on_device((last, load_speed, error, finite, detached, taken[0], unknown)))
     if not concrete:
         return found
     jax.block_until_ready(found)

@@ -115,7 +115,7 @@ def integrate(
     controller: diffrax.AbstractStepSizeController | StepControl,
     adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
-    turns: Array,
+    turns: Array | np.ndarray,
     max_steps: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
     wanted: Array | np.ndarray | None = None,

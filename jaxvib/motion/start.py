@@ -89,7 +89,8 @@ def initial_state(
         angle = (phases(first), *others)
         require_start(scene, angle)
         still = tuple(np.zeros(n, zero.dtype) for _ in angle)
-        return with_spin(scene, on_device(State(zero, zero, angle, still, rotor)))
+        zero, angle, still, rotor = on_device((zero, angle, still, rotor))
+        return with_spin(scene, State(zero, zero, angle, still, rotor))
     if mode is None:
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:

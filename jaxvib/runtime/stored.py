@@ -181,7 +181,7 @@ class _Program:
             raise Undescribable("an array of the result is in a static field")
         if exported is None:
             return cls(run, result)
-        return cls(run, result, *(list(map(_type_of, avals)) for avals in (exported.in_avals, exported.out_avals)), is_new)
+        return cls(run, result, list(map(_type_of, exported.in_avals)), list(map(_type_of, exported.out_avals)), is_new)
 
     def __call__(self, arrays: Iterable[Array]) -> Any:
         compiling, self.compiling, self.is_new = self.compiling, None, False

@@ -198,7 +198,7 @@ def _run(
     end: Array,
     state: State | None,
     solver: diffrax.AbstractSolver | None,
-    control: diffrax.AbstractStepSizeController | Array,
+    control: diffrax.AbstractStepSizeController | Array | np.ndarray,
     adjoint: diffrax.AbstractAdjoint | None,
     samples: int,
     turns: int,
@@ -218,7 +218,8 @@ def _run(
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
 
-    controller = diffrax.PIDController(rtol=control, atol=control) if isinstance(control, Array) else control
+    given = isinstance(control, diffrax.AbstractStepSizeController)
+    controller = control if given else diffrax.PIDController(rtol=control, atol=control)
 
     rates, args = _rates(units.pack(begin), (field, units), nd)
     solution = solve(

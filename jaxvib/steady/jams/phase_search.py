@@ -268,7 +268,7 @@ def _equal_loads(parts: Parts) -> list[np.ndarray]:
     """Groups of loads that are alike in every number, by their places."""
     direction = np.asarray(parts.direction)
     rows = np.concatenate(
-        [direction.real, direction.imag, np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
+        [np.real(direction), np.imag(direction), np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
     )
     _, which = np.unique(rows, axis=0, return_inverse=True)
     return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]

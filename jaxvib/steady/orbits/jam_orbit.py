@@ -16,7 +16,7 @@ from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
-from jaxvib.runtime.devices import known
+from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
@@ -112,16 +112,16 @@ def jam_orbit(
     loads = jammed_loads(frozen)
     require_drag(loads)
 
-    exists, direction, start = np.asarray(True), None, frozen.drive.speed
+    exists, direction, start = on_device(np.asarray(True)), None, frozen.drive.speed
     if mode is not None:
         if frozen.machine.structure().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
         jams = jams_of(frozen)
         light, speed = known(jams.omega)[jams.row(mode)], known(frozen.drive.speed)
-        direction = np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype)
+        direction = on_device(np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype))
         within = jnp if traced(light) or traced(speed) else np
-        exists = within.asarray(within.isfinite(light))
-        start = within.asarray(within.where(exists, light, speed))
+        exists = on_device(within.asarray(within.isfinite(light)))
+        start = on_device(within.asarray(within.where(within.isfinite(light), light, speed)))
     elif near is not None:
         start = number(near, "rad/s", "near", low=0.0, open_low=True)
     which: Parameter = "rotor_speed"
