@@ -8,6 +8,7 @@ cases needs no other program.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import os
 from collections.abc import Callable, Generator, Iterable
@@ -21,7 +22,7 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import on_device, shared_devices
-from jaxvib.runtime.stored import is_rehearsing
+from jaxvib.runtime.stored import begin_others, beginning, is_rehearsing
 
 __all__ = ["cores", "in_chunks", "in_parallel"]
 
@@ -46,29 +47,33 @@ def cores() -> int:
 def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
     """A function of many items: threads compute them on all cores and accelerators; gives each with its item as it is finished.
 
-    The first item is computed alone, so that a program is compiled once. Items are taken as there is room for them: one more
-    than threads is held at most, so that memory does not grow with their number. JAX's options are those of the caller, with
-    those that a context manager set for the caller's thread alone. When an error is raised, here or by who takes the results,
-    items that have not begun are not computed.
+    The first item is computed alone as long as its programs are new, so that each is compiled once. Items are taken as there is
+    room for them: one more than threads is held at most, so that memory does not grow with their number. JAX's options are
+    those of the caller, with those that a context manager set for the caller's thread alone. When an error is raised, here or
+    by who takes the results, items that have not begun are not computed.
 
     >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
     [(1, 1), (2, 4), (3, 9)]
     """
     left, devices = iter(items), itertools.cycle(shared_devices())
-    alike = _same_options(function)
-    for first in left:
-        yield first, alike(first, next(devices))
-        break
-    threads = cores()
+    alike, threads = _same_options(function), cores()
     pool = ThreadPoolExecutor(threads)
     running: dict[Future[Found], Item] = {}
-    try:
-        for item in left:
+
+    def begin(most: int) -> None:
+        for item in itertools.islice(left, max(most - len(running), 0)):
             running[pool.submit(alike, item, next(devices))] = item
-            if len(running) > threads:
-                yield from _finished(running)
+
+    try:
+        for first in left:
+            with beginning(functools.partial(begin, threads - 1)):
+                found = alike(first, next(devices))
+            yield first, found
+            break
+        begin(threads + 1)
         while running:
             yield from _finished(running)
+            begin(threads + 1)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -125,5 +130,32 @@ def in_chunks(
         out = function(*on_device(jax.tree.map(lambda leaf: leaf[index[chunk]], plain)), *shared)
         return jax.tree.map(np.asarray, out)
 
-    parts = dict.fromkeys(range(chunks), computed(0)) if is_rehearsing() else dict(in_parallel(computed, range(chunks)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *(parts[k] for k in range(chunks)))
+    parts = [computed(0)] * chunks if is_rehearsing() else _all(computed, chunks)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
+
+
+def _all(function: Callable[[int], Found], number: int) -> list[Found]:
+    """The function of 0, 1, ... so many: each thread, the caller's too, takes the next number as soon as it is free, which
+    takes less time than to hand out items one by one. Devices, options and errors as `in_parallel`."""
+    devices, alike = shared_devices(), _same_options(function)
+    workers = min(max(cores(), len(devices)), number)
+    left, found, failed = iter(range(number)), [], []
+
+    def work(worker: int) -> None:
+        try:
+            for k in left:
+                if failed:
+                    break
+                found.append((k, alike(k, devices[worker % len(devices)])))
+                begin_others()
+        except BaseException:
+            failed.append(True)
+            raise
+
+    with ThreadPoolExecutor(workers) as pool:
+        others: list[Future[None]] = []
+        with beginning(lambda: others.extend(pool.submit(work, k) for k in range(1, workers))):
+            work(0)
+        for other in others:
+            other.result()
+    return [value for _, value in sorted(found, key=lambda each: each[0])]

@@ -35,7 +35,7 @@ from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
-__all__ = ["StoredFunction", "compiled_together", "is_rehearsing"]
+__all__ = ["StoredFunction", "begin_others", "beginning", "compiled_together", "is_rehearsing"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -99,6 +99,8 @@ class StoredFunction(Generic[T]):
         program.used = next(_clock)
         if program.is_new and (_rest.question is not None or is_rehearsing()):
             program.compile_beside(_rehearse)
+        if program.has_run:
+            begin_others()
         with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
             return program.unknown() if is_rehearsing() else program(leaf for leaf in leaves if eqx.is_array(leaf))
 
@@ -156,13 +158,14 @@ class StoredFunction(Generic[T]):
 class _Program:
     """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used;
     types of the arguments and results of one that is stored, whether it was traced in this process and has not been run, and
-    the thread that compiles it."""
+    whether it has; and the thread that compiles it."""
 
     run: Callable[..., list[Array]]
     result: Skeleton
     arguments: Sequence[jax.ShapeDtypeStruct] = ()
     results: Sequence[jax.ShapeDtypeStruct] | None = None
     is_new: bool = False
+    has_run: bool = False
     used: int = dataclasses.field(default_factory=lambda: next(_clock))
     compiling: threading.Thread | None = None
 
@@ -187,7 +190,9 @@ class _Program:
         compiling, self.compiling, self.is_new = self.compiling, None, False
         if compiling is not None:
             compiling.join()
-        return self.result.filled(self.run(*arrays))
+        found = self.run(*arrays)
+        self.has_run = True
+        return self.result.filled(found)
 
     def compile_beside(self, what: Callable[[], None]) -> None:
         """Begins to compile a new program in a thread, and does what is to be done beside."""
@@ -214,10 +219,11 @@ def _compile(lowered: jax.stages.Lowered) -> None:
 
 
 class _Rest(threading.local):
-    """Of a thread: the question that asks for programs, if it is one that is `compiled_together`, and whether it is
-    gone through with zeros."""
+    """Of a thread: the question that asks for programs, if it is `compiled_together`, whether it is gone through with zeros,
+    and what is to be begun, see `beginning`."""
 
     question: Callable[[], object] | None = None
+    others: Callable[[], None] | None = None
     resuming: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
     rehearsing: bool = False
 
@@ -253,6 +259,23 @@ def compiled_together(question: Callable[P, T]) -> Callable[P, T]:
 def is_rehearsing() -> bool:
     """Whether programs are only traced and compiled here, see `compiled_together`."""
     return _rest.rehearsing
+
+
+@contextlib.contextmanager
+def beginning(others: Callable[[], None]) -> Iterator[None]:
+    """In here `others`, which ask for the same programs in other threads, are begun once one runs that has run before."""
+    before, _rest.others = _rest.others, others
+    try:
+        yield
+    finally:
+        _rest.others = before
+
+
+def begin_others() -> None:
+    """What is to be begun, if it has not been yet."""
+    if (others := _rest.others) is not None:
+        _rest.others = None
+        others()
 
 
 def _rehearse() -> None:

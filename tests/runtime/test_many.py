@@ -9,8 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import scene
 
+from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.runtime import many
+from jaxvib.runtime.cache import keep_programs
 
 
 def test_items_are_taken_as_there_is_room_and_the_first_one_alone(monkeypatch):
@@ -51,6 +54,46 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         for _ in many.in_parallel(lambda k: begun.append(k), range(1000, 2000)):
             raise KeyboardInterrupt
+    assert len(begun) < 30
+
+
+def test_other_threads_begin_as_soon_as_a_program_that_has_run_before_runs_again(monkeypatch, tmp_path):
+    """Of a new program nobody else runs anything while the first one is at work; of a known one others do."""
+    monkeypatch.setattr(many, "cores", lambda: 2)
+    keep_programs(tmp_path)
+    threads, both = [], threading.Event()
+
+    def computed(x):
+        fastest_and_slowest(asked)
+        threads.append(threading.current_thread())
+        if len(set(threads)) == 2:
+            both.set()
+        if wait:
+            assert both.wait(20.0)  # until another thread has come as far
+        return x + 1.0
+
+    asked, wait = scene("one_mass", "balls"), False
+    np.testing.assert_array_equal(many.in_chunks(2, computed, np.arange(3.0)), np.arange(3.0) + 1.0)
+    assert threads[0] is threading.main_thread()
+    threads.clear(), both.clear()
+    wait = True
+    np.testing.assert_array_equal(many.in_chunks(2, computed, np.arange(8.0)), np.arange(8.0) + 1.0)
+    threads.clear(), both.clear()
+    assert sorted(k for k, _ in many.in_parallel(lambda k: computed(np.ones(2)), range(4))) == [0, 1, 2, 3]
+
+
+def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
+    monkeypatch.setattr(many, "cores", lambda: 3)
+    begun = []
+
+    def computed(x):
+        begun.append(x[0])
+        if x[0] == 5.0:
+            raise KeyError("five")
+        return x
+
+    with pytest.raises(KeyError, match="five"):
+        many.in_chunks(1, computed, np.arange(1000.0))
     assert len(begun) < 30
 
 
