@@ -22,7 +22,7 @@ from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
-from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
     Parts,
@@ -179,18 +179,23 @@ def _distinct(
     omega: np.ndarray, phase: np.ndarray, starts: np.ndarray, groups: list[np.ndarray]
 ) -> tuple[list[int], np.ndarray]:
     """Places of jams (n,) that differ, by falling speed, and how many of the `starts` (n,) of all of them led to each."""
+    # Most are found many times: those that differ by less than half of what is close are taken together at once.
+    cells = np.concatenate([np.log(omega)[:, None] / _SAME, np.cos(phase) / _CLOSE, np.sin(phase) / _CLOSE], axis=1)
+    once, which = distinct_rows(np.floor(2.0 * cells))
+    starts = np.bincount(which, starts, once.size).astype(int)
     places: list[int] = []
     reached: list[int] = []
     near = 0  # the first of `places` that is not too fast to be the same
-    for k in np.argsort(-omega, kind="stable"):
+    for m in np.argsort(-omega[once], kind="stable"):
+        k = once[m]
         while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME * omega[places[near]]:
             near += 1
         place = next((i for i in range(near, len(places)) if _same(phase[places[i]], phase[k], groups)), None)
         if place is None:
             places.append(int(k))
-            reached.append(int(starts[k]))
+            reached.append(int(starts[m]))
         else:
-            reached[place] += int(starts[k])
+            reached[place] += int(starts[m])
     return places, np.asarray(reached, dtype=int)
 
 

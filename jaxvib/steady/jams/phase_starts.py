@@ -15,7 +15,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at
 
-__all__ = ["LOAD_SPEEDS", "AtSpeed", "at_speed", "load_speeds", "phases_near", "starts_of"]
+__all__ = ["LOAD_SPEEDS", "AtSpeed", "at_speed", "distinct_rows", "load_speeds", "phases_near", "starts_of"]
 
 LOAD_SPEEDS = 240
 """Load speeds at which phases are looked for, besides those near resonances."""
@@ -46,11 +46,8 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
-    digits = [1e4 * size[:, None], 1e3 * np.cos(angles[:, 1:]), 1e3 * np.sin(angles[:, 1:])]
-    kinds = np.concatenate([row[:, None], np.rint(np.concatenate(digits, axis=1)).astype(int)], axis=1)
-    # Of each row one number is compared, which is much faster: the odds that any two of 1e5 rows share theirs are 3e-10.
-    mixed = kinds @ np.random.default_rng(0).integers(2**63, size=kinds.shape[1])
-    once = np.sort(np.unique(mixed, return_index=True)[1])
+    inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
+    once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
     row, size, angles = row[once], size[once], angles[once]
     near = np.abs(size) < np.log(3.0)
 
@@ -73,6 +70,21 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         low, high, at = ends[lane, cut], ends[lane, cut + 1], turned[lane, cut]
     every = np.concatenate([angles[near], at])
     return np.tile(np.concatenate([speeds[row[near]], low]), 2), np.concatenate([every, -every])
+
+
+def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the rows of whole numbers (n, m) that differ, each where it stands first, ascending; and for each row (n,)
+    which of them it is.
+
+    Of each row one number is compared, which is much faster: the odds that any two of 1e5 rows share theirs are 3e-10.
+    """
+    mixed = rows.astype(int) @ np.random.default_rng(0).integers(2**63, size=rows.shape[1])
+    order = np.argsort(mixed)
+    begins = np.diff(mixed[order], prepend=mixed[order[:1]] - 1) != 0
+    first = np.minimum.reduceat(order, np.flatnonzero(begins))
+    which = np.empty(order.size, dtype=int)
+    which[order] = np.argsort(np.argsort(first))[np.cumsum(begins) - 1]
+    return np.sort(first), which
 
 
 class AtSpeed(eqx.Module):
