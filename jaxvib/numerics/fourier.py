@@ -5,10 +5,12 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-__all__ = ["Grid", "grid_of"]
+__all__ = ["Grid", "analyzed", "deviation_analysis", "grid_of", "resampling", "synthesized"]
 
 
 class Grid(NamedTuple):
@@ -21,7 +23,8 @@ class Grid(NamedTuple):
     d^2/dtheta^2 of psi; `deviation_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `deviation_weights` (J,): psi
     has the harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times
     cos and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis`
-    (M, K) and `synthesis` (K, M) complex: e_k = sum_l e_l analysis_lk, e_l = Re sum_k e_k synthesis_kl.
+    (M, 2K) and `synthesis` (2K, M): real parts of the harmonics e_k, and beside them imaginary ones, from e_l, and back, see
+    `analyzed` and `synthesized`.
     """
 
     symmetric: bool
@@ -67,5 +70,36 @@ def _grid_of(points: int, symmetric: bool, double: bool) -> Grid:
     return Grid(
         symmetric, theta, first, second, deviation_orders, weights, orders,
         2.0 / m * np.cos(distance), 2.0 / m * np.sin(distance), index[:, None] - index[None, :] + m - 1,
-        2.0 / m * np.exp(-1j * orders * theta[:, None]), np.exp(1j * orders[:, None] * theta),
+        2.0 / m * _analysis(orders, theta), _synthesis(orders, theta),
     )  # fmt: skip
+
+
+def _analysis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    wave = orders * theta[:, None]
+    return np.concatenate([np.cos(wave), -np.sin(wave)], 1)
+
+
+def _synthesis(orders: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    return _analysis(orders, theta).T
+
+
+def analyzed(values: Array, matrix: np.ndarray) -> Array:
+    """Harmonics (..., K) of values (..., M) at the points: a product of real numbers, a quarter of the complex one."""
+    return jax.lax.complex(*jnp.split(values @ matrix, 2, -1))
+
+
+def synthesized(harmonics: Array, matrix: np.ndarray) -> Array:
+    """Values (..., M) at the points of harmonics (..., K): Re sum_k c_k exp(i k theta_l)."""
+    return jnp.concatenate([harmonics.real, harmonics.imag], -1) @ matrix
+
+
+def deviation_analysis(grid: Grid) -> np.ndarray:
+    """(M, 2J): real parts of psi's harmonics, and beside them imaginary ones, from its values at the points; see `analyzed`."""
+    return _analysis(grid.deviation_orders, grid.theta) * np.tile(grid.deviation_weights, 2) / grid.theta.size
+
+
+def resampling(grid: Grid, to: Grid) -> np.ndarray:
+    """(M, M') psi at the points of another grid from that at those of one, by the harmonics that both have."""
+    orders = min(grid.deviation_orders.size, to.deviation_orders.size)
+    keep = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
+    return deviation_analysis(grid)[:, keep] @ _synthesis(grid.deviation_orders[:orders], to.theta)

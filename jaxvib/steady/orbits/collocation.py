@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
-from jaxvib.numerics.fourier import Grid, grid_of
+from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
 __all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branch_tangent", "harmonics_of", "periodic_motion"]
@@ -67,8 +67,8 @@ class _Balance(NamedTuple):
 def _balance(model: CollectedModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = model.circle(phi)
-    along_port = jnp.einsum("kab,bk->ak", answer, jnp.einsum("g,agi->ai", model.unbalance, point) @ grid.analysis)
-    acceleration = (along_port @ grid.synthesis).real
+    force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
+    acceleration = synthesized(jnp.einsum("kab,bk->ak", answer, force), grid.synthesis)
     size, unit = model.unbalance[:, None], (model.drag * omega)[:, None]
     vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
     torque = model.torque(phi, rate, speed, acceleration)
@@ -263,15 +263,12 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     both = jnp.eye(2, dtype=omega.dtype)
     at, (by_omega, by_speed), (received, answer, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
     matrix = _pinned(_jacobian(model, grid, answer, found, deviation, omega, speed), by_speed)
-    deviation_k = _deviation_harmonics(grid, deviation)
-    there = (deviation_k @ np.exp(1j * grid.deviation_orders[:, None] * fine.theta)).real
+    there = deviation @ resampling(grid, fine)
     between = _balance(model, fine, _at_port(model, fine, omega, received), there, omega, speed).residual
-    low = _deviation_harmonics(fine, between)[:, : grid.deviation_orders.shape[0]]
-    seen = (low @ np.exp(1j * grid.deviation_orders[:, None] * grid.theta)).real.ravel()
-    # Two solutions, not one of two right sides: who asks for the slope alone does not pay for the error.
-    slope = small_solve(matrix, -_then_zero(by_omega))[-1]
-    error = solve_in_turn(*jax.lax.stop_gradient((matrix, _then_zero(seen))))
-    last = jnp.max(deviation_k[:, -1].real ** 2 + deviation_k[:, -1].imag ** 2)
+    seen = (between @ resampling(fine, grid)).ravel()
+    found_by = small_solve(matrix, jnp.stack([-_then_zero(by_omega), _then_zero(jax.lax.stop_gradient(seen))], axis=1))
+    slope, error = found_by[-1, 0], jax.lax.stop_gradient(found_by[:, 1])
+    last = jnp.max(jnp.sum((deviation @ deviation_analysis(grid)[:, [grid.deviation_orders.size - 1, -1]]) ** 2, axis=1))
     return BranchTangent(
         slope,
         jnp.max(jnp.abs(at)) / found.scale,
@@ -293,12 +290,6 @@ def _pinned(by_lag: Array, by_unknown: Array) -> Array:
     return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
 
 
-def _deviation_harmonics(grid: Grid, values: Array) -> Array:
-    """(G, J) of values (G, M) at the points."""
-    m = grid.theta.shape[0]
-    return values @ (grid.deviation_weights / m * np.exp(-1j * grid.deviation_orders * grid.theta[:, None]))
-
-
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
     m of the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
@@ -313,12 +304,12 @@ def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution, an
     """The harmonics of psi and of everything that the carrier does, whose receptance `answer` (K, nd, np) may be known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
-    force = jnp.einsum("g,agi->ai", model.unbalance, point) @ grid.analysis
+    force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
     answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders) if answer is None else answer
     displacement = jnp.einsum("kdp,pk->dk", answer, force)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(
-        _deviation_harmonics(grid, motion.deviation),
+        analyzed(motion.deviation, deviation_analysis(grid)),
         displacement,
         -(carrier.port @ displacement) * w[None] ** 2,
         carrier.bed_force(displacement, 1j * w[None] * displacement),

@@ -230,13 +230,16 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     pick = np.arange(row.size)
     a, b = grid.omega[row], grid.omega[row + 1]
     fa, fb = tests[row, which], tests[row + 1, which]
-    share, values, done = np.full(row.size, 0.5), grid, np.zeros(row.size, bool)
+    beyond = np.maximum(row - 1, 0)
+    with np.errstate(all="ignore"):
+        share = next_share(np, (a, fa), (b, fb), (grid.omega[beyond], tests[beyond, which]), 1e-12)
+    values, done = grid, np.zeros(row.size, bool)
     while not np.all(done):
         # A root that is found stays where it is until all are.
         x = np.where(done, a, a + share * (b - a))
         values = solve(x)
         f = read(values)[pick, which]
-        done |= (np.abs(x - a) <= 1e-10 * a) | ~np.isfinite(f)
+        done |= (np.abs(x - a) <= 1e-8 * a) | ~np.isfinite(f)
         same = (f > 0.0) == (fa > 0.0)
         before = np.where(same, a, b), np.where(same, fa, fb)
         other = np.where(same, b, a), np.where(same, fb, fa)

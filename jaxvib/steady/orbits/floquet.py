@@ -20,7 +20,8 @@ from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 __all__ = ["Floquet", "floquet", "steps_for"]
 
 _PHASE = 0.7
-"""Phase of the carrier's fastest motion in a step, rad; order 8 then leaves about 1e-10 in the multipliers."""
+"""Phase of the carrier's fastest motion in a step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast as the
+carrier, 1e-10 where it is three times as fast and 1e-8 where it is fifteen times as fast."""
 
 # The method's last stage is the end of the step, there to be evaluated for the next one.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
@@ -99,13 +100,13 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     omega, speed = motion.omega, motion.rotor_speed
     lanes, w, n = omega.shape[0], omega[None, None], speed[None, None]
     turn = np.pi if model.half_turn else 2.0 * np.pi
-    h = turn / steps
+    h = jnp.asarray(turn / steps, omega.dtype)
 
-    def coefficients(theta: Array) -> _Coefficients:
-        deviation, deviation1, deviation2 = _signals(grid.deviation_orders, harmonics.deviation, theta, 3)
+    def coefficients(theta: Array, waves: Array) -> _Coefficients:
+        deviation, deviation1, deviation2 = _signals(harmonics.deviation, waves[..., of_deviation])
         phi, rate = theta[None, :, None] + deviation, 1.0 + deviation1
         point, moving = model.circle(phi)
-        (acceleration,) = _signals(grid.orders, harmonics.acceleration, theta, 1)
+        (acceleration,) = _signals(harmonics.acceleration, waves[:1, :, of_motion])
         slopes = jax.vmap(lambda p, r, w, n, a: model.torque_slopes(p, w * r, n, a), in_axes=-1, out_axes=-1)
         by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, speed, acceleration)
         stiff = by_angle + model.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
@@ -145,10 +146,18 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     parting = loads.alike and loads.count > 1 and loads.own_radius is None
     sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
     fields = (full, apart)[: len(sizes)]
-    begin = tuple(start(n) for n in sizes)
+    nodes, rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_NODES, _ROWS, _WEIGHTS))
+    # exp(i k theta) goes from step to step as a product: sines and cosines at every node took a quarter of the time.
+    gap = 2 if grid.symmetric else 1
+    of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
+    every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
+    at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, nodes * h), _wave(every, h[None])
+    begin = jnp.ones_like(turning), tuple(start(n) for n in sizes)
 
-    def step(k: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in coefficients((k + nodes) * h)))
+    def step(k: Array, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        turned, state = carry
+        found = coefficients((k + nodes) * h, at_nodes * turned)
+        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
         def stage(rates: tuple[Array, ...], now: tuple[Array, Array, _Coefficients]) -> tuple[tuple[Array, ...], None]:
@@ -159,17 +168,18 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
 
         rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
         rates, _ = jax.lax.scan(stage, rates, (jnp.arange(len(_NODES)), rows, at))
-        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+        moved = tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+        return turned * turning, moved
 
-    nodes, rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_NODES, _ROWS, _WEIGHTS))
-    end = jax.lax.fori_loop(0, steps, step, begin)
+    _, end = jax.lax.fori_loop(0, steps, step, begin)
     flip = np.concatenate([np.full(2 * nd, -1.0 if model.half_turn else 1.0), np.ones(2 * count)])
     monodromy = flip[:, None, None] * end[0]
 
     # A shift in time: q' and phi' along the orbit itself.
-    zero = jnp.zeros((1,), dtype=omega.dtype)
-    at, at1 = _signals(grid.orders, harmonics.displacement, zero, 2) / length
-    deviation, deviation1, deviation2 = _signals(grid.deviation_orders, harmonics.deviation, zero, 3)
+    at, at1 = _signals(harmonics.displacement, _derivatives(grid.orders, 2, harmonics.displacement)) / length
+    deviation, deviation1, deviation2 = _signals(
+        harmonics.deviation, _derivatives(grid.deviation_orders, 3, harmonics.deviation)
+    )
     _, moving = model.circle(deviation)
     along = jnp.concatenate([
         at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + deviation1)[None], axis=1)),
@@ -183,13 +193,20 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     return Floquet(roots, inner, trivial)
 
 
-def _signals(orders: np.ndarray, harmonics: Array, theta: Array, number: int) -> Array:
-    """Re sum_k c_k exp(i k theta) and its first derivatives, so many in all, at the angles theta (n,); c (m, K, P) gives
-    (number, m, n, P)."""
-    factors, k = (1j * orders) ** np.arange(number)[:, None, None], np.asarray(orders, theta.dtype)[None, None]
-    wave = jnp.asarray(factors, harmonics.dtype) * jnp.exp(1j * k * theta[None, :, None])
-    waves, parts = jnp.concatenate([wave.real, -wave.imag], -1), jnp.concatenate([harmonics.real, harmonics.imag], -2)
-    return jnp.einsum("dnk,mkp->dmnp", waves, parts)
+def _wave(orders: np.ndarray, theta: Array) -> Array:
+    """exp(i k theta) at angles theta (n,): (1, n, K)."""
+    return jnp.exp(1j * np.asarray(orders, theta.dtype)[None, None] * theta[None, :, None])
+
+
+def _derivatives(orders: np.ndarray, number: int, like: Array) -> Array:
+    """What makes so many derivatives of exp(i k theta), the 0th first: (number, 1, K), of the type of `like`."""
+    return jnp.asarray((1j * orders) ** np.arange(number)[:, None, None], like.dtype)
+
+
+def _signals(harmonics: Array, waves: Array) -> Array:
+    """Re sum_k c_k exp(i k theta) and derivatives, from the waves' own (number, n, K); c (m, K, P) gives (number, m, n, P)."""
+    parts = jnp.concatenate([harmonics.real, harmonics.imag], -2)
+    return jnp.einsum("dnk,mkp->dmnp", jnp.concatenate([waves.real, -waves.imag], -1), parts)
 
 
 def _times(matrix: Array, vectors: Array) -> Array:

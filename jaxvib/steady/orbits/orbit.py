@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import JammedModel
 from jaxvib.numerics.extrema import greatest
-from jaxvib.numerics.fourier import Grid, grid_of
+from jaxvib.numerics.fourier import Grid, grid_of, synthesized
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
@@ -260,7 +260,7 @@ def orbits(
 def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
     """Amplitude, foundation force, power and push between loads of one motion."""
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
-    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    acceleration = synthesized(harmonics.acceleration, grid.synthesis)
     drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
     nd = harmonics.displacement.shape[0]
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
@@ -280,7 +280,7 @@ def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, har
     if loads.own_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
     phi, rate = model.each_load(grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))
-    acceleration = (harmonics.acceleration @ grid.synthesis).real
+    acceleration = synthesized(harmonics.acceleration, grid.synthesis)
     vibration = loads.mass * loads.radius * jnp.einsum("aji,ai->ji", model.circle(phi)[1], acceleration)
     needed = jnp.mean(vibration - model.torque_of_each(phi, rate, motion.rotor_speed, acceleration[:, None]), axis=1)
     return jnp.min(-jnp.cumsum(needed)[:-1])
@@ -290,29 +290,32 @@ _PARTS = 16
 """Of a period, whose peaks are told apart: more than the harmonics that matter have peaks."""
 
 
-def _peaks(orders: np.ndarray, harmonics: Array) -> Array:
-    """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included."""
-    each = max(16, int(orders[-1]) // 4)
+def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
+    """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included; of one
+    that turns its sign in `half` a period the greatest magnitude in each part of that half, (8,)."""
+    parts, each = _PARTS // 2 if half else _PARTS, max(16, int(orders[-1]) // 4)
     width = 2.0 * np.pi / _PARTS
-    samples = width * (np.arange(_PARTS)[:, None] + np.arange(each + 1) / each)
-    still, k = jax.lax.stop_gradient(harmonics), np.asarray(orders, harmonics.real.dtype)[None]
-    slopes = jnp.concatenate([1j * k, -(k**2)]).astype(still.dtype) * still[None]
-    waves = jnp.asarray(np.exp(1j * orders * samples[..., None]), still.dtype)
-
-    def at(c: Array, wave: Array) -> Array:
-        return wave.real @ c.real.T - wave.imag @ c.imag.T
+    first, places, k = width * np.arange(parts), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
+    angles = k * (first[:, None] + width * places)[..., None]
+    # Real parts and beside them imaginary ones: products of complex numbers take four times as long.
+    waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
+    both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
+    slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
+    slopes, values = np.stack([slope, slope @ slope]) @ still, waves @ still
+    best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
+    begin = waves[np.arange(parts), best]
+    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(parts, k.dtype)
 
     def newton(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
-        first, second = at(slopes, wave).T
-        step = first / jnp.where(second < 0.0, second, -jnp.finfo(second.dtype).tiny)  # uphill in any case
-        theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), samples[:, 0], samples[:, -1])
-        return theta, jax.lax.complex(*sine_and_cosine(k * theta[:, None])[::-1])
+        rise, bend = slopes @ wave.T * side[None]
+        step = rise / jnp.where(bend < 0.0, bend, -jnp.finfo(bend.dtype).tiny)  # uphill in any case
+        theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), first, first + width)
+        sine, cosine = sine_and_cosine(k[None] * theta[:, None])
+        return theta, jnp.concatenate([cosine, -sine], 1)
 
-    best = jnp.arange(_PARTS), jnp.argmax((waves @ still).real, axis=1)
-    begin = jnp.asarray(samples, k.dtype)[best], waves[best]
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-    return at(harmonics, jax.lax.fori_loop(0, 4, newton, begin)[1])
+    return side * (jax.lax.fori_loop(0, 4, newton, (first + width / each * best, begin))[1] @ both)
 
 
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
@@ -320,7 +323,7 @@ def _swing(orders: np.ndarray, harmonics: Array) -> Array:
     symmetric = bool(np.all(orders % 2 == 1))  # the signal turns its sign in half a period
 
     def highest(c: Array) -> Array:
-        return greatest(_peaks(orders, c))  # the highest between the samples, not that beside the highest sample
+        return greatest(_peaks(orders, c, half=symmetric))  # between the samples, not that beside the highest sample
 
     def swing(c: Array) -> Array:
         return highest(c) if symmetric else (highest(c) + highest(-c)) / 2.0
