@@ -28,6 +28,7 @@ from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolera
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
+from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
 from jaxvib.units import Number, count, number, traced
@@ -161,8 +162,10 @@ def simulate(
     elif not isinstance(control, StepControl) or not (concrete if estimate is None else estimate):
         found = run(control)
     else:
-        coarse, found = run(_coarser(control), wanted=False), run(control)
-        found = _compared(scene, found, coarse, control, _coarser(control), [coarse])
+        coarser = _coarser(control)
+        both = (lambda: run(control)), (lambda: run(coarser, wanted=False))
+        found, coarse = in_threads(lambda k: both[k](), 2) if progress_meter is None else [each() for each in both]
+        found = _compared(scene, found, coarse, control, coarser, [coarse])
     if traced(found.steps):
         return found
     jax.block_until_ready(found.steps)

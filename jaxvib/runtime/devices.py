@@ -8,6 +8,7 @@ import itertools
 import os
 import tempfile
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 
-__all__ = ["known", "on_device", "shared_devices", "take_a_device"]
+__all__ = ["arrays_on_device", "known", "on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """What restricts a process to some of its machine's accelerators."""
@@ -49,6 +50,11 @@ def on_device(tree: PyTree) -> PyTree:
     leaves, structure = jax.tree.flatten(tree)
     moved = iter(jax.device_put([leaf for leaf in leaves if isinstance(leaf, (np.ndarray, np.generic))]))
     return structure.unflatten(next(moved) if isinstance(leaf, (np.ndarray, np.generic)) else leaf for leaf in leaves)
+
+
+def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
+    """Leaves of a tree with NumPy's arrays moved to JAX's device; numbers are part of programs, and stay."""
+    return [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
 
 
 def take_a_device() -> None:

@@ -11,7 +11,7 @@ import contextlib
 import functools
 import itertools
 import os
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
@@ -21,10 +21,10 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
-from jaxvib.runtime.devices import on_device, shared_devices
+from jaxvib.runtime.devices import shared_devices
 from jaxvib.runtime.stored import begin_others, beginning, is_rehearsing
 
-__all__ = ["cores", "in_chunks", "in_parallel"]
+__all__ = ["cores", "in_chunks", "in_parallel", "in_threads"]
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -127,17 +127,23 @@ def in_chunks(
     plain = jax.tree.map(np.asarray, cases)
 
     def computed(chunk: int) -> PyTree[np.ndarray]:
-        out = function(*on_device(jax.tree.map(lambda leaf: leaf[index[chunk]], plain)), *shared)
+        out = function(*jax.tree.map(lambda leaf: leaf[index[chunk]], plain), *shared)
         return jax.tree.map(np.asarray, out)
 
-    parts = [computed(0)] * chunks if is_rehearsing() else _all(computed, chunks)
+    parts = [computed(0)] * chunks if is_rehearsing() else in_threads(computed, chunks, shared_devices())
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
 
-def _all(function: Callable[[int], Found], number: int) -> list[Found]:
+def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[object] = (None,)) -> list[Found]:
     """The function of 0, 1, ... so many: each thread, the caller's too, takes the next number as soon as it is free, which
-    takes less time than to hand out items one by one. Devices, options and errors as `in_parallel`."""
-    devices, alike = shared_devices(), _same_options(function)
+    takes less time than to hand out items one by one. Options and errors as `in_parallel`; a thread has one of the `devices`.
+
+    Programs that one thread asks for are run one after the other, whether it waits for their results or not.
+
+    >>> in_threads(lambda k: k * k, 3)
+    [0, 1, 4]
+    """
+    alike = _same_options(function)
     workers = min(max(cores(), len(devices)), number)
     left, found, failed = iter(range(number)), [], []
 

@@ -17,12 +17,11 @@ from typing import Any, Generic, ParamSpec, TypeVar, overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import beneath, results_of, traced
-from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
@@ -67,10 +66,10 @@ class CachedFunction(Generic[P, T]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
         start()
         leaves, treedef = jax.tree.flatten((args, kwargs))
-        leaves = [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
         moved = [leaf for leaf in leaves if traced(leaf)]
         if not moved:
             return self.stored(leaves, treedef)
+        leaves = arrays_on_device(leaves)
         if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, moved)):
             question = _Question(self, Skeleton.of(leaves, treedef))
             if question.is_describable():

@@ -32,7 +32,7 @@ from jax.sharding import Sharding, SingleDeviceSharding
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, no_places, resuming
 from jaxvib.runtime.cpu import processor
-from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.devices import arrays_on_device, on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
 __all__ = ["StoredFunction", "begin_others", "beginning", "compiled_together", "is_rehearsing"]
@@ -90,7 +90,7 @@ class StoredFunction(Generic[T]):
             with self.lock:
                 program = self.ready.get(asked, _UNKNOWN)
                 if program is _UNKNOWN:
-                    program = self.ready[asked] = self._program(folder, leaves, treedef, home)
+                    program = self.ready[asked] = self._program(folder, arrays_on_device(leaves), treedef, home)
             _forget_oldest()
         if program is None:
             if is_rehearsing():
@@ -102,10 +102,10 @@ class StoredFunction(Generic[T]):
         if program.has_run:
             begin_others()
         with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
-            return program.unknown() if is_rehearsing() else program(leaf for leaf in leaves if eqx.is_array(leaf))
+            return program.unknown() if is_rehearsing() else program(x for x in leaves if isinstance(x, _ARRAYS))
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
-        args, kwargs = jax.tree.unflatten(treedef, leaves)
+        args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
         return self.jitted(*args, **kwargs)
 
     def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
@@ -186,7 +186,7 @@ class _Program:
             return cls(run, result)
         return cls(run, result, list(map(_type_of, exported.in_avals)), list(map(_type_of, exported.out_avals)), is_new)
 
-    def __call__(self, arrays: Iterable[Array]) -> Any:
+    def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
         compiling, self.compiling, self.is_new = self.compiling, None, False
         if compiling is not None:
             compiling.join()
@@ -296,8 +296,7 @@ _tracing: list[bool] = []
 
 @contextlib.contextmanager
 def _uncollected() -> Iterator[None]:
-    """In here Python does not look for garbage in circles: tracing makes very many objects that stay, and to look through them
-    again and again takes a fifteenth of the time until a program is compiled."""
+    """In here Python looks for no garbage: among the many objects that tracing makes that takes a fifteenth of its time."""
     with _pausing:
         _tracing.append(gc.isenabled() if not _tracing else _tracing[0])
         gc.disable()
@@ -309,6 +308,7 @@ def _uncollected() -> Iterator[None]:
                 gc.enable()
 
 
+_ARRAYS = (jax.Array, np.ndarray)  # NumPy's go to the device with the call, in a tenth of the time of asking for that
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 
 

@@ -75,7 +75,7 @@ class Skeleton:
 
 def leaf_key(leaf: Any) -> Hashable:
     """What a program depends on of a leaf of its arguments: of an array its type, else the leaf."""
-    if isinstance(leaf, jax.Array):
+    if isinstance(leaf, (jax.Array, np.ndarray)):
         return jax.typeof(leaf)
     return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
 
