@@ -82,6 +82,12 @@ def test_other_threads_begin_as_soon_as_a_program_that_has_run_before_runs_again
     assert sorted(k for k, _ in many.in_parallel(lambda k: computed(np.ones(2)), range(4))) == [0, 1, 2, 3]
 
 
+def test_a_rehearsal_starts_no_threads(monkeypatch):
+    """They would run what is only to be traced."""
+    monkeypatch.setattr(many, "is_rehearsing", lambda: True)
+    assert set(many.in_threads(lambda _: threading.current_thread(), 5)) == {threading.main_thread()}
+
+
 def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
     monkeypatch.setattr(many, "cores", lambda: 3)
     begun = []
