@@ -46,6 +46,7 @@ def starts_of(parts: Parts, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     if not good.any():
         return speeds[:1], phases[:1]
     row, size, angles = row[good], np.log(factor[good]), angles[good]
+    # Within the turn that begins at -1 rad: at 0 and pi, where many phases are, it has no ends.
     inside = angles[:, 1:] - 2.0 * np.pi * np.floor((angles[:, 1:] + 1.0) / (2.0 * np.pi))
     once = distinct_rows(np.concatenate([row[:, None], np.rint(1e4 * size[:, None]), np.rint(1e3 * inside)], axis=1))[0]
     row, size, angles = row[once], size[once], angles[once]

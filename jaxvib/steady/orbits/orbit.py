@@ -292,10 +292,11 @@ _PARTS = 16
 
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
     """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included; of one
-    that turns its sign in `half` a period the greatest magnitude in each part of that half, (8,)."""
-    parts, each = _PARTS // 2 if half else _PARTS, max(16, int(orders[-1]) // 4)
-    width = 2.0 * np.pi / _PARTS
-    first, places, k = width * np.arange(parts), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
+    that turns its sign in `half` a period the greatest magnitude in each part of that half."""
+    each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PARTS
+    if half:
+        each, width = each // 2, width / 2.0
+    first, places, k = width * np.arange(_PARTS), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
     angles = k * (first[:, None] + width * places)[..., None]
     # Real parts and beside them imaginary ones: products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
@@ -303,8 +304,8 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
     slopes, values = np.stack([slope, slope @ slope]) @ still, waves @ still
     best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
-    begin = waves[np.arange(parts), best]
-    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(parts, k.dtype)
+    begin = waves[np.arange(_PARTS), best]
+    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PARTS, k.dtype)
 
     def newton(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry

@@ -9,7 +9,7 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.steady.jams.patterns import phase_pattern
-from jaxvib.steady.jams.phase_starts import _regular, at_speed, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phase_starts import _regular, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import balanced, influence_of, parts_of, torques_at
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
@@ -111,3 +111,12 @@ def test_the_search_is_written_on_single_numbers():
         loops = [e for e in jax.make_jaxpr(search)().jaxpr.eqns if e.primitive.name == "while"]
         newton = max(loops, key=lambda e: len(e.outvars))
         assert len(newton.outvars) > 10 and all(v.aval.shape == () for v in newton.outvars)
+
+
+def test_rows_that_are_the_same_are_found_where_they_stand_first():
+    rows = np.random.default_rng(3).integers(-2, 3, (400, 3)).astype(float)
+    first, which = distinct_rows(rows)
+    np.testing.assert_array_equal(rows[first][which], rows)
+    assert len({tuple(row) for row in rows}) == first.size and np.all(np.diff(first) > 0)
+    assert all(np.flatnonzero(which == k)[0] == place for k, place in enumerate(first))
+    assert [found.size for found in distinct_rows(np.zeros((0, 3)))] == [0, 0]

@@ -61,3 +61,14 @@ def test_swings_are_half_of_what_lies_between_the_extremes():
         _swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]], complex)), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
     )
     np.testing.assert_allclose(_swing(np.array([1, 3]), jnp.array([[1.0, 0.0], [0.0, 2.0j]])), [1.0, 2.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("orders", [np.arange(1, 16, 2), np.arange(1, 9)], ids=["odd", "all"])
+def test_swings_miss_no_peak(orders):
+    """Of random signals whose harmonics do not fall, against samples so dense that they miss 3e-7 of a peak at most."""
+    harmonics = np.random.default_rng(7).normal(size=(300, orders.size, 2)) @ [1.0, 1.0j]
+    dense = np.zeros((300, 2**15 + 1), complex)
+    dense[:, orders] = harmonics
+    samples = np.fft.irfft(dense, axis=1) * 2**15
+    lies_between = (samples.max(axis=1) - samples.min(axis=1)) / 2.0
+    np.testing.assert_allclose(_swing(orders, jnp.asarray(harmonics)), lies_between, rtol=1e-6)
