@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import shared_devices
-from jaxvib.runtime.stored import begin_others, beginning, is_rehearsing
+from jaxvib.runtime.stored import begin_others, beginning, is_debugging, is_rehearsing
 
 __all__ = ["cores", "in_chunks", "in_parallel", "in_threads"]
 
@@ -138,12 +138,13 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
     """The function of 0, 1, ... so many: each thread, the caller's too, takes the next number as soon as it is free, which
     takes less time than to hand out items one by one. Options and errors as `in_parallel`; a thread has one of the `devices`.
 
-    Programs that one thread asks for are run one after the other, whether it waits for their results or not.
+    Programs that one thread asks for are run one after the other, whether it waits for their results or not. Where JAX is
+    debugging, operation by operation or looking for NaN, the caller's thread does all.
 
     >>> in_threads(lambda k: k * k, 3)
     [0, 1, 4]
     """
-    if is_rehearsing():
+    if is_rehearsing() or is_debugging():
         return [function(k) for k in range(number)]
     alike = _same_options(function)
     workers = min(max(cores(), len(devices)), number)

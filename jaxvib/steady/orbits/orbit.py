@@ -302,21 +302,22 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
-    slopes, values = np.stack([slope, slope @ slope]) @ still, waves @ still
+    slopes, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ still, waves @ still
     best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
     begin = waves[np.arange(_PARTS), best]
     side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PARTS, k.dtype)
 
-    def newton(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
-        rise, bend = slopes @ wave.T * side[None]
-        step = rise / jnp.where(bend < 0.0, bend, -jnp.finfo(bend.dtype).tiny)  # uphill in any case
+        rise, bend, twist = slopes @ wave.T * side[None]
+        tiny = -jnp.finfo(bend.dtype).tiny
+        step = rise / jnp.minimum(bend - 0.5 * rise * twist / jnp.minimum(bend, tiny), tiny)  # uphill in any case
         theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), first, first + width)
         sine, cosine = sine_and_cosine(k[None] * theta[:, None])
         return theta, jnp.concatenate([cosine, -sine], 1)
 
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-    return side * (jax.lax.fori_loop(0, 4, newton, (first + width / each * best, begin))[1] @ both)
+    return side * (jax.lax.fori_loop(0, 3, halley, (first + width / each * best, begin))[1] @ both)
 
 
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
