@@ -23,8 +23,8 @@ class Grid(NamedTuple):
     d^2/dtheta^2 of psi; `deviation_orders` (J,) and `orders` (K,), the harmonics of psi and of e; `deviation_weights` (J,): psi
     has the harmonics weight / M sum_l psi_l exp(-i k theta_l), e those with weight 2; `cosine`, `sine` (2M - 1, K): 2 / M times
     cos and sin of k times the distance of two points; `pairs` (M, M): which distance belongs to which two points; `analysis`
-    (M, 2K) and `synthesis` (2K, M): real parts of the harmonics e_k, and beside them imaginary ones, from e_l, and back, see
-    `analyzed` and `synthesized`.
+    (M, 2K) and `synthesis` (2K, M): the matrices from e_l to the real parts of its harmonics e_k with the imaginary ones beside
+    them, and back, see `analyzed` and `synthesized`.
     """
 
     symmetric: bool

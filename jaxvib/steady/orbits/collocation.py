@@ -268,6 +268,7 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
     seen = (between @ resampling(fine, grid)).ravel()
     found_by = small_solve(matrix, jnp.stack([-_then_zero(by_omega), _then_zero(jax.lax.stop_gradient(seen))], axis=1))
     slope, error = found_by[-1, 0], jax.lax.stop_gradient(found_by[:, 1])
+    # The highest harmonic's real part, and its imaginary one.
     last = jnp.max(jnp.sum((deviation @ deviation_analysis(grid)[:, [grid.deviation_orders.size - 1, -1]]) ** 2, axis=1))
     return BranchTangent(
         slope,

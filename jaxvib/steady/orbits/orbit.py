@@ -296,28 +296,28 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PARTS
     if half:
         each, width = each // 2, width / 2.0
-    first, places, k = width * np.arange(_PARTS), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
-    angles = k * (first[:, None] + width * places)[..., None]
+    starts, places, k = width * np.arange(_PARTS), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
+    angles = k * (starts[:, None] + width * places)[..., None]
     # Real parts and beside them imaginary ones: products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
     both, none = jnp.concatenate([harmonics.real, harmonics.imag]), np.zeros((k.size, k.size), k.dtype)
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
-    slopes, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ still, waves @ still
+    derivatives, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ still, waves @ still
     best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
     begin = waves[np.arange(_PARTS), best]
     side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PARTS, k.dtype)
 
     def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry
-        rise, bend, twist = slopes @ wave.T * side[None]
-        tiny = -jnp.finfo(bend.dtype).tiny
-        step = rise / jnp.minimum(bend - 0.5 * rise * twist / jnp.minimum(bend, tiny), tiny)  # uphill in any case
-        theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), first, first + width)
+        first, second, third = derivatives @ wave.T * side[None]
+        below = -jnp.finfo(second.dtype).tiny  # 0, so that the step goes uphill in any case
+        step = first / jnp.minimum(second - 0.5 * first * third / jnp.minimum(second, below), below)
+        theta = jnp.clip(theta - jnp.clip(step, -width / each, width / each), starts, starts + width)
         sine, cosine = sine_and_cosine(k[None] * theta[:, None])
         return theta, jnp.concatenate([cosine, -sine], 1)
 
     # The value at an extremum does not change with where the extremum is: its place needs no derivative.
-    return side * (jax.lax.fori_loop(0, 3, halley, (first + width / each * best, begin))[1] @ both)
+    return side * (jax.lax.fori_loop(0, 3, halley, (starts + width / each * best, begin))[1] @ both)
 
 
 def _swing(orders: np.ndarray, harmonics: Array) -> Array:
