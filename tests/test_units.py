@@ -1,12 +1,13 @@
 """Numbers with units."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pint
 import pytest
 
 import jaxvib as jv
-from jaxvib.units import _FACTORS, number, numbers, to_float
+from jaxvib.units import _FACTORS, known_number, number, numbers, to_float
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,17 @@ def test_numbers_come_in_any_unit(given, unit, expected):
     value = number(given, unit, "field")
     assert value.shape == () and value.dtype == jnp.float64
     np.testing.assert_allclose(value, expected, rtol=1e-14)
+
+
+def test_a_number_goes_to_a_program_as_it_is_known():
+    """What JAX does not hold is not moved to its device first, and has the precision that it would have there."""
+    plain, given = known_number("2 ms", "s", "field"), jnp.asarray(2e-3)
+    assert isinstance(plain, np.ndarray) and plain.shape == () and plain.dtype == np.float64 and plain == 2e-3
+    assert isinstance(known_number(given, "s", "field"), jax.Array)
+    with jax.enable_x64(False):
+        assert known_number(2e-3, "s", "field").dtype == np.float32
+        with pytest.raises(jv.InputError, match="field is inf s; a finite number is needed"):
+            known_number(1e39, "s", "field")
 
 
 @pytest.mark.parametrize(("unit", "text"), [(unit, text) for unit, known in _FACTORS.items() for text in known])

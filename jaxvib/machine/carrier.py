@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 __all__ = ["Carrier", "Machine"]
 
@@ -102,7 +103,13 @@ class Machine(eqx.Module):
     def structure(self) -> Carrier:
         """The carrier's names, directions and shapes, without computing its numbers."""
         leaves, rest = jax.tree.flatten(self)
-        return _structure(rest, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves), jnp.result_type(float))
+        return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float))
+
+
+def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and dtype; of an array without asking JAX, which takes ten times as long."""
+    known = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
+    return known.shape, known.dtype
 
 
 @functools.lru_cache(maxsize=128)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.stored import compiled_together
-from jaxvib.units import Number, count, number, traced
+from jaxvib.units import Number, count, known_number, traced
 
 __all__ = ["enough_steps", "simulate"]
 
@@ -118,7 +119,7 @@ def simulate(
     Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
     """
     scene = checked(scene)
-    end = number(until, "s", "until", low=0.0, open_low=True)
+    end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
@@ -129,8 +130,9 @@ def simulate(
     if given and (traced(apart) or apart != 0.0):
         raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
     state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+    fastest = functools.cache(lambda: fastest_and_slowest(scene)[0])
     if max_steps is None:
-        max_steps = enough_steps(scene, end)
+        max_steps = enough_steps(fastest(), end)
 
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     if solver is None and not concrete and end.dtype.itemsize >= 8:
@@ -139,7 +141,7 @@ def simulate(
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
 
     kept, allowed = samples if save == "all" else 0, min(count(max_steps, "max_steps"), _MOST_STEPS)
-    stretches = _stretches(scene, end, state, save)
+    stretches = _stretches(scene, fastest, end, state, save)
 
     def stretch(span: Array, state: State, chosen: _Control, wanted: bool) -> Run:
         most, measuring = allowed, None
@@ -158,17 +160,17 @@ def simulate(
         if not concrete:
             raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
         assert isinstance(control, StepControl)
-        found = _to_accuracy(scene, run, control, stepsize_controller.error)
+        found = _to_accuracy(scene, fastest(), run, control, stepsize_controller.error)
     elif not isinstance(control, StepControl) or not (concrete if estimate is None else estimate):
         found = run(control)
     else:
         coarser = _coarser(control)
         both = (lambda: run(control)), (lambda: run(coarser, wanted=False))
         found, coarse = in_threads(lambda k: both[k](), 2) if progress_meter is None else [each() for each in both]
-        found = _compared(scene, found, coarse, control, coarser, [coarse])
+        found = _compared(scene, fastest(), found, coarse, control, coarser, coarse.evaluations)
     if traced(found.steps):
         return found
-    jax.block_until_ready(found.steps)
+    jax.block_until_ready((found.steps, found.error))
     found = _with(found, seconds=time.perf_counter() - begun)
     if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
@@ -222,16 +224,24 @@ def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
     return (fine.tolerance / coarse.tolerance) ** 0.45
 
 
-def _compared(scene: Scene, fine: Run, coarse: Run, control: StepControl, coarser: StepControl, before: list[Run]) -> Run:
-    """The finer run with its estimated error, and what it and the runs `before` it cost."""
-    fastest, _ = fastest_and_slowest(scene)
-    error = _error(scene, fastest, fine.window, fine.steps, coarse.window.state, coarse.status, control, coarser)
-    evaluations = sum(known(run.evaluations) for run in (fine, *before))
-    return _with(fine, error=error, evaluations=evaluations)
+def _compared(
+    scene: Scene,
+    fastest: Array,
+    fine: Run,
+    coarse: Run,
+    control: StepControl,
+    coarser: StepControl,
+    before: Array | np.ndarray,
+) -> Run:
+    """The finer run with its estimated error, and with what all cost: so many evaluations were made `before` it."""
+    theirs = coarse.window.state, coarse.status
+    counted = fine.evaluations, before
+    error, evaluations = _estimated(scene, fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
+    return dataclasses.replace(fine, error=error, evaluations=evaluations)
 
 
 @cached
-def _error(
+def _estimated(
     scene: Scene,
     fastest: Array,
     window: Trajectory,
@@ -240,9 +250,10 @@ def _error(
     status: RunStatus,
     control: StepControl,
     coarser: StepControl,
-) -> Array:
-    """The estimated error of a run, from its window and the states and the status of a coarser one; `fastest` see
-    `fastest_and_slowest`."""
+    evaluations: tuple[Array, Array | np.ndarray],
+) -> tuple[Array, Array]:
+    """The estimated error of a run, from its window and the states and the status of a coarser one, and the sum of these
+    `evaluations`; `fastest` see `fastest_and_slowest`."""
     # A run that is compared with itself, or with one that failed, has an error that nobody knows.
     found = status == RunStatus.done
     if control.steps is not None:
@@ -251,30 +262,30 @@ def _error(
     theirs = turned(theirs, ours) if wrap_angles(scene, window.time.dtype)[0] else theirs
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
     error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
-    return jnp.where(found & jnp.isfinite(error), error, jnp.inf)
+    return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
 
 
-def _to_accuracy(scene: Scene, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
+def _to_accuracy(scene: Scene, fastest: Array, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
     """Runs with ever smaller tolerances until the estimated error is small enough."""
     floor = 10.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
     before, coarse = run(_coarser(control)), _coarser(control)
-    found, tried = before, [before]
+    found, spent = before, known(before.evaluations)
     for _ in range(_ATTEMPTS - 1):
         latest = run(control)
-        found = _compared(scene, latest, before, control, coarse, tried)
+        found = _compared(scene, fastest, latest, before, control, coarse, spent)
         if status_name(found.status) != "done":
             return found
         tolerance = float(cast(Array, control.tolerance))
         if float(found.error) <= accuracy:
             return found
         # Smaller steps only add to what rounding alone makes of the error.
-        radians = fastest_and_slowest(scene)[0] * latest.window.time[-1]
+        radians = fastest * latest.window.time[-1]
         if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, scene, latest.steps, radians)) > accuracy:
             break
         # A little more than what is missing, for the error shrinks a little slower than the tolerance.
         share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
         before, coarse = latest, control
-        tried.append(latest)
+        spent = known(found.evaluations)
         control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), found.error.dtype))
     return eqx.tree_at(lambda r: r.status, found, RunStatus.not_accurate)
 
@@ -284,13 +295,13 @@ def _with(run: Run, **values: Any) -> Run:
     return dataclasses.replace(run, **on_device(typed))
 
 
-def _stretches(scene: Scene, end: Array, state: State, save: str) -> int:
+def _stretches(scene: Scene, fastest: Callable[[], Array], end: Array, state: State, save: str) -> int:
     """Into how many stretches a run is cut: more than one in single precision, where time would lose its digits."""
     if state.displacement.dtype.itemsize >= 8 or save != "window" or not scene.drive.constant:
         return 1
     if any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state))):
         return 1
-    return max(1, math.ceil(float(end * fastest_and_slowest(scene)[0]) / (2.0 * math.pi * _STRETCH)))
+    return max(1, math.ceil(float(end * fastest()) / (2.0 * math.pi * _STRETCH)))
 
 
 def _in_stretches(
@@ -354,9 +365,9 @@ def _sample_size(scene: Scene) -> float:
     return 3.0 * scene.drive.speed.dtype.itemsize * numbers
 
 
-def enough_steps(scene: Scene, end: Array) -> int:
-    """500 steps for each turn of what moves fastest, rounded up to a power of 2: few programs where it is part of one."""
-    fastest, _ = fastest_and_slowest(scene)
+def enough_steps(fastest: Array, end: Array) -> int:
+    """500 steps for each turn of what moves `fastest`, rad/s, rounded up to a power of 2: few programs where it is part of
+    one."""
     if traced(end) or traced(fastest):
         return 2**20
     turns = float(end) * float(fastest) / (2.0 * math.pi)

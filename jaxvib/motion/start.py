@@ -19,7 +19,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import Number, Numbers, number, numbers, traced
+from jaxvib.units import Number, Numbers, known_number, numbers, traced
 
 __all__ = ["Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
 
@@ -73,8 +73,8 @@ def initial_state(
     mass = scene.machine.structure().mass
     zero = np.zeros(mass.shape[:1], mass.dtype)
 
-    half = number(apart, "rad", "apart", low=0.0)
-    spread = known(half) * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
+    half = known_number(apart, "rad", "apart", low=0.0)
+    spread = half * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
 
     def phases(value: float | Array) -> Array:
         if angles is not None:

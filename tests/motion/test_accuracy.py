@@ -55,6 +55,8 @@ def test_the_estimate_is_above_the_error_and_near_it():
     for accuracy in (1e-3, 1e-8):
         run = jv.simulate(s, 60.0, **asked, stepsize_controller=jv.Accuracy(accuracy))
         assert bool(run.status == jv.RunStatus.done) and apart(run) <= float(run.error) <= accuracy
+        before = int(run.evaluations) - 13 * int(run.steps)  # of the runs to larger tolerances, each with fewer steps
+        assert 13 * int(run.steps) // 3 < before and before % 13 == 0
 
 
 def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):

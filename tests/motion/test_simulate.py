@@ -123,7 +123,7 @@ def test_what_moves_fastest_and_slowest(speed):
 def test_a_run_may_take_500_steps_a_turn(turns, steps):
     """And 4096 besides, rounded up to a power of 2."""
     s = scene("one_mass", "balls", speed=100.0)
-    assert enough_steps(s, jnp.asarray(2.0 * np.pi * turns / 100.0)) == steps
+    assert enough_steps(fastest_and_slowest(s)[0], jnp.asarray(2.0 * np.pi * turns / 100.0)) == steps
 
 
 @pytest.mark.parametrize(("turns", "samples"), [(1000, 16384), (1100, 262144)])
@@ -199,7 +199,7 @@ def test_the_next_tolerance_is_smaller_by_a_little_more_than_what_is_missing(mon
 
         compared = lambda *_, errors=errors: dataclasses.replace(base, error=jnp.asarray(next(errors)))  # noqa: E731
         monkeypatch.setattr("jaxvib.motion.simulate._compared", compared)
-        found = _to_accuracy(base.scene, run, StepControl(tolerance=jnp.asarray(1e-6)), 1e-4)
+        found = _to_accuracy(base.scene, jnp.asarray(1.0), run, StepControl(tolerance=jnp.asarray(1e-6)), 1e-4)
         assert bool(found.status == jv.RunStatus.done) and len(asked) == 3 and asked[0] > asked[1] == 1e-6
         assert low <= asked[2] / asked[1] <= high, times
 
