@@ -18,7 +18,7 @@ from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.stored import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import count, number
 

@@ -31,7 +31,7 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.stored import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.units import Number, count, known_number, traced
 
 __all__ = ["enough_steps", "simulate"]

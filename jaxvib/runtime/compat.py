@@ -50,7 +50,6 @@ __all__ = [
     "no_host_checks",
     "no_places",
     "operation_like",
-    "results_of",
     "resuming",
     "rewritten",
     "short_end",
@@ -86,24 +85,6 @@ def rewritten(
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
     except (AttributeError, TypeError):
         return program
-
-
-def results_of(function: Callable[..., Sequence[Array]], wanted: Sequence[bool], *like: Array) -> Callable[..., list[Array]]:
-    """A function of such arrays, of which those results are `wanted`, traced, without the operations that the others alone
-    need: who differentiates it does not differentiate these."""
-
-    def all_of_it(*arrays: Array) -> list[Array]:
-        return [x for is_wanted, x in zip(wanted, function(*arrays), strict=True) if is_wanted]
-
-    if not HAS_JAXPRS:
-        return all_of_it
-    program = jax.make_jaxpr(all_of_it)(*like)
-    needed, kept = {id(result) for result in program.jaxpr.outvars}, []
-    for equation in reversed(program.jaxpr.eqns):
-        if equation.effects or any(id(result) in needed for result in equation.outvars):
-            needed |= {id(atom) for atom in equation.invars}
-            kept.append((equation, equation.invars))
-    return jaxpr_as_fun(rewritten(program, kept[::-1], program.jaxpr.outvars))
 
 
 Atoms: TypeAlias = "list[Var | Literal]"

@@ -22,7 +22,8 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import shared_devices
-from jaxvib.runtime.stored import begin_others, beginning, is_debugging, is_rehearsing
+from jaxvib.runtime.rehearsal import begin_others, beginning, is_rehearsing
+from jaxvib.runtime.stored import is_debugging
 
 __all__ = ["cores", "in_chunks", "in_parallel", "in_threads"]
 

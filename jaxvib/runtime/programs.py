@@ -20,8 +20,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import beneath, results_of, traced
+from jaxvib.runtime.compat import beneath, traced
 from jaxvib.runtime.devices import arrays_on_device
+from jaxvib.runtime.operations import results_of
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
@@ -60,7 +61,7 @@ class CachedFunction(Generic[P, T]):
     """What `cached` returns: the function, whose programs and those of its derivatives are `stored`; and its argument."""
 
     def __init__(self, function: Callable[P, T], reversed_anew: bool = False):
-        self.stored, self.reversed_anew = StoredFunction(function), reversed_anew
+        self.stored, self.reversed_anew = StoredFunction(function, keeps_trace=reversed_anew), reversed_anew
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -129,14 +130,19 @@ def _moving(question: _Question, active: Sequence[bool], arrays: Sequence[Array]
     """The function of its `active` arrays, which returns the numbers that have derivatives and, beside them, all; and these."""
 
     def function(*moving: Array) -> tuple[list[Array], list[Array]]:
-        given = iter(moving)
-        found = question.split(question([next(given) if moves else x for moves, x in zip(active, arrays, strict=True)]))
+        found = question.split(question(_filled(active, arrays, moving)))
         return [x for x in found if _has_slope(x)], found
 
     return function, [x for moves, x in zip(active, arrays, strict=True) if moves]
 
 
-def _has_slope(x: Array) -> bool:
+def _filled(active: Sequence[bool], arrays: Sequence[Array], moving: Sequence[Array]) -> list[Array]:
+    """The arrays with these in place of the `active` ones."""
+    given = iter(moving)
+    return [next(given) if moves else x for moves, x in zip(active, arrays, strict=True)]
+
+
+def _has_slope(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
@@ -177,9 +183,18 @@ def _pulled(
 def _pulled_anew(
     question: _Question, active: tuple[bool, ...], asked: tuple[bool, ...], arrays: list[Array], slopes: list[Array]
 ) -> list[Array]:
-    """`_pulled` of a function that is `reversed_anew`."""
-    function, moving = _moving(question, active, arrays)
-    return list(jax.vjp(results_of(lambda *moving: function(*moving)[0], asked, *moving), *moving)[1](slopes))
+    """`_pulled` of a function that is `reversed_anew`: of its program as it was traced for the results, if it just was."""
+
+    def numbers(*arrays: Array) -> list[Array]:
+        return [x for x in question.split(question(arrays)) if _has_slope(x)]
+
+    known = question.function.stored.traced(question.arguments, arrays)
+    if known is not None:
+        program, places = known
+        known = program, [k for k in places if _has_slope(program.out_avals[k])]
+    wanted = results_of(numbers, asked, *arrays, traced=known)
+    moving = [x for moves, x in zip(active, arrays, strict=True) if moves]
+    return list(jax.vjp(lambda *moving: wanted(*_filled(active, arrays, moving)), *moving)[1](slopes))
 
 
 def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:

@@ -20,7 +20,7 @@ import threading
 import weakref
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -30,14 +30,14 @@ from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import evaluating, no_host_checks, no_places, resuming
+from jaxvib.runtime.compat import ClosedJaxpr, evaluating, no_host_checks, no_places
 from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.devices import arrays_on_device, on_device
+from jaxvib.runtime.rehearsal import Unstored, begin_others, is_rehearsing, rehearsal
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
-__all__ = ["StoredFunction", "begin_others", "beginning", "compiled_together", "is_rehearsing"]
+__all__ = ["StoredFunction", "is_debugging"]
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 _PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
@@ -65,10 +65,13 @@ class StoredFunction(Generic[T]):
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
     (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
+
+    One that `keeps_trace` remembers what was traced last, see `traced`.
     """
 
-    def __init__(self, function: Callable[..., T]):
-        self.function = no_host_checks()(function)
+    def __init__(self, function: Callable[..., T], keeps_trace: bool = False):
+        self.function, self.keeps_trace = no_host_checks()(function), keeps_trace
+        self.latest: tuple[Hashable, ClosedJaxpr, list[int]] | None = None
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
@@ -94,11 +97,11 @@ class StoredFunction(Generic[T]):
             _forget_oldest()
         if program is None:
             if is_rehearsing():
-                raise _Unstored
+                raise Unstored
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
-        if program.is_new and (_rest.question is not None or is_rehearsing()):
-            program.compile_beside(_rehearse)
+        if program.is_new and (beside := rehearsal()) is not None:
+            program.compile_beside(beside)
         if program.has_run:
             begin_others()
         with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
@@ -115,6 +118,12 @@ class StoredFunction(Generic[T]):
             return _read(path, home) or self._write(path, leaves, treedef, home)
         except Undescribable:
             return None
+
+    def traced(self, arguments: Skeleton, arrays: Sequence[Array]) -> tuple[ClosedJaxpr, list[int]] | None:
+        """The function of arrays like these, in such arguments, as it was traced for a program of this process, and where the
+        arrays of its flattened result stand among the results of that; None where something else was traced since."""
+        latest = self.latest
+        return latest[1:] if latest is not None and latest[0] == (arguments, _types(arrays), _options()) else None
 
     def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
@@ -139,15 +148,19 @@ class StoredFunction(Generic[T]):
             return [jnp.asarray(x, x.dtype) for x in found]  # read from the disk, results have types of their own
 
         jitted = jax.jit(flat)
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         try:
             with no_places(), _uncollected():
-                exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
+                exported = export.export(jitted)(*arrays)
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
         program = _Program.of(_compiled(path, exported, home), structure[0], exported, is_new=True)
+        if self.keeps_trace:
+            places = [leaf.place for leaf in program.result.flat[0] if isinstance(leaf, Slot)]
+            self.latest = (given, _types(arrays), _options()), jitted.trace(*arrays).jaxpr, places
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
@@ -205,8 +218,12 @@ class _Program:
     def unknown(self) -> Any:
         """Zeros in place of results that have not been computed."""
         if self.results is None:
-            raise _Unstored
+            raise Unstored
         return self.result.filled(on_device([np.zeros(x.shape, x.dtype) for x in self.results]))
+
+
+def _types(arrays: Sequence[Any]) -> tuple[Hashable, ...]:
+    return tuple((x.shape, x.dtype, jax.typeof(x).weak_type) for x in arrays)
 
 
 def _type_of(aval: Any) -> jax.ShapeDtypeStruct:
@@ -216,77 +233,6 @@ def _type_of(aval: Any) -> jax.ShapeDtypeStruct:
 def _compile(lowered: jax.stages.Lowered) -> None:
     with contextlib.suppress(Exception):  # the compiler fails once more where the program is run
         lowered.compile()
-
-
-class _Rest(threading.local):
-    """Of a thread: the question that asks for programs, if it is `compiled_together`, whether it is gone through with zeros,
-    and what is to be begun, see `beginning`."""
-
-    question: Callable[[], object] | None = None
-    others: Callable[[], None] | None = None
-    resuming: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
-    rehearsing: bool = False
-
-
-_rest = _Rest()
-
-
-class _Unstored(Exception):
-    """Ends a rehearsal: what comes next depends on numbers of a program that can only be run."""
-
-
-def compiled_together(question: Callable[P, T]) -> Callable[P, T]:
-    """A question that asks for several programs, one after the other: those that are new are compiled at the same time.
-
-    Where the first new one is met, the question is asked once more with zeros for results of all programs, only to trace them
-    and to begin to compile them: tracing takes one core, compiling others. That ends at the first error, and where a program
-    depends on numbers, in which case it may be one that nobody needs.
-    """
-
-    @functools.wraps(question)
-    def asked(*args: P.args, **kwargs: P.kwargs) -> T:
-        if _rest.question is not None:  # a part of another question
-            return question(*args, **kwargs)
-        _rest.question, _rest.resuming = functools.partial(question, *args, **kwargs), resuming()
-        try:
-            return question(*args, **kwargs)
-        finally:
-            _rest.question = None
-
-    return asked
-
-
-def is_rehearsing() -> bool:
-    """Whether programs are only traced and compiled here, see `compiled_together`."""
-    return _rest.rehearsing
-
-
-@contextlib.contextmanager
-def beginning(others: Callable[[], None]) -> Iterator[None]:
-    """In here `others`, which ask for the same programs in other threads, are begun once one runs that has run before."""
-    before, _rest.others = _rest.others, others
-    try:
-        yield
-    finally:
-        _rest.others = before
-
-
-def begin_others() -> None:
-    """What is to be begun, if it has not been yet."""
-    if (others := _rest.others) is not None:
-        _rest.others = None
-        others()
-
-
-def _rehearse() -> None:
-    if _rest.question is None or _rest.rehearsing:
-        return
-    _rest.rehearsing = True
-    try:
-        with contextlib.suppress(Exception), np.errstate(all="ignore"), _rest.resuming():
-            _rest.question()
-    finally:
-        _rest.rehearsing = False
 
 
 _pausing = threading.Lock()

@@ -72,21 +72,6 @@ def test_programs_are_rewritten(monkeypatch):
     assert compat.rewritten(*asked) is closed and second in closed.jaxpr.eqns
 
 
-def test_operations_that_no_wanted_result_needs_are_left_out(monkeypatch):
-    """Jaxprs are read and rewritten; all operations where nobody may."""
-    x = jnp.asarray(0.5)
-
-    def three(x):
-        shared = jnp.exp(x)
-        return [jnp.sin(shared), jnp.tan(x) * shared, jnp.log(x)]
-
-    few = compat.results_of(three, [True, False, True], x)
-    assert operations(few, x) == 3 and few(x) == [three(x)[0], three(x)[2]]
-    np.testing.assert_allclose(jax.vjp(few, x)[1]([x, x])[0], x * (jnp.cos(jnp.exp(x)) * jnp.exp(x) + 1.0 / x), rtol=1e-15)
-    monkeypatch.setattr(compat, "HAS_JAXPRS", False)
-    assert compat.results_of(three, [True, False, True], x)(x) == [three(x)[0], three(x)[2]]
-
-
 @pytest.mark.parametrize("kind", [compat.custom_vmap, compat._PlainVmap])
 def test_functions_can_have_a_rule_for_vmap(kind):
     """jax.custom_batching.custom_vmap; without it the rule is left out."""

@@ -49,6 +49,7 @@ def asked(tmp_path, monkeypatch, request):
         kinds = (programs._pushed, programs._noted, programs._pulled, programs._pulled_anew, programs._mapped)
         for function in (globals()["wave"], *kinds):
             function.stored.ready.clear()
+            function.stored.latest = None
 
     forget()
     yield forgetful, forget
@@ -226,3 +227,25 @@ def test_what_is_reversed_anew_notes_nothing(asked):
         found = ROUTES["of two"](function)
     for ours, theirs in zip(found, ROUTES["of two"](plain), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+@pytest.mark.parametrize("asked", [True], indirect=True)
+def test_what_is_reversed_anew_is_traced_once(asked):
+    """The program of the results is at hand, unless it came from the disk or another one was traced since."""
+    function, forget = asked
+    expected, latest = ROUTES["grad"](plain), lambda: globals()["wave"].stored.latest
+    forget()
+    np.testing.assert_allclose(ROUTES["grad"](function), expected, rtol=1e-12)
+    assert traces == ["a"] and latest() is not None
+    forget()
+    jax.grad(lambda x: jnp.sum(function(x).values))(X)
+    assert traces == ["a"] and latest() is None
+    jax.grad(lambda x: jnp.sum(function(x).values))(X[:2])
+    value, pullback = jax.vjp(lambda x: number(function, x), 2.0 * X[1:])
+    function(X[:1])
+    traces.clear()
+    theirs, expected = jax.vjp(lambda x: number(plain, x), 2.0 * X[1:])
+    np.testing.assert_allclose(value, theirs, rtol=1e-12)
+    traces.clear()
+    np.testing.assert_allclose(pullback(1.0)[0], expected(1.0)[0], rtol=1e-12)
+    assert traces == ["a"]

@@ -292,57 +292,6 @@ print(round(float(total)), len(list((folder / "programs").iterdir())))
     assert [file for file in tmp_path.iterdir() if file.name.startswith("jit_values")]  # JAX's cache has what XLA made of it
 
 
-@programs.cached
-def squared(x):
-    traces.append(("squared", stored.is_rehearsing()))
-    return x**2
-
-
-@programs.cached
-def tripled(x):
-    traces.append(("tripled", stored.is_rehearsing()))
-    return 3.0 * x
-
-
-def together(between=lambda y: None):
-    """3 x^2 by two programs, and what is done with the result of the first one."""
-
-    @stored.compiled_together
-    def question(x):
-        y = squared(x)
-        between(y)
-        return tripled(y)
-
-    return question
-
-
-def test_programs_of_a_question_are_compiled_together(folder):
-    seen = []
-    question = together(lambda y: seen.append((y.tolist(), stored.is_rehearsing())))
-    x = jnp.asarray([1.0, 2.0])
-    np.testing.assert_array_equal(question(x), [3.0, 12.0])
-    assert seen == [([0.0, 0.0], True), ([1.0, 4.0], False)]
-    assert traces == [("squared", False), ("tripled", True)]
-    np.testing.assert_array_equal(question(2.0 * x), [12.0, 48.0])
-    assert len(seen) == 3 and len(traces) == 2
-
-
-def test_a_question_that_depends_on_numbers_is_answered_all_the_same(folder):
-    def refused(y):
-        if not y.any():
-            raise jv.InputError("y", "is zero")
-
-    np.testing.assert_array_equal(together(refused)(jnp.asarray([1.0, 2.0])), [3.0, 12.0])
-    assert traces == [("squared", False), ("tripled", False)] and not stored.is_rehearsing()
-
-
-@pytest.mark.parametrize("way", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
-def test_derivatives_of_a_question_are_compiled_together(folder, way):
-    jacobian = way(together())(jnp.asarray([1.0, 2.0]))
-    np.testing.assert_array_equal(jacobian, [[6.0, 0.0], [0.0, 12.0]])
-    assert ("tripled", True) in traces and ("tripled", False) not in traces
-
-
 def test_python_looks_for_no_garbage_while_a_program_is_traced(folder):
     before = gc.isenabled()
     with stored._uncollected():

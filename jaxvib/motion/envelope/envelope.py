@@ -34,7 +34,7 @@ from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.stored import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]

@@ -20,7 +20,7 @@ from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.stored import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (

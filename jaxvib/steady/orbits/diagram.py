@@ -23,7 +23,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.stored import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.folds import fold_points
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, steps_for
