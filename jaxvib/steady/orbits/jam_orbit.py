@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -142,13 +144,18 @@ def jam_orbit(
     many, found, settle = tried[0], None, False
 
     def attempt() -> Orbit:
+        """The first that is accurate enough, or the best: beside a fold more points add rounding, and no accuracy."""
         nonlocal many
-        for many in tried[:-1]:
-            orbit = _orbit(frozen, still, start, exists, direction, which, many, None, accuracy, settle)
-            if not float(orbit.error) > accuracy:
-                return orbit
-        many = tried[-1]
-        return _orbit(frozen, still, start, exists, direction, which, many, None, accuracy, settle)
+        best, least = None, math.inf
+        for each in tried:
+            orbit = _orbit(frozen, still, start, exists, direction, which, each, None, accuracy, settle)
+            error = float(orbit.error)
+            if best is None or error < least:
+                best, least, many = orbit, error, each
+            if not error > accuracy:  # nor is it where there is no motion
+                break
+        assert best is not None
+        return best
 
     if concrete:
         found = attempt()

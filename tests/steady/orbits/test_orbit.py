@@ -271,7 +271,9 @@ def test_at_a_fold_the_status_says_so():
     scene = published(eps=0.05, speed=rotor_speed * (1.0 - 1e-13)).scene()
     orbit = jv.jam_orbit(scene, near=omega)
     assert bool(orbit.status == jv.OrbitStatus.at_fold)
-    np.testing.assert_allclose(orbit.omega, omega, rtol=1e-6)
+    np.testing.assert_allclose(orbit.omega, omega, rtol=1e-7)
+    # No number of points is accurate enough: 32 leave the least, 128 six hundred times as much.
+    assert orbit.error < 1e-8 and orbit.harmonics < 2 * 64
     # A gradient there is huge, not infinite.
     of_omega = jnp.zeros(numbers_of(orbit).size).at[0].set(1.0)
     slopes = weighted_gradient(scene, omega, of_omega)
