@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["Grid", "analyzed", "deviation_analysis", "grid_of", "resampling", "synthesized"]
+__all__ = ["Grid", "analyzed", "deviation_analysis", "deviation_synthesis", "grid_of", "resampling", "synthesized"]
 
 
 class Grid(NamedTuple):
@@ -103,3 +103,8 @@ def resampling(grid: Grid, to: Grid) -> np.ndarray:
     orders = min(grid.deviation_orders.size, to.deviation_orders.size)
     keep = np.tile(np.arange(grid.deviation_orders.size) < orders, 2)
     return deviation_analysis(grid)[:, keep] @ _synthesis(grid.deviation_orders[:orders], to.theta)
+
+
+def deviation_synthesis(grid: Grid) -> np.ndarray:
+    """(2J, M): psi at the points from its harmonics, see `synthesized`."""
+    return _synthesis(grid.deviation_orders, grid.theta)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-__all__ = ["bracketed_root", "next_share"]
+__all__ = ["bracketed_root", "known_root", "next_share"]
 
 Numbers = TypeVar("Numbers", np.ndarray, Array)
 
@@ -59,7 +59,18 @@ def bracketed_root(f: Callable[[Array], Array], low: Array, high: Array, ends: t
         return jax.lax.while_loop(open_, step, start)[6]
 
     low, high, ends = jax.lax.stop_gradient((low, high, ends))
-    return jax.lax.custom_root(f, low, solve, lambda g, y: y / _nonzero(g(jnp.ones_like(y))))
+    return jax.lax.custom_root(f, low, solve, _by_slope)
+
+
+def known_root(f: Callable[[Array], Array], root: Array) -> Array:
+    """The `root` of `f` (scalar), which is known, with the derivatives that `bracketed_root` gives it."""
+    root = jax.lax.stop_gradient(root)
+    return jax.lax.custom_root(f, root, lambda *_: root, _by_slope)
+
+
+def _by_slope(g: Callable[[Array], Array], y: Array) -> Array:
+    """Where the linear function `g` is y."""
+    return y / _nonzero(g(jnp.ones_like(y)))
 
 
 def next_share(

@@ -1,4 +1,4 @@
-"""The operations of a program: how many there are, and which of them some results need."""
+"""The operations of a program: how many there are, and which of them are needed."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import jax
 from jax import Array
 
-from jaxvib.runtime.compat import HAS_JAXPRS, ClosedJaxpr, jaxpr_as_fun, rewritten
+from jaxvib.runtime.compat import HAS_JAXPRS, jaxpr_as_fun, rewritten
 
-__all__ = ["operations", "results_of"]
+__all__ = ["operations", "pruned"]
 
 
 def operations(function: Callable[..., Any], *arguments: Any) -> int:
@@ -44,29 +44,15 @@ def _programs(value: Any) -> Iterator[Any]:
             yield from _programs(each)
 
 
-def results_of(
-    function: Callable[..., Sequence[Array]],
-    wanted: Sequence[bool],
-    *like: Array,
-    traced: tuple[ClosedJaxpr, Sequence[int]] | None = None,
-) -> Callable[..., list[Array]]:
-    """A function of such arrays, of which those results are `wanted`, traced, without the operations that the others alone
-    need: who differentiates it does not differentiate these. It may have been `traced` before, as a part of a program, among
-    whose results its own have these places."""
-
-    def all_of_it(*arrays: Array) -> list[Array]:
-        return [x for is_wanted, x in zip(wanted, function(*arrays), strict=True) if is_wanted]
-
+def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:
+    """A function of such arrays, traced, without the operations that none of its results needs: who differentiates it does not
+    differentiate these."""
     if not HAS_JAXPRS:
-        return all_of_it
-    program, places = traced or (jax.make_jaxpr(all_of_it)(*like), ())
-    results = program.jaxpr.outvars
-    if traced is not None:
-        results = [results[k] for is_wanted, k in zip(wanted, places, strict=True) if is_wanted]
-    needed, kept = {id(result) for result in results}, []
+        return lambda *arrays: list(function(*arrays))
+    program = jax.make_jaxpr(function)(*like)
+    needed, kept = {id(result) for result in program.jaxpr.outvars}, []
     for equation in reversed(program.jaxpr.eqns):
         if equation.effects or any(id(result) in needed for result in equation.outvars):
             needed |= {id(atom) for atom in equation.invars}
             kept.append((equation, equation.invars))
-    fewer = rewritten(program, kept[::-1], results)
-    return all_of_it if fewer is program and traced is not None else jaxpr_as_fun(fewer)
+    return jaxpr_as_fun(rewritten(program, kept[::-1], program.jaxpr.outvars))

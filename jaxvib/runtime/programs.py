@@ -22,7 +22,7 @@ from jax import Array
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import beneath, traced
 from jaxvib.runtime.devices import arrays_on_device
-from jaxvib.runtime.operations import results_of
+from jaxvib.runtime.operations import pruned
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
 from jaxvib.runtime.startup import start
 from jaxvib.runtime.stored import StoredFunction, is_debugging
@@ -39,29 +39,28 @@ def cached(function: Callable[P, T]) -> CachedFunction[P, T]: ...
 
 
 @overload
-def cached(*, reversed_anew: bool) -> Callable[[Callable[P, T]], CachedFunction[P, T]]: ...
+def cached(*, from_result: Callable[..., Any]) -> Callable[[Callable[P, T]], CachedFunction[P, T]]: ...
 
 
-def cached(function: Callable[P, T] | None = None, *, reversed_anew: bool = False) -> Any:
+def cached(function: Callable[P, T] | None = None, *, from_result: Callable[..., Any] | None = None) -> Any:
     """Compiles a function of trees, as `equinox.filter_jit` does, and caches its programs on disk, see `StoredFunction`.
 
     Derivatives by `jax.jvp`, `grad`, `jacfwd`, `jacrev` and batches by `vmap` have programs of their own, cached alike. Where
     these are derivatives of derivatives, or `jit` is around them, it is just the compiled function that JAX transforms.
 
-    **Arguments**: `reversed_anew`: the reverse derivative computes the function once more, as far as results are asked for,
-    in place of noting what it needs of all of them. It pays where the function has many results, of which few are
-    differentiated, and is quickly computed.
+    **Arguments**: `from_result`: a function of the result and of the arguments that gives the numbers of the result once more,
+    with the same derivatives: what the function searches for is known there. It gives None for those that it does not tell.
+    The reverse derivative is taken of it; where others are asked for as well, of the function, computed once more as far as
+    they need it. Else the function notes what the reverse derivative needs of all of its results.
     """
-    return (
-        CachedFunction(function, reversed_anew) if function else functools.partial(CachedFunction, reversed_anew=reversed_anew)
-    )
+    return CachedFunction(function) if function else functools.partial(CachedFunction, from_result=from_result)
 
 
 class CachedFunction(Generic[P, T]):
     """What `cached` returns: the function, whose programs and those of its derivatives are `stored`; and its argument."""
 
-    def __init__(self, function: Callable[P, T], reversed_anew: bool = False):
-        self.stored, self.reversed_anew = StoredFunction(function, keeps_trace=reversed_anew), reversed_anew
+    def __init__(self, function: Callable[P, T], from_result: Callable[..., Any] | None = None):
+        self.stored, self.from_result = StoredFunction(function), from_result
         functools.update_wrapper(self, function)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -106,12 +105,29 @@ class _Question:
     def result(self, arrays: Sequence[Array]) -> Any:
         return self.skeletons[0].filled(arrays)
 
+    def told(self, found: Sequence[Array], arrays: Sequence[Array]) -> list[Array | None]:
+        """What the function's `from_result` gives for the arrays of a result that was `found`; None for others."""
+        assert self.function.from_result is not None
+        args, kwargs = self.arguments.filled(arrays)
+        result = self.result(found)
+        told = self.function.from_result(result, *args, **kwargs)
+
+        def spread(part: Array | None, whole: Any) -> Any:
+            return [part] * len(jax.tree.leaves(whole))
+
+        parts = jax.tree.leaves(jax.tree.map(spread, told, result, is_leaf=_is_none), is_leaf=_is_none)
+        return [part for part, x in zip(parts, jax.tree.leaves(result), strict=True) if eqx.is_array(x)]
+
     def is_describable(self) -> bool:
         """Whether its program can be told from others on disk."""
         try:
             return _is_describable(self)
         except TypeError:  # an argument without a hash
             return False
+
+
+def _is_none(x: object) -> bool:
+    return x is None
 
 
 @functools.lru_cache(256)
@@ -133,7 +149,11 @@ def _moving(question: _Question, active: Sequence[bool], arrays: Sequence[Array]
         found = question.split(question(_filled(active, arrays, moving)))
         return [x for x in found if _has_slope(x)], found
 
-    return function, [x for moves, x in zip(active, arrays, strict=True) if moves]
+    return function, _active(active, arrays)
+
+
+def _active(active: Sequence[bool], arrays: Sequence[Array]) -> list[Array]:
+    return [x for moves, x in zip(active, arrays, strict=True) if moves]
 
 
 def _filled(active: Sequence[bool], arrays: Sequence[Array], moving: Sequence[Array]) -> list[Array]:
@@ -180,21 +200,29 @@ def _pulled(
 
 
 @cached
-def _pulled_anew(
-    question: _Question, active: tuple[bool, ...], asked: tuple[bool, ...], arrays: list[Array], slopes: list[Array]
+def _pulled_again(
+    question: _Question,
+    active: tuple[bool, ...],
+    asked: tuple[bool, ...],
+    arrays: list[Array],
+    found: list[Array],
+    slopes: list[Array],
 ) -> list[Array]:
-    """`_pulled` of a function that is `reversed_anew`: of its program as it was traced for the results, if it just was."""
+    """`_pulled` of a function that has a `from_result`, of arrays for which these were `found`."""
+    numbers = [k for k, x in enumerate(found) if _has_slope(x)]
+    wanted = [k for k, is_asked in zip(numbers, asked, strict=True) if is_asked]
 
-    def numbers(*arrays: Array) -> list[Array]:
-        return [x for x in question.split(question(arrays)) if _has_slope(x)]
+    def function(*moving: Array) -> list[Array]:
+        given = _filled(active, arrays, moving)
+        parts = question.told(found, given)
+        told = [part for k in wanted if (part := parts[k]) is not None]
+        if len(told) == len(wanted):
+            return told
+        whole = question.split(question(given))
+        return [whole[k] for k in wanted]
 
-    known = question.function.stored.traced(question.arguments, arrays)
-    if known is not None:
-        program, places = known
-        known = program, [k for k in places if _has_slope(program.out_avals[k])]
-    wanted = results_of(numbers, asked, *arrays, traced=known)
-    moving = [x for moves, x in zip(active, arrays, strict=True) if moves]
-    return list(jax.vjp(lambda *moving: wanted(*_filled(active, arrays, moving)), *moving)[1](slopes))
+    moving = _active(active, arrays)
+    return list(jax.vjp(pruned(function, *moving), *moving)[1](slopes))
 
 
 def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Array]) -> tuple[list[Array], Any]:
@@ -264,9 +292,10 @@ def _differentiated(arrays: Sequence[Array], tangents: Sequence[Any], *, questio
     if all(not traced(tangent) or _is_simple(tangent) for tangent in moving):
         result, slopes = _pushed(question, active, list(arrays), moving)
     else:  # tangents that nobody knows: the derivative is to be transposed
-        if question.function.reversed_anew:
+        if question.function.from_result is not None:
             args, kwargs = question.arguments.filled(arrays)
-            result, notes = question.function(*args, **kwargs), []
+            result = question.function(*args, **kwargs)
+            notes = question.split(result)
         else:
             result, notes = _noted(question, active, list(arrays))
         types = tuple(jax.typeof(x) for x in jax.tree.leaves(result) if eqx.is_array(x) and _has_slope(x))
@@ -286,8 +315,9 @@ def _in_batch(arrays: Sequence[Array], axes: Sequence[Any], *, question: _Questi
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class _Known:
-    """Where a derivative is taken, what the reverse one needs, and the types of results that have one. JAX writes parameters of
-    primitives out whenever it maps them: no `repr`, which would write out all the numbers."""
+    """Where a derivative is taken, what the reverse one needs (the results, of a function that has a `from_result`), and the
+    types of results that have one. JAX writes parameters of primitives out whenever it maps them: no `repr`, which would write
+    out all the numbers."""
 
     question: _Question
     active: tuple[bool, ...]
@@ -312,8 +342,8 @@ def _slopes_in_batch(tangents: Sequence[Array], axes: Sequence[Any], *, at: _Kno
 def _transposed(slopes: Sequence[Any], *_: Any, at: _Known) -> list[Array]:
     asked = tuple(not is_zero(slope) for slope in slopes)
     wanted = [slope for is_asked, slope in zip(asked, slopes, strict=True) if is_asked]
-    if at.question.function.reversed_anew:
-        return _pulled_anew(at.question, at.active, asked, at.arrays, wanted)
+    if at.question.function.from_result is not None:
+        return _pulled_again(at.question, at.active, asked, at.arrays, at.notes, wanted)
     return _pulled(at.question, at.active, asked, _types(at.arrays), at.notes, wanted)
 
 

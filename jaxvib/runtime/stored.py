@@ -30,7 +30,7 @@ from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import ClosedJaxpr, evaluating, no_host_checks, no_places
+from jaxvib.runtime.compat import evaluating, no_host_checks, no_places
 from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.devices import arrays_on_device, on_device
 from jaxvib.runtime.rehearsal import Unstored, begin_others, is_rehearsing, rehearsal
@@ -65,13 +65,10 @@ class StoredFunction(Generic[T]):
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
     (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
-
-    One that `keeps_trace` remembers what was traced last, see `traced`.
     """
 
-    def __init__(self, function: Callable[..., T], keeps_trace: bool = False):
-        self.function, self.keeps_trace = no_host_checks()(function), keeps_trace
-        self.latest: tuple[Hashable, ClosedJaxpr, list[int]] | None = None
+    def __init__(self, function: Callable[..., T]):
+        self.function = no_host_checks()(function)
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
         self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
@@ -119,12 +116,6 @@ class StoredFunction(Generic[T]):
         except Undescribable:
             return None
 
-    def traced(self, arguments: Skeleton, arrays: Sequence[Array]) -> tuple[ClosedJaxpr, list[int]] | None:
-        """The function of arrays like these, in such arguments, as it was traced for a program of this process, and where the
-        arrays of its flattened result stand among the results of that; None where something else was traced since."""
-        latest = self.latest
-        return latest[1:] if latest is not None and latest[0] == (arguments, _types(arrays), _options()) else None
-
     def _key(self, leaves: Sequence[object], treedef: Hashable) -> str:
         def abstract(leaf: Array) -> str:
             device, *others = leaf.sharding.device_set
@@ -148,19 +139,15 @@ class StoredFunction(Generic[T]):
             return [jnp.asarray(x, x.dtype) for x in found]  # read from the disk, results have types of their own
 
         jitted = jax.jit(flat)
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         try:
             with no_places(), _uncollected():
-                exported = export.export(jitted)(*arrays)
+                exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
         program = _Program.of(_compiled(path, exported, home), structure[0], exported, is_new=True)
-        if self.keeps_trace:
-            places = [leaf.place for leaf in program.result.flat[0] if isinstance(leaf, Slot)]
-            self.latest = (given, _types(arrays), _options()), jitted.trace(*arrays).jaxpr, places
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
@@ -220,10 +207,6 @@ class _Program:
         if self.results is None:
             raise Unstored
         return self.result.filled(on_device([np.zeros(x.shape, x.dtype) for x in self.results]))
-
-
-def _types(arrays: Sequence[Any]) -> tuple[Hashable, ...]:
-    return tuple((x.shape, x.dtype, jax.typeof(x).weak_type) for x in arrays)
 
 
 def _type_of(aval: Any) -> jax.ShapeDtypeStruct:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import dataclasses
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
-from jaxvib.numerics.roots import bracketed_root
+from jaxvib.numerics.roots import bracketed_root, known_root
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
@@ -198,7 +199,15 @@ def jam_modes(scene: Scene) -> JamModes:
     return jams_of(scene)
 
 
-@cached
+def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
+    """The jams at their load speeds, which are known; neither resonances nor folds."""
+    n, model, there = scene.drive.speed, jammed_model(scene), jams.status != JamStatus.absent
+    omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(there, jams.omega, n))
+    fields = _fields(model, jnp.where(there, omega, n), there, jams.status == JamStatus.at_fold)
+    return dataclasses.replace(jax.tree.map(lambda _: None, jams), **fields)
+
+
+@cached(from_result=_from_jams)
 def jams_of(scene: Scene) -> JamModes:
     """`jam_modes` of a scene that is known to be right."""
     n, model = scene.drive.speed, jammed_model(scene)
@@ -216,6 +225,14 @@ def jams_of(scene: Scene) -> JamModes:
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]
 
+    fields = _fields(model, omega, there, close)
+    return JamModes(**fields, resonances=pieces.resonances, folds=pieces.folds)
+
+
+def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> dict[str, Any]:
+    """Those of all jam modes, from the loads' speed in each, rad/s, whether it exists, and whether it lies at its fold."""
+    n = model.scene.drive.speed
+
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
         found = jam_at(model, number, w, n, flat)
         values = jax.tree.map(
@@ -228,9 +245,8 @@ def jams_of(scene: Scene) -> JamModes:
             (JamStatus.where(is_there, found.status, JamStatus.absent), is_there & found.stable, n),
         )
 
-    jams = jax.vmap(jam)(numbers, omega, there, close)
-    fields = {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
-    return JamModes(**fields, resonances=pieces.resonances, folds=pieces.folds)
+    jams = jax.vmap(jam)(jnp.arange(1, omega.shape[0] + 1), omega, there, at_fold)
+    return {name: getattr(jams, name) for name in Jam.__dataclass_fields__}
 
 
 def jam_at(

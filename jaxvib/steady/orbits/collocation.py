@@ -112,7 +112,14 @@ class PeriodicSolution(NamedTuple):
 
 
 def periodic_motion(
-    model: CollectedModel, grid: Grid, given: Parameter, value: Array, start: Array, deviation: Array | None = None
+    model: CollectedModel,
+    grid: Grid,
+    given: Parameter,
+    value: Array,
+    start: Array,
+    deviation: Array | None = None,
+    *,
+    is_known: bool = False,
 ) -> PeriodicSolution:
     """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
 
@@ -123,14 +130,14 @@ def periodic_motion(
     at the M points of `grid`, with the index k for harmonics, a the port's acceleration, e the point of a load on the unit
     circle. The unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter
     starts from, `deviation` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
-    residual.
+    residual. Where it `is_known` that these are the motion, none are taken.
 
     Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
     """
     if deviation is None:
         deviation = jnp.zeros((*model.unbalance.shape, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, deviation))
-    psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given)
+    psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given, is_known=is_known)
     return PeriodicSolution(psi, *_both(given, value, x))
 
 
@@ -157,8 +164,17 @@ class _State(NamedTuple):
 
 @eqx.filter_custom_jvp
 def _newton(
-    model: CollectedModel, value: Array, start: Array, deviation: Array, *, grid: tuple[int, bool], given: Parameter
+    model: CollectedModel,
+    value: Array,
+    start: Array,
+    deviation: Array,
+    *,
+    grid: tuple[int, bool],
+    given: Parameter,
+    is_known: bool,
 ) -> tuple[Array, Array]:
+    if is_known:
+        return deviation, start
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
@@ -196,9 +212,9 @@ def _newton(
 
 
 @_newton.def_jvp
-def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter):
+def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, is_known: bool):
     model, value, start, deviation = primals
-    deviation, x = _newton(model, value, start, deviation, grid=grid, given=given)
+    deviation, x = _newton(model, value, start, deviation, grid=grid, given=given, is_known=is_known)
     on = grid_of(*grid)
 
     def equations(model: CollectedModel, value: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import steps_for
-from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, orbits
+from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, numbers_of, orbits
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["branch_at", "exact_mode_speeds", "jam_orbit"]
@@ -193,7 +194,23 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
     return fold_points(jammed_model(scene), _SEARCH)
 
 
-@cached(reversed_anew=True)
+def _from_orbit(
+    orbit: Orbit,
+    scene: Scene,
+    value: Array,
+    start: Array,
+    exists: Array,
+    direction: Array | None,
+    given: Parameter,
+    points: int,
+    *_: object,
+) -> Orbit:
+    """What follows from the motion, which is known; neither multipliers nor how good it is."""
+    untold = jax.tree.map(lambda _: None, orbit)
+    return dataclasses.replace(untold, **numbers_of(collected_model(jammed_model(scene)), orbit, value, start, given, points))
+
+
+@cached(from_result=_from_orbit)
 def _orbit(
     scene: Scene,
     value: Array,

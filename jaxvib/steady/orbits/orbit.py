@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import JammedModel
 from jaxvib.numerics.extrema import greatest
-from jaxvib.numerics.fourier import Grid, grid_of, synthesized
+from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
@@ -199,9 +199,7 @@ def orbits(
 
     def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
         motion = periodic_motion(model, grid, given, v, s, deviation)
-        branch = branch_tangent(model, grid, motion)
-        harmonics = harmonics_of(model, grid, motion, branch.receptance)
-        return motion, harmonics, (*branch[:-1], *_measured(model, grid, motion, harmonics))
+        return motion, *_numbers(model, grid, motion)
 
     if value.shape[0] == 1:  # a program without an axis of length one is a smaller one
         alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
@@ -255,6 +253,38 @@ def orbits(
         offsets=jnp.broadcast_to(model.offsets, (value.shape[0], model.loads.count)),
     )
     return orbit, growth
+
+
+def numbers_of(
+    model: CollectedModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
+) -> dict[str, Array]:
+    """Those fields of one orbit that follow from its motion, which is known: as `orbits` with the same arguments gave it, and
+    with the same derivatives; 0 where it gave none."""
+    grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
+    x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
+    deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
+    motion = periodic_motion(model, grid, given, value, x, deviation, is_known=True)
+    harmonics, (slope, _, _, _, amplitude, force, power, _) = _numbers(model, grid, motion)
+    fields = {
+        "omega": motion.omega,
+        "rotor_speed": motion.rotor_speed,
+        "slope": slope,
+        "amplitude": amplitude,
+        "foundation_force": force,
+        "power": power,
+        "deviation_harmonics": harmonics.deviation,
+        "displacement_harmonics": harmonics.displacement,
+        "force_harmonics": harmonics.force,
+    }
+    return {name: jnp.where(there, field, 0.0) for name, field in fields.items()}
+
+
+def _numbers(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
+    """Harmonics of one motion; slope of the branch, residual, errors of the rotor's speed and of the deviation, and what is
+    `_measured`."""
+    branch = branch_tangent(model, grid, motion)
+    harmonics = harmonics_of(model, grid, motion, branch.receptance)
+    return harmonics, (*branch[:-1], *_measured(model, grid, motion, harmonics))
 
 
 def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:

@@ -224,3 +224,24 @@ def test_loads_too_unlike_to_stay_together_are_not_called_stable():
         assert (vibration > need) == holds == bool(jam.stable), (vibration, need)
         assert jam.status_name == ("found" if holds else "apart") and float(jam.slope) > 0.0
         assert ("stable by slope" in jam.summary()) == holds and ("cannot stay together" in jam.summary()) != holds
+
+
+@pytest.mark.parametrize("friction", [False, True], ids=["drag", "friction"])
+def test_reverse_derivatives_at_known_jams_are_those_of_the_search(friction):
+    """Of numbers of all jams, of which some are absent, by every number of the scene; then of a fold as well."""
+    hung = jv.pendulums(count=2, mass=[0.8, 0.9], radius=0.12, drag=[1.5, 1.4], inertia=1e-3)
+    effects = jv.DryFriction(0.01, diameter=0.02) if friction else ()
+    s = jv.Scene(machines()["two_mass"], hung if friction else loads()["balls"], jv.ConstantSpeed(120.0), effects)
+    assert 0 < len(jv.jam_modes(s).mode_numbers()) < 5
+    weights = np.random.default_rng(0).normal(size=(5, 4))
+
+    def total(s, fold):
+        jams = jv.jam_modes(s)
+        numbers = jnp.stack([jams.omega, jams.slope, jams.amplitude[:, 1], jams.foundation_force], axis=1)
+        return jnp.nansum(weights * numbers) + (jams.folds.rotor_speed[1] if fold else 0.0)
+
+    for fold in (False,) if friction else (False, True):
+        ours, theirs = jax.grad(total)(s, fold), jax.jit(jax.grad(total), static_argnums=1)(s, fold)
+        for (path, a), b in zip(jax.tree.leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-7, err_msg=f"{path}")
+            assert np.all(np.isfinite(a))
