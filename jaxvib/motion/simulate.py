@@ -155,7 +155,7 @@ def simulate(
             return _in_stretches(scene, end, stretches, state, chosen, stretch)
         return stretch(end, state, chosen, wanted)
 
-    begun = time.perf_counter()
+    begun, estimated = time.perf_counter(), {}
     if isinstance(stepsize_controller, Accuracy):
         if not concrete:
             raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
@@ -167,11 +167,11 @@ def simulate(
         coarser = _coarser(control)
         both = (lambda: run(control)), (lambda: run(coarser, wanted=False))
         found, coarse = in_threads(lambda k: both[k](), 2) if progress_meter is None else [each() for each in both]
-        found = _compared(scene, fastest(), found, coarse, control, coarser, coarse.evaluations)
+        estimated = _compared(scene, fastest(), found, coarse, control, coarser, coarse.evaluations)
     if traced(found.steps):
-        return found
-    jax.block_until_ready((found.steps, found.error))
-    found = _with(found, seconds=time.perf_counter() - begun)
+        return dataclasses.replace(found, **estimated)
+    jax.block_until_ready((found.steps, estimated))
+    found = _with(found, seconds=time.perf_counter() - begun, **estimated)
     if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
     return found
@@ -232,12 +232,12 @@ def _compared(
     control: StepControl,
     coarser: StepControl,
     before: Array | np.ndarray,
-) -> Run:
-    """The finer run with its estimated error, and with what all cost: so many evaluations were made `before` it."""
+) -> dict[str, Array]:
+    """The estimated error of the finer run, and what all cost: so many evaluations were made `before` it."""
     theirs = coarse.window.state, coarse.status
     counted = fine.evaluations, before
     error, evaluations = _estimated(scene, fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
-    return dataclasses.replace(fine, error=error, evaluations=evaluations)
+    return {"error": error, "evaluations": evaluations}
 
 
 @cached
@@ -272,7 +272,7 @@ def _to_accuracy(scene: Scene, fastest: Array, run: Callable[[StepControl], Run]
     found, spent = before, known(before.evaluations)
     for _ in range(_ATTEMPTS - 1):
         latest = run(control)
-        found = _compared(scene, fastest, latest, before, control, coarse, spent)
+        found = dataclasses.replace(latest, **_compared(scene, fastest, latest, before, control, coarse, spent))
         if status_name(found.status) != "done":
             return found
         tolerance = float(cast(Array, control.tolerance))
@@ -291,8 +291,12 @@ def _to_accuracy(scene: Scene, fastest: Array, run: Callable[[StepControl], Run]
 
 
 def _with(run: Run, **values: Any) -> Run:
-    typed = {name: known(value).astype(getattr(run, name).dtype) for name, value in values.items()}
-    return dataclasses.replace(run, **on_device(typed))
+    """The run with these values, in the types of its own where they are numbers of Python."""
+
+    def typed(name: str, value: Any) -> Any:
+        return value if isinstance(value, Array) else np.asarray(value, getattr(run, name).dtype)
+
+    return dataclasses.replace(run, **on_device({name: typed(name, value) for name, value in values.items()}))
 
 
 def _stretches(scene: Scene, fastest: Callable[[], Array], end: Array, state: State, save: str) -> int:

@@ -162,10 +162,20 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
             failed.append(True)
             raise
 
-    with ThreadPoolExecutor(workers) as pool:
-        others: list[Future[None]] = []
-        with beginning(lambda: others.extend(pool.submit(work, k) for k in range(1, workers))):
+    others: list[Future[None]] = []
+    try:
+        with beginning(lambda: others.extend(_threads().submit(work, k) for k in range(1, workers))):
             work(0)
-        for other in others:
-            other.result()
+    finally:
+        begun = [other for other in others if not other.cancel()]
+        wait(begun)
+    for other in begun:
+        other.result()
     return [value for _, value in sorted(found, key=lambda each: each[0])]
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Those beside the caller's, which stay: to begin them anew takes longer than to hand them a run. Nobody waits for one that
+    has not begun, so that they may themselves ask for threads."""
+    return ThreadPoolExecutor(max(64, cores()))

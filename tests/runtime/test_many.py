@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from scenes import scene
 from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.runtime import many
 from jaxvib.runtime.cache import keep_programs
+from jaxvib.runtime.rehearsal import begin_others
 
 
 def test_items_are_taken_as_there_is_room_and_the_first_one_alone(monkeypatch):
@@ -101,6 +103,24 @@ def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
     with pytest.raises(KeyError, match="five"):
         many.in_chunks(1, computed, np.arange(1000.0))
     assert len(begun) < 30
+
+
+def test_nobody_waits_for_a_thread_that_has_not_begun(monkeypatch):
+    """Where all others are busy, with what asks for threads itself for example, the caller's computes everything."""
+    pool, free = ThreadPoolExecutor(1), threading.Event()
+    monkeypatch.setattr(many, "_threads", lambda: pool)
+    busy = pool.submit(free.wait)
+
+    def squared(k):
+        begin_others()
+        return k * k, threading.current_thread()
+
+    try:
+        assert many.in_threads(squared, 3) == [(k * k, threading.current_thread()) for k in range(3)]
+        assert not busy.done()
+    finally:
+        free.set()
+        pool.shutdown()
 
 
 def test_threads_have_the_options_of_the_caller():
