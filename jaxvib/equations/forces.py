@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import Dynamics, State, vector_field
@@ -13,6 +15,8 @@ from jaxvib.equations.sliding import dot, kinematics, missing_force
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.programs import cached
+from jaxvib.units import traced
 
 __all__ = ["energy", "foundation_force", "normal_force", "power"]
 
@@ -50,6 +54,16 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     its spin on its track, where effects free them. The time `t`, s, says where an ideal drive has its rotor; it matters to an
     imbalance alone.
     """
+    return _energy(scene, state, _at_time(t, state))
+
+
+def _at_time(t: Array | float, state: State) -> Any:
+    """A time as a number of a program: another one needs no other program."""
+    return jnp.asarray(t) if traced(t) else np.asarray(t, state.displacement.dtype)
+
+
+@cached
+def _energy(scene: Scene, state: State, t: Array) -> Array:
     carrier, loads = scene.machine.carrier(), scene.loads
     q, v = state.displacement, state.velocity
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
@@ -84,13 +98,18 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     return sum(parts[1:], parts[0])
 
 
-def power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
+def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Power that the rotor puts in, and power that dampers, drag and friction dissipate, W; dE/dt is their difference.
 
     P_in = speed T, T the motor's torque, or that which turns an ideal drive's rotor against loads, their spin and imbalance:
     T = sum_j M_j + d'(theta).P q'';    P_diss = q'.C q' + sum_j M_j (speed - phi_j') + what supports and contacts take,
     M_j = b_W R^2 (speed - phi_j') + friction. Loads that slide dissipate - F_t.c besides.
     """
+    return _power(scene, _at_time(t, state), state)
+
+
+@cached
+def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     carrier, loads = scene.machine.carrier(), scene.loads
     turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     field = vector_field(scene)
@@ -167,6 +186,11 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
     Source: Strautmanis et al. 2018, equation (10), with the acceleration of the rotor.
     """
+    return _normal_force(scene, _at_time(t, state), state)
+
+
+@cached
+def _normal_force(scene: Scene, t: Array, state: State) -> Array:
     pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
     if pressing is None:
         problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.pressing)"

@@ -17,6 +17,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
 
 __all__ = [
@@ -143,7 +144,12 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return linear_model(checked(scene)).modes()[0]
+    return _natural_frequencies(checked(scene))
+
+
+@cached
+def _natural_frequencies(scene: Scene) -> Array:
+    return linear_model(scene).modes()[0]
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:

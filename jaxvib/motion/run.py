@@ -34,9 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["Run", "RunStatus"]
 
 
-_named = cached(regime)
-
-
 @cached
 def _detached(scene: Scene, kept: Trajectory) -> Array:
     force = jax.vmap(lambda t, state: normal_force(scene, t, state))(kept.time, kept.state)
@@ -115,7 +112,7 @@ class Run(AbstractMeasured, Result):
     @property
     def regime(self) -> Regime:
         """What kind of motion the run has come to, see `Regime`."""
-        return _named(self.scene, self.window)
+        return regime(self.scene, self.window)
 
     @property
     def detached(self) -> Array:

@@ -104,13 +104,13 @@ def initial_state(
         if "simulate" not in advice:  # which is who asks
             raise
         raise InputError("start", f"is 'jam', but {error.field} {why}; start at 'rest', or from a State") from error
-    row, angle = modes.row(mode, throw=throw), phases(0.0)
+    row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(0.0)
     require_start(scene, (angle,))
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
 
 
 @cached
-def _in_jam(omega: Array, displacement: Array, row: int, angle: Array) -> State:
+def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: Array) -> State:
     """The motion of the jam in that row of all of them, the loads at these angles."""
     turned = displacement[row] * jnp.exp(1j * jnp.mean(angle))
     return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))

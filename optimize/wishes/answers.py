@@ -16,6 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
+from jaxvib.runtime.devices import known
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
@@ -145,8 +146,8 @@ class Answers:
 
     def jam_run(self, mode: int) -> Run:
         """The full equations, integrated from a jam mode for 60 periods of the lowest natural frequency."""
-        lowest = jnp.min(jax.lax.stop_gradient(natural_frequencies(self.scene)))
-        until = 60.0 * 2.0 * jnp.pi / lowest
+        frequencies = known(jax.lax.stop_gradient(natural_frequencies(self.scene)))
+        until = 60.0 * 2.0 * np.pi / frequencies.min()
         return self._run(("jam", mode), partial(simulate, self.scene, until, start="jam", mode=mode, save="window"))
 
     def keep_run(self, mode: int, run: Run) -> None:

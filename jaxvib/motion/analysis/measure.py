@@ -15,6 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
+from jaxvib.runtime.programs import cached
 
 __all__ = ["LEAST", "STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure", "unmeasured"]
 
@@ -215,6 +216,7 @@ def _away_from_zero(x: Array) -> Array:
     return jnp.where(jnp.abs(x) < tiny, tiny, x)
 
 
+@cached
 def relative_amplitude(stretch: Trajectory, i: int, j: int) -> Array:
     """Amplitude of platform `i` relative to platform `j` (counted from 1) over an evenly sampled stretch, m zero to peak."""
     x, v = (values[:, i - 1] - values[:, j - 1] for values in (stretch.state.displacement, stretch.state.velocity))

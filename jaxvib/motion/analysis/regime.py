@@ -17,6 +17,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.compat import enumeration_names
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.whirl import whirl
 
@@ -143,6 +144,11 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     >>> bool(run.regime.name == jv.RegimeName.jammed), int(run.regime.mode)
     (True, 1)
     """
+    return _regime(scene, stretch)
+
+
+@cached
+def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     times, state = stretch.time, stretch.state
     phi, rate = state.azimuth, state.azimuth_rate
     half = times.shape[0] // 2

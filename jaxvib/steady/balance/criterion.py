@@ -178,7 +178,7 @@ def criterion_table(result: Criterion) -> dict[str, Any]:
     """
     speeds = result.speeds
     lists = {
-        name: [float(w) for w in getattr(speeds, name) if not np.isnan(w)]
+        name: [float(w) for w in np.asarray(getattr(speeds, name)) if not np.isnan(w)]
         for name in ("resonances", "additional", "damped_resonances", "damped_additional")
     }
     intervals = {

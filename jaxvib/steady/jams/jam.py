@@ -137,12 +137,12 @@ class JamModes(AbstractJam):
         at this rotor speed; with `throw=False`, and under a JAX transformation, the status says so.
         """
         row = self.row(mode, throw=throw)
-        return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), row)
+        return _row(Jam(**{name: getattr(self, name) for name in Jam.__dataclass_fields__}), np.asarray(row, np.uint32))
 
     def summary(self) -> str:
         """A table a person can read; amplitudes zero to peak."""
-        lines = [f"rotor speed {float(self.rotor_speed[0]):.6g} rad/s, resonances "]
-        lines[0] += ", ".join(f"{float(w):.6g}" for w in self.resonances) + " rad/s"
+        lines = [f"rotor speed {np.asarray(self.rotor_speed)[0]:.6g} rad/s, resonances "]
+        lines[0] += ", ".join(f"{w:.6g}" for w in np.asarray(self.resonances)) + " rad/s"
         return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
@@ -154,7 +154,7 @@ class JamModes(AbstractJam):
 
 
 @cached
-def _row(jams: Jam, row: int) -> Jam:
+def _row(jams: Jam, row: Array | np.ndarray) -> Jam:
     return jax.tree.map(lambda leaf: leaf[row], jams)
 
 

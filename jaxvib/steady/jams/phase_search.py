@@ -71,7 +71,7 @@ class PhaseJams(AbstractPhaseJam):
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
             raise InputError("index", f"is {index!r}; there are {n} jams, counted from 0")
         fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
-        return PhaseJam(**jax.tree.map(lambda leaf: leaf[index], fields))
+        return _selected(PhaseJam(**fields), np.asarray(index, np.uint32))
 
     def follow(self, index: int, omega: Array) -> PhaseBranch:
         """The phase pattern of the jam of that place over load speeds `omega` (n,) rad/s, see `phase_branch`."""
@@ -218,6 +218,11 @@ def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
     """Whether the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
+
+
+@cached
+def _selected(jams: PhaseJam, index: Array | np.ndarray) -> PhaseJam:
+    return jax.tree.map(lambda leaf: leaf[index], jams)
 
 
 def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:

@@ -18,6 +18,7 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.orbits.collocation import (
     Harmonics,
@@ -28,6 +29,7 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
+from jaxvib.units import traced
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -100,30 +102,19 @@ class Orbit(Result):
         Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
         the motion.
         """
-        k, j = np.asarray(self.orders), np.asarray(self.deviation_orders)
-        wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
-        phi = theta + (self.deviation_harmonics @ lag_wave).real
-        rate = self.omega * (1.0 + (self.deviation_harmonics @ (1j * j * lag_wave)).real)
-        return (
-            (self.displacement_harmonics @ wave).real,
-            self.omega * (self.displacement_harmonics @ (1j * k * wave)).real,
-            (self.offsets + phi,),
-            (jnp.broadcast_to(rate, self.offsets.shape),),
-        )
+        return _at(self, theta if traced(theta) else np.asarray(theta, self.offsets.dtype))
 
     def relative_amplitude(self, i: int, j: int) -> Array:
         """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period."""
-        c = self.displacement_harmonics
-        return _swing(np.asarray(self.orders), c[i - 1 : i] - c[j - 1 : j])[0]
+        return _relative_amplitude(self.orders, self.displacement_harmonics, i, j)
 
     def force_peaks(self) -> Array:
         """The greatest force on the bed in each of 16 equal parts of the period, N, (16,); the largest is `foundation_force`,
         which bends where another one overtakes it. Of a force that does not turn its sign in half a period, or of two
         directions, `foundation_force` alone, (1,)."""
-        orders = np.asarray(self.orders)
-        if self.force_harmonics.shape[0] > 1 or np.any(orders % 2 == 0):
+        if self.force_harmonics.shape[0] > 1 or any(k % 2 == 0 for k in self.orders):
             return self.foundation_force[None]
-        return _peaks(orders, self.force_harmonics[0])
+        return _force_peaks(self.orders, self.force_harmonics)
 
     def summary(self) -> str:
         """A few lines a person can read; amplitudes zero to peak."""
@@ -160,6 +151,30 @@ class Orbit(Result):
             ("force on the bed, N", force, ["across", "up"][-force.shape[1] :]),
         ]
         return signals_chart(np.rad2deg(theta), panels, across="load angle Ωt, degrees", ax=ax)
+
+
+@cached
+def _at(orbit: Orbit, theta: Array | np.ndarray) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
+    k, j = np.asarray(orbit.orders), np.asarray(orbit.deviation_orders)
+    wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
+    phi = theta + (orbit.deviation_harmonics @ lag_wave).real
+    rate = orbit.omega * (1.0 + (orbit.deviation_harmonics @ (1j * j * lag_wave)).real)
+    return (
+        (orbit.displacement_harmonics @ wave).real,
+        orbit.omega * (orbit.displacement_harmonics @ (1j * k * wave)).real,
+        (orbit.offsets + phi,),
+        (jnp.broadcast_to(rate, orbit.offsets.shape),),
+    )
+
+
+@cached
+def _relative_amplitude(orders: tuple[int, ...], displacement: Array, i: int, j: int) -> Array:
+    return _swing(np.asarray(orders), displacement[i - 1 : i] - displacement[j - 1 : j])[0]
+
+
+@cached
+def _force_peaks(orders: tuple[int, ...], force: Array) -> Array:
+    return _peaks(np.asarray(orders), force[0])
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
