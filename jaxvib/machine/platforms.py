@@ -89,7 +89,7 @@ def _platforms(
         given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
         if not joined and given > 0:
             raise InputError(field, f"has {given} values; the machine has no links, leave it out or give links")
-        return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.zeros((0,), dtype=float)
+        return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.asarray(np.zeros(0), dtype=float)
 
     return Platforms(
         mass=numbers(mass, "kg", "machine.mass", n, low=0.0, open_low=True),

@@ -27,11 +27,13 @@ def known():
 
 
 CALLS = {
+    "scene": lambda _: scene("three_mass", "pendulums"),
     "natural_frequencies": lambda k: jv.natural_frequencies(k["scene"]),
     "mode_shapes": lambda k: jv.mode_shapes(k["scene"]),
     "energy": lambda k: jv.energy(k["scene"], k["state"], 0.5),
     "power": lambda k: jv.power(k["scene"], k["t"], k["state"]),
     "normal_force": lambda k: jv.normal_force(k["scene"], 0.5, k["state"]),
+    "stability": lambda k: k["states"].stability(),
     "regime": lambda k: jv.regime(k["scene"], k["window"]),
     "select": lambda k: k["jams"].select(5),
     "initial_state": lambda k: jv.initial_state(k["scene"], "jam", mode=5),

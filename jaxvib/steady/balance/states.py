@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -156,7 +156,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
 
 def _sides(loads: CircularLoads) -> np.ndarray:
-    return np.asarray(jnp.broadcast_to(loads.mass * loads.radius, (loads.count,)))
+    return np.broadcast_to(np.asarray(loads.mass) * np.asarray(loads.radius), (loads.count,))
 
 
 def _imbalance(scene: Scene) -> complex:
@@ -164,7 +164,8 @@ def _imbalance(scene: Scene) -> complex:
     thrown = [effect.imbalance(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
     static = [complex(*map(float, each.static)) for each in thrown if each is not None]
     moment = [complex(*map(float, each.moment)) for each in thrown if each is not None]
-    cg_offset = scene.machine.carrier().cg_offset
+    machine = scene.machine  # its form is known without computing its numbers
+    cg_offset = None if machine.structure().cg_offset is None else machine.carrier().cg_offset
     moment += [] if cg_offset is None else [float(cg_offset) * each for each in static]
     if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
         problem = (
@@ -242,7 +243,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
     """
     angles, neutral = _arrangement(scene, angles)
-    matrix = _monodromies(scene, jnp.asarray(angles), steps)
+    matrix = _monodromies(scene, angles, steps)
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
@@ -270,12 +271,12 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.
     padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
-    flows = _flows(at_constant_speed(scene), jnp.asarray(angles), jnp.asarray(padded), steps)[: flat.size]
+    flows = _flows(at_constant_speed(scene), angles, padded, steps)[: flat.size]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
 @cached
-def _flows(scene: Scene, angles: Array, speeds: Array, steps: int) -> Array:
+def _flows(scene: Scene, angles: Any, speeds: Any, steps: int) -> Array:
     def flow(speed: Array) -> Array:
         return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
 
@@ -332,7 +333,7 @@ def stability_changes(
 def _arrangement(scene: Scene, angles: ArrayLike | None) -> tuple[np.ndarray, int]:
     """Angles at which the loads are known to cancel, and how many neutral directions they have."""
     sides, imbalance = _sides(circular_loads(scene)), _imbalance(scene)
-    if not np.min(natural_frequencies(scene)) > 0.0:
+    if not np.min(np.asarray(natural_frequencies(scene))) > 0.0:
         problem = (
             "lets the machine drift: that motion neither grows nor dies, which hides whether the loads do; give it a support"
         )
@@ -362,16 +363,16 @@ def _require_undisturbed(scene: Scene, angles: np.ndarray) -> None:
 
 
 @cached
-def _disturbance(scene: Scene, angles: Array | np.ndarray) -> Array:
+def _disturbance(scene: Scene, angles: Any) -> Array:
     """The largest acceleration of a load, rad/s^2, in the balanced motion, at some turns of the rotor."""
     field, speed = vector_field(at_constant_speed(scene)), scene.drive.speed
 
     def acceleration(turn: Array) -> Array:
-        return jnp.max(jnp.abs(field(turn / speed, balanced_motion(scene, jnp.asarray(angles), turn)).azimuth_rate))
+        return jnp.max(jnp.abs(field(turn / speed, balanced_motion(scene, angles, turn)).azimuth_rate))
 
     return jnp.max(jax.vmap(acceleration)(jnp.arange(3.0)))
 
 
 @cached
-def _monodromies(scene: Scene, angles: Array, steps: int) -> tuple[Array, Array]:
+def _monodromies(scene: Scene, angles: Any, steps: int) -> tuple[Array, Array]:
     return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)
