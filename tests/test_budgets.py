@@ -7,10 +7,13 @@ more often than before: make it less, or raise the budget together with the reas
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from scenes import scene
 
 import jaxvib as jv
+from jaxvib.runtime import operations as counted
 from jaxvib.runtime.operations import operations
 
 SCENE = scene("two_mass", "balls")
@@ -66,3 +69,20 @@ def test_a_larger_program_is_noticed():
     """Traced twice, a question has twice the operations."""
     once = operations(field, SCENE.machine.stiffness)
     assert operations(lambda k: (field(k), field(2.0 * k)), SCENE.machine.stiffness) > 1.8 * once
+
+
+def two(x):
+    shared = jnp.exp(x)
+    found = [jnp.sin(shared), jnp.tan(x) * shared, jnp.log(x)]
+    return [found[0], found[2]]
+
+
+def test_operations_that_no_result_needs_are_left_out(monkeypatch):
+    """All operations stay where nobody may read programs."""
+    x = jnp.asarray(0.5)
+    few = counted.pruned(two, x)
+    assert operations(two, x) == 5 and operations(few, x) == 3 and few(x) == two(x)
+    slope = x * (jnp.cos(jnp.exp(x)) * jnp.exp(x) + 1.0 / x)
+    np.testing.assert_allclose(jax.vjp(few, x)[1]([x, x])[0], slope, rtol=1e-15)
+    monkeypatch.setattr(counted, "HAS_JAXPRS", False)
+    assert counted.pruned(two, x)(x) == two(x)
