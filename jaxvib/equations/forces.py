@@ -16,7 +16,6 @@ from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
-from jaxvib.units import traced
 
 __all__ = ["energy", "foundation_force", "normal_force", "power"]
 
@@ -59,7 +58,7 @@ def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
 
 def _at_time(t: Array | float, state: State) -> Any:
     """A time as a number of a program: another one needs no other program."""
-    return jnp.asarray(t) if traced(t) else np.asarray(t, state.displacement.dtype)
+    return t if isinstance(t, Array) else np.asarray(t, state.displacement.dtype)
 
 
 @cached

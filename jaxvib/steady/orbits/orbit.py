@@ -29,7 +29,6 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
-from jaxvib.units import traced
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -102,7 +101,7 @@ class Orbit(Result):
         Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
         the motion.
         """
-        return _at(self, theta if traced(theta) else np.asarray(theta, self.offsets.dtype))
+        return _at(self, theta if isinstance(theta, Array) else np.asarray(theta, self.offsets.dtype))
 
     def relative_amplitude(self, i: int, j: int) -> Array:
         """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period."""
