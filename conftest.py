@@ -78,8 +78,10 @@ def pytest_configure(config):
 @pytest.fixture(autouse=True, scope="module")
 def _stored():
     """A worker keeps what a module compiled no longer than the module: hundreds of programs fill gigabytes, and what a test
-    finds compiled depends on no other module."""
-    keep_programs(PROGRAMS)
+    finds compiled depends on no other module. Where `coverage` asks which lines run, all programs are traced: a stored one runs
+    none."""
+    measured = "coverage" in sys.modules and sys.modules["coverage"].Coverage.current() is not None
+    keep_programs(None if measured else PROGRAMS)
     yield
     keep_programs(None)
     for function in _functions:
