@@ -91,10 +91,36 @@ def _stored():
 
 
 @pytest.fixture(autouse=True)
-def _traced_anew(request):
-    """A test that changes parts of the package stores no program and finds none: their keys do not know of such changes."""
+def _stored_again():
+    """What a test chooses ends with it."""
     folder = program_folder()
-    if "monkeypatch" in request.fixturenames:
-        keep_programs(None)
     yield
     keep_programs(folder)
+
+
+class _Patch(pytest.MonkeyPatch):
+    """From where a test changes a part of the package it stores no program and finds none: their keys do not know of such
+    changes. Another folder, another environment are none."""
+
+    def setattr(self, *change, **how):
+        self._unknown()
+        super().setattr(*change, **how)
+
+    def delattr(self, *change, **how):
+        self._unknown()
+        super().delattr(*change, **how)
+
+    def setitem(self, *change):
+        self._unknown()
+        super().setitem(*change)
+
+    def _unknown(self):
+        if program_folder() == PROGRAMS:
+            keep_programs(None)
+
+
+@pytest.fixture
+def monkeypatch():
+    patch = _Patch()
+    yield patch
+    patch.undo()

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plugin_drive import Turbine
-from plugin_effect import SealFriction
-from plugin_load import TorusPoints
+from plugins.drive import Turbine
+from plugins.effect import SealFriction
+from plugins.load import TorusPoints
 from scenes import machines, published
 
 import jaxvib as jv

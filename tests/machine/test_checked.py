@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plugin_effect import SealFriction
+from plugins.effect import SealFriction
 from scenes import BALLS, machines, scene
 
 import jaxvib as jv

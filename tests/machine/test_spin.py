@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stored_jit import stored_jit
 from torus import MASS, OWN, RADIUS, SPEED, balls, published, scene, some_state
 from torus.rigid_ball import RigidBall
 
@@ -16,7 +17,7 @@ BOTH = (jv.FreeSpin(), jv.Sliding(0.1))
 GAP = 0.0025
 RIGID = RigidBall(MASS, OWN, RADIUS, GAP, SPEED, 9.81)
 
-evaluate = jax.jit(lambda s, t, state: jv.vector_field(s)(t, state))
+evaluate = stored_jit(lambda s, t, state: jv.vector_field(s)(t, state))
 
 
 def one_ball(*effects):
@@ -116,7 +117,7 @@ def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
     """On a rotor that gives way, with friction of all kinds: sliding, and in the last case sticking while a slip dies out."""
     s = scene((*published(1e-4), *effects), drag=0.2)
 
-    @jax.jit
+    @stored_jit
     def growth(t, state):
         change = jv.vector_field(s)(t, state)
         return jax.jvp(lambda t, y: energy(s, y, t), (t, state), (jnp.ones_like(t), change))[1], *power(s, t, state)
@@ -138,7 +139,7 @@ def test_derivatives_of_balls_that_spin_and_slide_are_the_differences():
     rng = np.random.default_rng(0)
     sizes = [rng.normal(size=np.shape(leaf)) * np.maximum(np.abs(leaf), 1e-3) for leaf in leaves]
 
-    @jax.jit
+    @stored_jit
     def field(leaves):
         change = jv.vector_field(jax.tree.unflatten(rest, leaves)[0])(0.2, jax.tree.unflatten(rest, leaves)[1])
         return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((change.velocity, change.rate, change.spin))])

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published, scene
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -41,7 +42,7 @@ def test_what_the_integrator_says_is_the_status(result, status):
 def test_a_lane_whose_start_does_not_exist_says_so():
     s = published(eps=1e-3).scene()
 
-    @eqx.filter_jit
+    @stored_jit
     @eqx.filter_vmap
     def lanes(speed):
         there = eqx.tree_at(lambda x: x.drive.speed, s, speed)
@@ -73,7 +74,7 @@ def test_a_lane_that_is_not_finite_does_not_keep_the_others_waiting():
         run = jv.simulate(there, 20.0, save="window")
         return run.status == jv.RunStatus.not_finite, run.steps, run.omega
 
-    bad, steps, omega = jax.jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan, 1.1]))
+    bad, steps, omega = stored_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan, 1.1]))
     assert bad.tolist() == [False, True, False] and np.isfinite(omega).tolist() == [True, False, True]
     assert int(jnp.max(steps)) < 2000
     with pytest.raises(jv.InputError, match=r"scene\.machine\.link_stiffness is nan; a finite number is needed"):

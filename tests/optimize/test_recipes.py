@@ -3,11 +3,11 @@
 from types import SimpleNamespace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import scene
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto, recipes
@@ -104,7 +104,7 @@ def test_the_middle_platform_rests_at_the_anti_resonance():
 @pytest.mark.slow
 def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
     found = retune(SCENE, force_per_amplitude(mode=3), starts=8)
-    asked = jax.jit(force_per_amplitude(mode=3).__call__)
+    asked = stored_jit(force_per_amplitude(mode=3).__call__)
     least = {}
     for name, _ in found:
         place = places_of(SCENE, name, "free")

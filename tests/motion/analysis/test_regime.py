@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
@@ -163,7 +164,9 @@ def test_stiff_dry_friction_by_an_implicit_solver():
 def test_regime_under_jit_and_vmap():
     s, stretch = made([0.0, 0.1, -0.1, 0.05], 170.0)
     once = jv.regime(s, stretch)
-    many = jax.jit(jax.vmap(lambda k: jv.regime(s, eqx.tree_at(lambda x: x.state.rate[0], stretch, k * stretch.state.rate[0]))))
+    many = stored_jit(
+        jax.vmap(lambda k: jv.regime(s, eqx.tree_at(lambda x: x.state.rate[0], stretch, k * stretch.state.rate[0])))
+    )
     found = many(jnp.array([1.0, 2.0]))
     assert np.all(found.name == once.name) and found.load_speed.shape == (2, 4)
 

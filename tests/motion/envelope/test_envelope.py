@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import published
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.envelope.envelope import _measure, _Tolerance
@@ -50,7 +51,7 @@ def test_a_rotor_that_is_alike_in_all_directions_is_followed_exactly():
     assert float(jnp.min(jnp.max(jnp.abs(full.state.displacement), axis=0))) > 1e-3
 
 
-@jax.jit
+@stored_jit
 def both(s, speed, end):
     """Brought up over the first 0.6 of the time: the full equations and the averaged ones."""
     s = spun_up(s, speed, 0.6 * end)
@@ -131,13 +132,13 @@ def test_gradients_by_three_routes():
         run = jv.envelope(spun_up(moved, 1.5 * x[7], 300.0), 500.0, adjoint=adjoint, **given)
         return run.amplitude @ jnp.asarray([30.0, 50.0]) + 20.0 * run.foundation_force + run.omega
 
-    @jax.jit
+    @stored_jit
     def forward(x):
         return jax.jvp(functools.partial(output, adjoint=diffrax.ForwardMode()), (x,), (along,))
 
     x = jnp.ones(8)
     _, slope = forward(x)
-    value, gradient = jax.jit(jax.value_and_grad(output))(x)
+    value, gradient = stored_jit(jax.value_and_grad(output))(x)
     np.testing.assert_allclose(gradient @ along, slope, rtol=1e-9)
     assert np.isfinite(gradient).all() and (np.abs(gradient) > 1e-3 * float(value)).all()
     up, down = (forward(x + h * along)[0] for h in (1e-4, -1e-4))
@@ -188,7 +189,7 @@ def test_a_batch_with_a_jam_that_is_absent_says_so():
         at = eqx.tree_at(lambda x: x.drive.speed, s, speed)
         return jv.envelope(at, 100.0, start="jam", mode=1, save="window")
 
-    runs = jax.jit(jax.vmap(run))(speeds)
+    runs = stored_jit(jax.vmap(run))(speeds)
     assert (runs.status == jv.EnvelopeStatus.done).tolist() == [True, False]
     assert (runs.status == jv.EnvelopeStatus.no_start).tolist() == [False, True]
     assert runs.trajectory is None and float(runs.drift[0]) < 1e-6
@@ -288,5 +289,5 @@ def test_a_lane_that_is_not_finite_ends_at_once():
         run = jv.envelope(there, 60.0, start="spin_up", save="window")
         return run.status == jv.EnvelopeStatus.not_finite, run.steps
 
-    bad, steps = jax.jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan]))
+    bad, steps = stored_jit(jax.vmap(one))(jnp.asarray([1.0, jnp.nan]))
     assert bad.tolist() == [False, True] and int(jnp.max(steps)) < 1000

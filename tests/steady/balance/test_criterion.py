@@ -10,6 +10,7 @@ import scipy.optimize
 from closed_forms import one_mass_speeds, three_mass_speeds, two_mass_functional, two_mass_speeds
 from gyroscopic_rotor import rotor
 from scenes import machines, scene
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
@@ -106,7 +107,7 @@ def test_order_of_ten_thousand_three_mass_machines():
     values["link_stiffness"] = rng.uniform(0.1, 9.0, (count, 3))
     base = scene("three_mass")
 
-    @jax.jit
+    @stored_jit
     @jax.vmap
     def speeds(values):
         machine = eqx.tree_at(lambda m: tuple(getattr(m, name) for name in values), base.machine, tuple(values.values()))
@@ -226,8 +227,8 @@ def speeds_of(values, name):
     return (speeds, r.shapes), speeds
 
 
-forward = jax.jit(jax.jacfwd(speeds_of, has_aux=True), static_argnums=1)
-reverse = jax.jit(jax.jacrev(speeds_of, has_aux=True), static_argnums=1)
+forward = stored_jit(jax.jacfwd(speeds_of, has_aux=True))
+reverse = stored_jit(jax.jacrev(speeds_of, has_aux=True))
 
 
 @pytest.mark.parametrize("name", ["two_mass", "three_mass"])

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from periodic import monodromy, ordered
 from scenes import machines, published
 from scipy.integrate import solve_ivp
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.orbits.floquet import _deflated, _small_solve
@@ -135,7 +136,7 @@ def test_load_mass_from_which_on_odd_modes_are_not_stable_everywhere(kind, betwe
 @pytest.mark.slow
 def test_gradient_of_the_largest_multiplier():
     flat, restore = ravel_pytree(gravity())
-    f = jax.jit(lambda x: jv.jam_orbit(restore(x), omega=60.0, points=33).multiplier)
+    f = stored_jit(lambda x: jv.jam_orbit(restore(x), omega=60.0, points=33).multiplier)
     direction = jnp.asarray(flat * np.random.default_rng(0).normal(size=flat.shape))
     forward, reverse = jax.jvp(f, (flat,), (direction,))[1], jax.grad(f)(flat)
     h = 1e-4

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.cli.app import run as command
@@ -151,9 +152,9 @@ def outcome(change, adjoint=None):
 
 
 def test_forward_derivatives_of_capture_time_and_of_what_is_left_of_the_imbalance():
-    evaluate = jax.jit(outcome)
+    evaluate = stored_jit(outcome)
     assert 0.01 < float(evaluate(AT)[0]) < 1.0 and len(NUMBERS) == 14
-    forward = np.asarray(jax.jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
+    forward = np.asarray(stored_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
     for k, name in enumerate([*NUMBERS, "initial speed"]):
         by = AT.at[k].set(STEP)
         difference = (np.asarray(evaluate(AT + by)) - np.asarray(evaluate(AT - by))) / (2.0 * STEP)
@@ -163,8 +164,8 @@ def test_forward_derivatives_of_capture_time_and_of_what_is_left_of_the_imbalanc
 
 @pytest.mark.slow
 def test_reverse_derivatives_are_the_forward_ones():
-    forward = jax.jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(outcome))(AT), forward, rtol=1e-7, atol=1e-9)
+    forward = stored_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT)
+    np.testing.assert_allclose(stored_jit(jax.jacrev(outcome))(AT), forward, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize(
