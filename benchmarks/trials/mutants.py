@@ -116,8 +116,8 @@ def _changes(node: ast.AST, place: str = "") -> Iterator[tuple[ast.expr, str, as
             func = _with(node.func, **{"attr" if isinstance(node.func, ast.Attribute) else "id": CALLS[name]})
             yield node, "function", _with(node, func=func)
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        if place == "index":
-            yield node, place, ast.Constant(node.value + 1)
+        if place == "index":  # one past the end of a JAX array is its last one
+            yield node, place, ast.Constant(node.value - 1 if node.value > 0 else 1)
         elif place == "factor" and FACTORS[0] <= abs(node.value) <= FACTORS[1]:
             yield node, place, ast.Constant(2 * node.value)
     if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):

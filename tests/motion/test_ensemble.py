@@ -106,6 +106,23 @@ def test_runs_that_are_all_the_same():
     np.testing.assert_allclose(same.state.angle[0], np.tile(first.state.angle[0][0], (3, 1)), rtol=1e-10)
 
 
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_one_number_alone_may_differ(place):
+    """Whichever it is of the first ones that a run is made of; the others are shared by all."""
+    given, structure = jax.tree.flatten(make({name: value[0] for name, value in values().items()}))
+
+    def other(share):
+        leaves = list(given)
+        leaves[place] = leaves[place] * share
+        return jax.tree.unflatten(structure, leaves)
+
+    run = lambda shares: jv.ensemble(other, jnp.asarray(shares), 5.0, stepsize_controller=jv.EqualSteps(100), estimate=False)  # noqa: E731
+    both = run([1.0, 1.3]).state.angle[0]
+    assert abs(float(both[0, 0] - both[1, 0])) > 1e-6
+    for k, share in enumerate((1.0, 1.3)):
+        np.testing.assert_allclose(both[k], run([share]).state.angle[0][0], rtol=1e-10)
+
+
 def test_other_values_need_no_new_program(caplog):
     """Neither with the number of steps that is chosen for them."""
 

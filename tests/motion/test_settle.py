@@ -132,6 +132,7 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
         run = jv.simulate(single[0], 3.0, start=single[1], save="window", estimate=False)
         phase, unbalance = run.regime.phase, run.regime.unbalance
     np.testing.assert_allclose(run.window.time[-1], 3.0, rtol=1e-6)
+    assert int(run.evaluations) > 10 * int(run.steps) > 0  # those of all stretches
     np.testing.assert_allclose(np.exp(1j * phase), np.exp(1j * exact.regime.phase), atol=1e-2)
     np.testing.assert_allclose(unbalance, exact.regime.unbalance, atol=1e-2)
     assert not np.allclose(np.exp(1j * phase), 1.0, atol=0.3)
@@ -179,6 +180,18 @@ def test_the_last_32_stretches_are_judged_or_more_where_they_are_shorter(monkeyp
     assert found.status_name == "beating" and seen == [(stretches, 5)] * 2
 
 
+@pytest.mark.parametrize("periods", [100, 30])
+def test_a_stretch_is_so_many_periods_of_the_slowest_resonance(monkeypatch, periods):
+    """In whole turns of the rotor, which is three of this machine's units fast."""
+    asked, run = [], small_run(save="window")
+    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda _, until, **__: asked.append(float(until)) or run)
+    jv.settle(small_machine(), start=small_start(), periods=periods, stretches=1, throw=False)
+    slowest, turn = float(np.min(jv.natural_frequencies(small_machine()))), 2.0 * np.pi / float(small_machine().drive.speed)
+    turns = asked[0] / turn
+    np.testing.assert_allclose(turns, round(turns), rtol=1e-9)
+    assert abs(asked[0] - 2.0 * np.pi * periods / slowest) <= turn
+
+
 def test_means_scatter_by_their_standard_errors():
     """Quarters of n values whose spread is 1: their means lie within 3.6 / sqrt(n) of each other where they do not move."""
     for n in (8, 32):
@@ -188,3 +201,11 @@ def test_means_scatter_by_their_standard_errors():
             shift = np.repeat([0.0, 0.0, 0.0, share * 3.6 / np.sqrt(n)], n)
             values = 5.0 + np.tile(spread, 4) + shift
             assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
+
+
+@pytest.mark.parametrize(("share", "steady"), [(0.45, True), (0.55, False)])
+def test_less_than_half_the_drift_is_not_seen(share, steady):
+    """Quarters that do not scatter, and the last of which is another by a share of the drift."""
+    drift = 1e-3 * np.resize([0.9, 1.1, 1.1, 0.9], 128)
+    values = 5.0 * (1.0 + share * np.median(drift) * np.repeat([0.0, 0.0, 0.0, 1.0], 32))
+    assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady

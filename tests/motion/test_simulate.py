@@ -161,7 +161,7 @@ class Asked(Exception):
     """What the engine was called with."""
 
 
-@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode()])
+@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()])
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
 def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, double, adjoint):
     """In single precision the engine's own, which alone keeps angles within a turn."""
@@ -178,7 +178,11 @@ def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, doub
         with pytest.raises(Asked) as plainly:
             run(jnp.asarray(3.0))
     (solver,) = found.value.args
-    assert isinstance(solver, LoopDopri8) and solver.tangents == (adjoint is not None) if double else solver is None
+    if double:
+        forward = isinstance(adjoint, diffrax.ForwardMode)
+        assert isinstance(solver, LoopDopri8) and (solver.tangents, solver.reuse) == (forward, forward or adjoint is None)
+    else:
+        assert solver is None
     assert plainly.value.args == (None,)
 
 

@@ -13,6 +13,7 @@ from jaxvib.ode import scalarize as module
 from jaxvib.ode.scalar_programs import fenced, without_repeats
 from jaxvib.ode.scalar_rules import primitive_of, rules, to_scalars
 from jaxvib.ode.scalarize import (
+    MAX_SCALARS,
     NotScalarizable,
     arrays_program,
     scalarize,
@@ -235,3 +236,14 @@ def test_on_arrays_sines_and_cosines_are_computed_once_together():
     assert names == ["add", "custom_jvp_call", "custom_jvp_call", "mul", "sin"]  # the last of a number of the program
     for ours, jaxs in zip(found, function(x), strict=True):
         np.testing.assert_allclose(ours, jaxs, rtol=0.0, atol=1e-15)
+
+
+def test_only_so_many_numbers_are_taken_apart():
+    """A product of each of a batch's arrays: an operation for each number, or one for all."""
+
+    def size(numbers):
+        run = scalarized_vmap(lambda x, factor: factor * x)
+        program = jax.make_jaxpr(lambda batch: run(batch, jnp.asarray(3.0)))(jnp.ones((2, numbers)))
+        return str(program).count(" mul ")
+
+    assert size(MAX_SCALARS) == MAX_SCALARS and size(MAX_SCALARS + 1) == 1

@@ -199,6 +199,13 @@ def test_folds_are_looked_for_on_both_sides_of_every_pole():
             assert np.max(away[1:] / away[:-1]) < 4.0 / 3.0
 
 
+def test_folds_are_looked_for_beyond_poles_that_only_decay():
+    """A strong damper's pole, at c/m, is far above all resonances."""
+    model = linear_model(two((2.0, 1.0), (8.0, 9.0), (0.04, 600.0), 0.0, 0.0, 1e-6, 0.7))
+    grid, resonances = folds.fold_points(model, 40)
+    assert float(resonances[-1]) < 4.0 and float(grid[-1]) > 600.0
+
+
 def test_two_folds_in_one_interval_are_found():
     """Slopes that touch 0 twice between two points, from above and from below; and one that stays away."""
     grid = jnp.linspace(0.0, 10.0, 21)

@@ -75,3 +75,12 @@ def test_an_undamped_resonance_has_no_amplitude_though_another_platform_rests():
     assert np.isnan(jam.displacement).all()
     beside = jam_at(jammed_model(alone), jnp.asarray(4), 1.01 * resonance, jnp.asarray(20.0), jnp.asarray(False))
     assert np.isfinite(beside.displacement).all()
+
+
+def test_amplitudes_are_bounded_beside_those_of_the_lightest_platform():
+    """Near an undamped resonance 1e12 times the imbalance over the lightest mass is an answer, however heavy another one is."""
+    machine = jv.two_mass(mass=(2e6, 1.0), stiffness=(8e6, 9.0), damping=(0.0, 0.0), link_stiffness=0.0, link_damping=0.0)
+    alone = jv.Scene(machine, jv.balls(count=1, mass=0.01, radius=0.1, drag=1e-3), jv.ConstantSpeed(20.0))
+    omega = jnp.sqrt(9.0 / 1.01) * (1.0 + 1e-12)
+    jam = jam_at(jammed_model(alone), jnp.asarray(4), omega, jnp.asarray(20.0), jnp.asarray(False))
+    assert np.isfinite(jam.displacement).all() and float(jnp.max(jnp.abs(jam.displacement))) > 1e11 * 0.01 * 0.1

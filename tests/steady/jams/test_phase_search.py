@@ -3,11 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxvib as jv
 from jaxvib.steady.jams import phase_search
-from jaxvib.steady.jams.phase_search import phase_branch
-from jaxvib.steady.jams.phases import phase_jam
+from jaxvib.steady.jams.phase_search import _equal_loads, _passes, phase_branch
+from jaxvib.steady.jams.phases import PhaseStatus, jam_from, parts_of, phase_jam
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
 SCENE = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
@@ -49,3 +50,44 @@ def test_a_branch_is_followed_from_its_jam_both_ways(monkeypatch):
     np.testing.assert_array_equal(omega, [*[150.0, 160.0, 168.0, 172.0][at:], *[150.0, 160.0, 168.0, 172.0][:at][::-1]])
     np.testing.assert_array_equal(anew, np.arange(4) == 4 - at)  # below the jam from its own phases again
     np.testing.assert_array_equal(branch.growth, branch.omega)
+
+
+@pytest.mark.parametrize("growth", [-100.0, -0.01, 2.0])
+def test_a_branch_has_the_jam_of_the_same_growth(growth):
+    """To a thousandth of it, however large it is."""
+    jam = phase_jam(SCENE, 165.0, jnp.zeros(2))
+    branch = phase_branch(SCENE, jam, jnp.atleast_1d(jam.omega))
+    branch = eqx.tree_at(lambda b: (b.growth, b.drag_factor), branch, (jnp.full(1, growth), jnp.ones(1)))
+    assert _passes(branch, 0, jnp.asarray(growth * (1.0 + 0.9e-3)))
+    assert not _passes(branch, 0, jnp.asarray(growth * (1.0 + 1.1e-3)))
+    assert not _passes(eqx.tree_at(lambda b: b.drag_factor, branch, jnp.full(1, 1.0002)), 0, jnp.asarray(growth))
+
+
+def test_loads_are_equal_that_are_alike_in_every_number():
+    loads = jv.pendulums(count=5, mass=0.05, radius=0.08, drag=0.04)
+    heavier, braked = jnp.array([0.05, 0.05, 0.05, 0.1, 0.05]), jnp.array([0.04, 0.08, 0.04, 0.04, 0.04])
+    loads = eqx.tree_at(lambda x: (x.mass, x.drag), loads, (heavier, braked))
+    groups = _equal_loads(parts_of(jv.Scene(MACHINE, loads, jv.ConstantSpeed(460.0))))
+    assert sorted(group.tolist() for group in groups) == [[0, 2, 4], [1], [3]]
+
+
+@pytest.mark.parametrize(("away", "status"), [(0.0, PhaseStatus.unbounded), (1e-12, PhaseStatus.with_rotor)])
+def test_loads_that_turn_with_the_rotor_at_an_undamped_resonance(away, status):
+    """The amplitude there is rounding, not an answer; beside it, it is one, also where a load is hardly unbalanced."""
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)
+    loads = jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04)
+    loads = eqx.tree_at(lambda x: x.mass, loads, jnp.array([0.05, 1e-7]))
+    speed = float(np.sqrt(1.16e6 / (37.0 + 0.05 + 1e-7))) * (1.0 + away)
+    jam = jam_from(jv.Scene(machine, loads, jv.ConstantSpeed(speed)), jnp.asarray(speed), jnp.zeros(2))
+    assert bool(jam.status == status)
+
+
+def test_more_starts_than_fit_are_refused():
+    """Each takes 64 bytes for each load at each load speed: how many fit into the memory is said."""
+    fit = []
+    for loads in (2, 6):
+        scene = jv.Scene(MACHINE, jv.pendulums(count=loads, mass=0.05, radius=0.08, drag=0.04), SCENE.drive)
+        with pytest.raises(jv.InputError, match="at most fit") as error:
+            jv.phase_jams(scene, starts=10**12)
+        fit.append(int(str(error.value).split("; ")[1].split()[0]))
+    np.testing.assert_allclose(fit[0] / fit[1], 3.0, rtol=1e-3)

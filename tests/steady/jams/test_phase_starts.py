@@ -64,6 +64,13 @@ def test_loads_together_need_the_drag_that_is_computed_by_hand(omega):
     np.testing.assert_allclose([factor, phase[1]], [each[0], 1.0], rtol=1e-9)
 
 
+def test_a_common_turn_of_the_start_changes_nothing():
+    p, start = parts(count=3), jnp.array([0.0, 0.4, -0.3])
+    at = at_speed(p, jnp.asarray(170.0))
+    for one, other in zip(phases_near(p, at, start), phases_near(p, at, start + 1.1), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-12)
+
+
 def test_a_load_alone_needs_what_it_needs():
     p = parts(count=1)
     factor, phase, residual = phases_near(p, at_speed(p, jnp.asarray(170.0)), jnp.array([2.0]))

@@ -6,7 +6,9 @@ import pytest
 from scenes import published
 
 import jaxvib as jv
+from jaxvib.equations.linear import linear_model
 from jaxvib.steady.orbits import diagram, jam_orbit
+from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.jam_orbit import _between
 from jaxvib.steady.orbits.orbit import _swing
 
@@ -72,3 +74,11 @@ def test_swings_miss_no_peak(orders):
     samples = np.fft.irfft(dense, axis=1) * 2**15
     lies_between = (samples.max(axis=1) - samples.min(axis=1)) / 2.0
     np.testing.assert_allclose(_swing(orders, jnp.asarray(harmonics)), lies_between, rtol=1e-6)
+
+
+def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
+    """Where gravity lets halves of the motion differ."""
+    half = published().scene()
+    whole = jv.Scene(half.machine, half.loads, half.drive, (jv.Gravity(9.81),))
+    few, many = (int(steps_for(linear_model(s), jnp.asarray(1.7), jnp.asarray(3.0))) for s in (half, whole))
+    assert few > 4 and 2 * few - 1 <= many <= 2 * few
