@@ -248,7 +248,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     """
     crowded, resonances = _fold_points(scene)
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
-    crowded = np.sort(np.append(crowded, target))
+    crowded = np.unique(np.append(crowded, target))  # twice the same point would look like a turn
     omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
     speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
     known = np.isfinite(speed)

@@ -6,7 +6,7 @@ import pytest
 from two_springs import FREE, SCENE, plain
 
 from optimize import DesignSpace, Quantity, hold
-from optimize.search.descent import STRETCH, descend
+from optimize.search.descent import STRETCH, _least, descend
 from optimize.search.problem import evaluate, problem_of
 
 STEPS, RATE = 45, 0.05
@@ -139,3 +139,11 @@ def test_two_things_that_are_held_are_kept_together():
     numbers = np.asarray(space.numbers(found.point.z[0])) / 1e4
     np.testing.assert_allclose(numbers, [least, 7.0 - least, 10.0 * least], rtol=0.01)
     assert np.all(np.abs(found.point.values[:, 1:]) < 1e-6)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-8, 1e-10])
+def test_what_hardly_changes_a_demand_is_not_sent_the_wrong_way(size):
+    """x = 1 meets size x = size; where that is rounding, what is between 0 and 1 does."""
+    found = _least(jnp.array([[size, 0.0]]), jnp.array([size]))
+    assert 0.0 < float(found[0]) <= 1.0 and float(found[1]) == 0.0
+    np.testing.assert_allclose(_least(jnp.array([[3.0, 4.0]]), jnp.array([5.0])), [0.6, 0.8], rtol=1e-12)

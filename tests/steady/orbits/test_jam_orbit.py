@@ -82,3 +82,11 @@ def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
     whole = jv.Scene(half.machine, half.loads, half.drive, (jv.Gravity(9.81),))
     few, many = (int(steps_for(linear_model(s), jnp.asarray(1.7), jnp.asarray(3.0))) for s in (half, whole))
     assert few > 4 and 2 * few - 1 <= many <= 2 * few
+
+
+def test_a_branch_is_looked_at_once_at_each_point(monkeypatch):
+    """On n = Omega, in whole numbers, some of them given several times; at the rotor speed itself nothing is left over."""
+    points = np.concatenate([np.ones(9), np.arange(1.0, jam_orbit._SEARCH + 1)])
+    monkeypatch.setattr(jam_orbit, "_fold_points", lambda scene: (points, jnp.array([2.0, 3.0])))
+    monkeypatch.setattr(jam_orbit, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))
+    assert jam_orbit.exact_mode_speeds(published(speed=30.0).scene()) == {5: 30.0}
