@@ -38,12 +38,7 @@ matplotlib.use("Agg")
 
 
 def pytest_configure(config):
-    """Each worker is a process of its own. Most of the suite's time is the compiler's, and nearly all its programs are run a
-    few times only: those are compiled without LLVM's optimizations, which takes half as long and changes a number in its last
-    digits. The slow tests run for long, and get the programs that users get; XLA_FLAGS=--xla_backend_optimization_level=3 gives
-    them to all."""
-    if "--xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", "") and config.option.markexpr == "not slow":
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
+    """Prepare the compiler in each worker, which is a process of its own, with the flags that users get."""
     prepare_cpu()
     with contextlib.suppress(OSError):  # a home that cannot be written to, other tests that remove the same
         PROGRAMS.mkdir(parents=True, exist_ok=True)
