@@ -1,4 +1,4 @@
-"""How fast small disturbances of a motion grow: whether its derivatives mean anything."""
+"""Growth of small disturbances of a motion: regular, unstable, chaotic, or not decided by the run."""
 
 from __future__ import annotations
 
@@ -32,24 +32,44 @@ if TYPE_CHECKING:
 
 __all__ = ["Growth", "GrowthStatus", "growth"]
 
-_THOUSANDFOLD = math.log(1e3)
-"""What a disturbance has to grow by, beyond doubt, for a motion to be called chaotic."""
+_THOUSANDFOLD, _DOUBLED = math.log(1e3), math.log(2.1)
+"""Logarithms of growth over the later half of a run: exponential beyond doubt; and the most that a growth in proportion to
+time can reach, with a margin."""
+
+_UNSEEN = math.log(1.01)
+"""Logarithm of a growth over the later half of a run that is not told from the errors of the integration."""
+
+_FADING = 0.85
+"""Largest ratio of the growth in the last quarter of a run to that in the quarter before it for a growth that is not
+exponential: in proportion to time it is 0.71, exponentially 1."""
+
+_RETURNED = 1e-2
+"""Distance of a motion from where it was at which it has returned, relative to the farthest that it went in between."""
+
+_TURNS, _SAMPLES = 3.0, 4096
+"""Turns of the slowest of rotor and loads in which a motion must return to count as periodic, and samples of that stretch."""
 
 
 class GrowthStatus(eqx.Enumeration):
-    """What becomes of small disturbances; the members are the sentences a user reads."""
+    """Growth of small disturbances; the members are the sentences a user reads."""
 
     regular = "small disturbances do not grow exponentially: derivatives of the motion mean what they say"
+    unstable = "the motion repeats itself and is unstable: small disturbances grow exponentially until it is left"
     chaotic = "small disturbances grow exponentially: derivatives of a run longer than the horizon mean nothing"
+    undecided = "the run is too short or too uneven to decide whether small disturbances grow exponentially: run longer"
 
 
 class Growth(Result):
-    """How small disturbances of a motion grow.
+    """Growth of small disturbances of a motion.
 
-    **Attributes**: `status` a `GrowthStatus`; `exponent` the largest Lyapunov exponent, 1/s, and its standard error
-    `uncertainty`, over the later half of the stretches; `horizon` s, after which rounding is as large as the motion itself,
-    ln(1/eps)/exponent, infinite for a regular motion: a derivative by a number of the scene has grown by 1/eps then, and says
-    nothing about a change that is larger than rounding; `rates` (stretches,) 1/s of each stretch, which end at `time` s.
+    **Attributes**
+
+    - `status`: a `GrowthStatus`
+    - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
+    - `horizon`: time in s after which rounding is as large as the motion itself, ln(1/eps)/exponent: a derivative with respect
+      to a number of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite
+      for a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
+    - `rates`: (stretches,) 1/s of each stretch, which end at `time` s
     """
 
     status: GrowthStatus
@@ -61,12 +81,13 @@ class Growth(Result):
 
     def summary(self) -> str:
         """The exponent and the horizon, for a person to read."""
-        lasts = "" if math.isinf(self.horizon) else f", horizon {self.horizon:.3g} s"
+        least = "at least " if self.status_name == "undecided" else ""
+        lasts = "" if math.isinf(self.horizon) else f", horizon {least}{self.horizon:.3g} s"
         return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{lasts}"
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """The rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
-        from jaxvib.draw.results import growth_chart  # slow to import: only who draws pays
+        """Draw the rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
+        from jaxvib.draw.results import growth_chart  # slow to import
 
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)
 
@@ -74,14 +95,25 @@ class Growth(Result):
 def growth(
     scene: Scene, until: Number, *, start: Start | State = "rest", mode: int | None = None, stretches: int = 40
 ) -> Growth:
-    """Estimates the largest Lyapunov exponent of a motion: how fast two motions part that begin next to each other.
+    """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions separate that begin close together.
 
         exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
 
     A second motion starts at the distance d_0 and is put back to it after each stretch, in the direction that it has come to
-    (Benettin's method). Derivatives of a run grow at the same rate: where it is positive, no derivative of a run that is longer
+    (Benettin's method). Derivatives of a run grow at the same rate: if it is positive, no derivative of a run that is longer
     than the horizon says anything, however exactly it is computed; ask for those of shorter runs, of averages over many
     starts, or of exact motions (`jam_orbit`).
+
+    The later half of the run decides, with G the logarithm of the growth over it and s its standard error:
+
+    - "chaotic" or "unstable": G > 3 s and G > ln 1000, at rates that agree in both quarters. The motion is unstable if it
+      returns to where it was within three turns of its rotor and loads, an unstable jam for example, whose exponent is
+      ln|multiplier| over the period of `jam_orbit`; a motion of several periods that is unstable counts as chaotic
+    - "regular": G + 3 s < ln 1000 and G < 2 s, or, if G < ln 2.1, the rates fade as those of a growth in proportion to time do
+    - "undecided": everything else, for example a rate that is certain in a run in which it does not reach ln 1000
+
+    A motion that leaves an unstable one during the run, as every motion does sooner or later for rounding, is judged by the
+    motion that it has come to.
 
     **Arguments**: `until` s or text, about how long all stretches are together; each is a whole number of turns of the rotor;
     `start`, `mode` as `simulate`; `stretches`, 8 at least: so many that motions a rounding apart are not far apart after one.
@@ -116,12 +148,14 @@ def growth(
             raise failure(run.status)
         return run
 
-    rng, rates, other = np.random.default_rng(0), [], None
-    for _ in range(stretches):
+    rng, rates, other, quarters = np.random.default_rng(0), [], None, []
+    for k in range(stretches):
         if other is None:  # not along the motion, where nothing grows
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
             other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, apart)
+        if k in (stretches // 2, 3 * stretches // 4):
+            quarters.append(state)
         first, second = run_on(state), run_on(other)
         scale = error_scale(first.window.state, unit)
         ours, theirs = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
@@ -131,22 +165,76 @@ def growth(
         state, gone = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, theirs)
         other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, apart)
     late = np.array(rates[stretches // 2 :])
-    exponent, uncertainty = float(np.mean(late)), float(np.std(late, ddof=1) / math.sqrt(late.size))
-    chaotic = exponent > 3.0 * uncertainty and exponent * stretch * late.size > _THOUSANDFOLD
-    horizon = math.log(1.0 / float(jnp.finfo(scene.drive.speed.dtype).eps)) / exponent if chaotic else math.inf
+    exponent, uncertainty = float(np.mean(late)), _sum_error(late) / late.size
+    name = _judged(late * stretch)
+    if name == "chaotic" and all(_returns(scene, quarter, steps) for quarter in quarters):
+        name = "unstable"
+    fastest = {"regular": 0.0, "undecided": exponent + 3.0 * uncertainty}.get(name, exponent)
+    horizon = math.log(1.0 / float(jnp.finfo(scene.drive.speed.dtype).eps)) / fastest if fastest > 0.0 else math.inf
     times = stretch * np.arange(1, stretches + 1)
-    status = member(GrowthStatus, "chaotic" if chaotic else "regular")
-    return Growth(status, exponent, uncertainty, horizon, np.array(rates), times)
+    return Growth(member(GrowthStatus, name), exponent, uncertainty, horizon, np.array(rates), times)
+
+
+def _judged(late: np.ndarray) -> str:
+    """Name of the `GrowthStatus` for logarithms `late` (n,) of the growth in each stretch of the later half of a run.
+
+    Periodic motions are not told from others here: "chaotic" stands for "unstable" too.
+    """
+    grown, error = float(np.sum(late)), _sum_error(late)
+    first, last = np.split(late, [late.size // 2])
+    rising = float(np.mean(last) - np.mean(first))
+    if grown > max(3.0 * error, _THOUSANDFOLD):
+        spread = math.hypot(*(_sum_error(quarter) / quarter.size for quarter in (first, last)))
+        return "chaotic" if abs(rising) < max(3.0 * spread, 0.25 * float(np.mean(late))) else "undecided"
+    fades = grown < _DOUBLED and float(np.mean(last)) < _FADING * float(np.mean(first))
+    seen = grown > max(2.0 * error, _UNSEEN)
+    return "regular" if grown + 3.0 * error < _THOUSANDFOLD and (fades or not seen) else "undecided"
+
+
+def _sum_error(values: np.ndarray) -> float:
+    """Standard error of the sum of values (n,) of which only neighbours are correlated.
+
+        s^2 = n c_0 + 2 (n - 1) c_1
+
+    c_k their autocovariances; at least that of one value. A motion whose phase differs from one end of a stretch to the next
+    gives logarithms of growth that are large and cancel each other.
+    """
+    off = values - np.mean(values)
+    each = float(np.sum(off**2)) / (values.size - 1)
+    return math.sqrt(max(values.size * each + 2.0 * float(np.sum(off[1:] * off[:-1])), each))
+
+
+def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
+    """True if the motion from `state` comes back to it within a few turns of rotor and loads."""
+    speed = float(scene.drive.speed)
+    turning = np.abs(np.asarray(state.azimuth_rate))
+    slowest = min([speed, *(float(w) for w in turning if w > 1e-2 * speed)])
+    run = simulate(
+        scene, _TURNS * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES, stepsize_controller=steps, estimate=False,
+        throw=False,
+    )  # fmt: skip
+    if run.trajectory is None or not bool(run.status == RunStatus.done):
+        return False
+    path = jax.tree.map(np.asarray, run.trajectory.state)
+    begin = jax.tree.map(lambda x: x[:1], path)
+    scale = error_scale(path, natural_units(scene))
+    parts = jax.tree.map(
+        lambda x, y, s: np.sum(((x - y) / s) ** 2, axis=tuple(range(1, x.ndim))), turned(path, begin), begin, scale
+    )
+    distance = np.sqrt(sum(jax.tree.leaves(parts)))
+    farthest = float(np.max(distance))
+    away = int(np.argmax(distance > 0.3 * farthest))
+    return float(np.min(distance[away:])) < _RETURNED * farthest
 
 
 def _distance(a: State, b: State, scale: State) -> float:
-    """The Euclidean distance of two states, each number relative to its part's scale."""
+    """Euclidean distance of two states, each number relative to its part's scale."""
     parts = jax.tree.leaves(jax.tree.map(lambda x, y, s: np.sum(((np.asarray(y) - np.asarray(x)) / s) ** 2), a, b, scale))
     return math.sqrt(float(sum(parts)))
 
 
 def _at_distance(a: State, b: State, scale: State, apart: float) -> State:
-    """The state at the distance `apart` from `a` towards `b`; of two that are one, that with the first number moved."""
+    """State at the distance `apart` from `a` towards `b`; if the two are equal, `a` with its displacements moved."""
     distance = _distance(a, b, scale)
     if distance == 0.0:
         return eqx.tree_at(lambda s: s.displacement, a, a.displacement + apart * scale.displacement)

@@ -1,4 +1,4 @@
-"""How disturbances grow: chaos is named, and its exponent is right."""
+"""Growth of disturbances: its exponent and its name, against attractors that are known and against Floquet multipliers."""
 
 import itertools
 from types import SimpleNamespace
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.motion.growth import _judged
 
 
 def forced(cubic, stiffness):
@@ -36,13 +37,94 @@ def test_a_linear_oscillator_is_regular():
     assert -0.026 < found.exponent < 1e-3
 
 
+def jammed(**numbers):
+    """One ball jammed at a resonance at 28.1 rad/s."""
+    values = {"damping": 100.0, "drag": 0.5, "speed": 60.0} | numbers
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=values["damping"])
+    loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=values["drag"])
+    return jv.Scene(machine, loads, jv.ConstantSpeed(values["speed"]))
+
+
+def on_orbit(scene, mode):
+    """The state on an exact jam, and its largest rate of growth by its multipliers, 1/s."""
+    orbit = jv.jam_orbit(scene, mode=mode)
+    rate = np.log(np.max(np.abs(orbit.multipliers))) * float(orbit.omega) / (2.0 * np.pi)
+    return jv.State(*orbit.at(jnp.zeros(()))), float(rate)
+
+
+@pytest.mark.parametrize("numbers", [{}, {"speed": 80.0, "drag": 0.4}])
+def test_an_unstable_jam_grows_as_its_multiplier(numbers):
+    scene = jammed(**numbers)
+    start, rate = on_orbit(scene, 2)
+    found = jv.growth(scene, 20.0 / rate, start=start, stretches=16)
+    assert found.status_name == "unstable"
+    np.testing.assert_allclose(found.exponent, rate, rtol=0.01)
+    np.testing.assert_allclose(found.horizon, -np.log(np.finfo(float).eps) / rate, rtol=0.01)
+
+
+@pytest.mark.parametrize(("until", "stretches"), [(1.0, 8), (2.0, 8), (3.0, 20)])
+def test_a_short_run_at_an_unstable_jam_is_undecided(until, stretches):
+    """Its rate is certain long before disturbances have grown a thousandfold."""
+    scene = jammed()
+    start, rate = on_orbit(scene, 2)
+    found = jv.growth(scene, until, start=start, stretches=stretches)
+    assert found.status_name == "undecided" and found.exponent > 3.0 * found.uncertainty
+    assert 0.7 < found.horizon * rate / -np.log(np.finfo(float).eps) < 1.0
+    assert "horizon at least" in found.summary()
+
+
+def test_a_jam_that_is_left_is_judged_by_where_it_leads():
+    """Rounding leaves the unstable jam after some 8 s; the later half of the run is at the stable one."""
+    scene = jammed()
+    found = jv.growth(scene, 40.0, start=on_orbit(scene, 2)[0], stretches=40)
+    assert found.status_name == "regular" and np.isinf(found.horizon)
+    np.testing.assert_allclose(found.rates[2:6], on_orbit(scene, 2)[1], rtol=0.01)
+
+
+@pytest.mark.parametrize("numbers", [{}, {"speed": 45.0}])
+def test_a_stable_jam_is_regular(numbers):
+    scene = jammed(**numbers)
+    start, rate = on_orbit(scene, 1)
+    found = jv.growth(scene, 10.0, start=start)
+    assert rate < 0.0 and found.status_name == "regular"
+
+
+def test_growth_in_proportion_to_time_is_regular():
+    """Two loads without drag that turn at speeds a little apart separate in proportion to time."""
+    scene = jammed(drag=0.0, damping=1e4)
+    start = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.full(1, 300.0),))
+    scene = eqx.tree_at(lambda s: s.loads.mass, scene, jnp.asarray(1e-9))
+    found = jv.growth(scene, 40.0, start=start)
+    assert found.status_name == "regular" and found.exponent > 3.0 * found.uncertainty
+    np.testing.assert_allclose(np.sum(found.rates[20:]) * found.time[0], np.log(2.0), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("late", "name"),
+    [
+        (np.full(20, 0.5), "chaotic"),
+        (np.full(20, 0.3), "undecided"),  # e^6: certain, but not a thousandfold
+        (np.full(20, 1e-5), "regular"),  # less than the integration's own errors
+        (np.random.default_rng(0).normal(0.1, 1.0, 20), "undecided"),  # the scatter hides a thousandfold growth
+        (np.tile([1.0, -1.0], 10) + 0.02, "regular"),  # cancels
+        (1.0 / np.arange(21, 41), "regular"),
+        (np.log1p(2.0 / np.arange(21, 41)), "undecided"),  # with the square of time
+        (np.geomspace(4.0, 1e-3, 20), "undecided"),  # a passage, after which nothing grows
+        (np.geomspace(0.05, 1e-4, 20), "regular"),
+    ],
+)
+def test_the_later_half_decides(late, name):
+    assert _judged(late) == name
+
+
 def test_angles_that_are_kept_within_a_turn_are_compared_across_its_end(monkeypatch):
     """In single precision of two motions that are 2 pi - 6.2 apart one may end at 3.1 rad, the other at -3.1 rad."""
     ends = itertools.cycle([3.1, -3.1])
 
     def run(scene, stretch, *, start, **_):
         end = eqx.tree_at(lambda s: s.angle, start, (jnp.full(1, next(ends)),))
-        return SimpleNamespace(status=jv.RunStatus.done, window=SimpleNamespace(state=jax.tree.map(lambda x: x[None], end)))
+        window = SimpleNamespace(state=jax.tree.map(lambda x: x[None], end))
+        return SimpleNamespace(status=jv.RunStatus.done, window=window, trajectory=None)
 
     monkeypatch.setattr("jaxvib.motion.growth.simulate", run)
     with jax.enable_x64(False):

@@ -97,7 +97,7 @@ def envelope(
 def growth(
     scene: Path, until: str, start: Start | None, mode: int | None, speed: str | None, stretches: int, output: Output
 ) -> None:
-    """How fast motions of SCENE part that begin next to each other: regular or chaotic, and what derivatives are worth."""
+    """Growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and after which time derivatives fail."""
     if start == "spin_up":
         raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
     begin = ("rest" if mode is None else "jam") if start is None else start
