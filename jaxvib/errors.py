@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["ComputationError", "InputError", "require_one_of", "written"]
+__all__ = ["ComputationError", "InputError", "require_one_of", "shown", "written"]
 
 
 class InputError(ValueError):
@@ -30,16 +30,32 @@ class InputError(ValueError):
         self.problem = problem
 
 
+def shown(value: object, longest: int = 60) -> str:
+    """Return the value as an error message quotes it: its representation, at most `longest` characters of one line.
+
+    >>> shown("left"), shown(10**5000)
+    ("'left'", 'a whole number of 16610 bits')
+    """
+    if isinstance(value, int) and abs(value).bit_length() > 1024:  # Python refuses to write numbers of more than 4300 digits
+        return f"a whole number of {abs(value).bit_length()} bits"
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # the representation is the user's code
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= longest else f"{text[: longest - 4].rstrip()} ..."
+
+
 def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str = "is") -> None:
-    """**Raises** `InputError` for a value that is none of the `allowed`.
+    """Check a choice. **Raises** `InputError` for a value that is not one of the `allowed` names.
 
     >>> require_one_of("left", ("above", "below"), "effects.stop.side")
     Traceback (most recent call last):
         ...
     jaxvib.errors.InputError: effects.stop.side is 'left'; allowed: above, below
     """
-    if value not in (allowed := tuple(allowed)):
-        raise InputError(field, f"{verb} {value!r}; allowed: {', '.join(allowed)}")
+    allowed = tuple(allowed)
+    if not isinstance(value, str) or value not in allowed:
+        raise InputError(field, f"{verb} {shown(value)}; allowed: {', '.join(allowed)}")
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """Numbers with units."""
 
+import datetime
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,8 @@ import pint
 import pytest
 
 import jaxvib as jv
-from jaxvib.units import _FACTORS, known_number, number, numbers, to_float
+from jaxvib.units import count, in_own_unit, known_number, number, numbers, to_float, unit_ratio
+from jaxvib.units.reading import _FACTORS
 
 
 @pytest.mark.parametrize(
@@ -28,6 +31,22 @@ from jaxvib.units import _FACTORS, known_number, number, numbers, to_float
         ("120 mm", "m", 0.12),
         ("2 min", "s", 120.0),
         ("5 kg cm^2", "kg m^2", 5e-4),
+        ("1500 min^-1", "rad/s", 50 * np.pi),
+        ("1500 1/min", "rad/s", 50 * np.pi),
+        ("1500 r/min", "rad/s", 50 * np.pi),
+        ("1500 U/min", "rad/s", 50 * np.pi),
+        ("1500 rev/min", "rad/s", 50 * np.pi),
+        ("1500 RPM", "rad/s", 50 * np.pi),
+        ("25 cps", "rad/s", 50 * np.pi),
+        ("25 rps", "rad/s", 50 * np.pi),
+        ("25hz", "rad/s", 50 * np.pi),
+        ("600 rpm", "Hz", 10.0),
+        ("600 1/min", "1/s", 10.0),
+        ("3 m rad^2/s^2", "m/s^2", 3.0),
+        ("40 Ns/m", "N s/m", 40.0),
+        ("2 kNm", "N m", 2e3),
+        ("5 kgm^2", "kg m^2", 5.0),
+        ("5 %", "", 0.05),
         ("4.4e4", "N/m", 4.4e4),
         (44, "N/m", 44.0),
         (np.float32(2.5), "kg", 2.5),
@@ -71,12 +90,81 @@ def test_pint_quantities_come_in():
         number(units.Quantity(3.0, "kg"), "N/m", "field")
 
 
-@pytest.mark.parametrize(
-    "text", ["1,5 N/m", "1 500 N/m", "1500 N/m 2", "N/m", "(1500 N/m", "1500 (N/m", "1500/0 N/m", "1.5 N/m,", ""]
-)
+@pytest.mark.parametrize("text", ["1 500 N/m", "1500 N/m 2", "N/m", "(1500 N/m", "1500 (N/m", "1500/0 N/m", "1.5 N/m,", ""])
 def test_text_that_only_looks_like_a_number_is_refused(text):
     with pytest.raises(jv.InputError, match=r"which is not in N/m; write for example '1.5 N/m'"):
         to_float(text, "N/m", "machine.stiffness")
+
+
+@pytest.mark.parametrize("text", ["25 s^-1", "25 1/s", "25 /s", "25 Bq", "25 count/s"])
+def test_a_speed_must_say_what_it_counts(text):
+    """Revolutions and radians per second differ by 2 pi, and 1/s is neither."""
+    with pytest.raises(jv.InputError, match=r"write (for example )?'1500 rpm', '157.1 rad/s' or '25 Hz'"):
+        to_float(text, "rad/s", "drive.speed")
+    with pytest.raises(jv.InputError, match="which is not in rad; write for example"):
+        to_float("5 percent", "rad", "apart")
+
+
+def test_a_decimal_comma_has_its_own_message():
+    with pytest.raises(jv.InputError, match=r"'1,5 N/m', with a comma; write '1\.5 N/m' for a decimal comma, else '15 N/m'"):
+        to_float("1,5 N/m", "N/m", "machine.stiffness")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        True,
+        np.True_,
+        jnp.asarray(True),
+        1j,
+        np.asarray([1.0 + 0.0j]),
+        jnp.asarray(1.0 + 0.0j),
+        np.ma.masked,
+        np.ma.array([1.0], mask=[True]),
+        datetime.date(2020, 1, 1),
+        np.datetime64("2020-01-01"),
+        np.timedelta64(3, "s"),
+        b"12",
+        None,
+        [[1.0]],
+        {1.0},
+        np.asarray(["12"]),
+        np.asarray([None], dtype=object),
+        10**400,
+        10**5000,
+        "1" * 400,
+        object(),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_finite_real_number_is_refused(value):
+    with pytest.raises(jv.InputError, match=r"^mass(\[0\])? (is|has) .{1,90}; "):
+        number(value, "kg", "mass")
+    with pytest.raises(jv.InputError, match=r"^mass(\[0\])? (is|has) .{1,90}; "):
+        numbers([value], "kg", "mass", 1)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 1.0, "3", None, 0, 10**12, 10**400, -(10**5000), [2]], ids=type)
+def test_a_count_is_a_whole_number_that_an_array_can_have(value):
+    with pytest.raises(jv.InputError, match=r"^samples is .{1,90}; it must be a whole number"):
+        count(value, "samples", each=8.0)
+
+
+def test_units_compare_as_what_they_count():
+    """A frequency in hertz is 2 pi times itself in rad/s; radians have no dimension beside lengths."""
+    assert unit_ratio("Hz", "rad/s") == pytest.approx(2.0 * np.pi, rel=1e-15)
+    assert unit_ratio("rad/s", "Hz") == pytest.approx(0.5 / np.pi, rel=1e-15)
+    assert unit_ratio("rps", "Hz") == pytest.approx(1.0) and unit_ratio("m rad/s", "m/s") == 1.0
+    assert unit_ratio("1/s", "rad/s") is None and unit_ratio("nonsense", "m") is None
+
+
+def test_a_text_has_its_own_unit_in_si():
+    assert in_own_unit("2 mm", "x") == (0.002, "meter") and in_own_unit("3", "x") == (3.0, "")
+    np.testing.assert_allclose(in_own_unit("10 Hz", "x")[0], 20.0 * np.pi, rtol=1e-15)
+    assert in_own_unit("10 Hz", "x")[1] == in_own_unit("600 rpm", "x")[1] == "radian / second"
+    for text in ("", "3 nonsense", "3,4 mm", "nan", "1 " + "m" * 10**6):
+        with pytest.raises(jv.InputError, match=r"^x is "):
+            in_own_unit(text, "x")
 
 
 def test_hertz_count_as_turns_in_every_power():

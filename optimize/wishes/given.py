@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from functools import lru_cache
 
-from jaxvib.units import Number, number
+from jaxvib.units import Number, number, unit_ratio
 
 __all__ = ["arguments", "number_in", "same_unit"]
 
@@ -23,18 +23,13 @@ def arguments(function: Callable[..., object]) -> int:
 
 @lru_cache(maxsize=256)
 def same_unit(one: str, other: str) -> bool:
-    """Whether two units are one."""
+    """True if two units are the same, for example "N" and "kg m/s^2"; hertz and rad/s are not."""
     if one == other:
         return True
-    import pint  # half a second, and most units are written alike
-
-    units = pint.get_application_registry()
-    try:
-        return abs(float((1.0 * units(one or "dimensionless")).m_as(other or "dimensionless")) - 1.0) < 1e-12
-    except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError):
-        return False
+    ratio = unit_ratio(one, other)
+    return ratio is not None and abs(ratio - 1.0) < 1e-12
 
 
 def number_in(value: Number, unit: str, name: str) -> float:
-    """A number or text in a unit."""
+    """Return a number, or a text with a unit, in a unit. **Raises** `InputError` as `jaxvib.units.number` does."""
     return float(number(value, unit, name))

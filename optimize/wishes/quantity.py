@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
@@ -10,11 +9,12 @@ from typing import Literal, TypeAlias
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, require_one_of, shown
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
-from jaxvib.units import Number
+from jaxvib.units import Number, in_own_unit
+from jaxvib.units import Quantity as UnitQuantity
 from optimize.wishes.answers import Answers
 from optimize.wishes.given import arguments, number_in, same_unit
 
@@ -133,10 +133,9 @@ class Quantity:
         return Combined(f"negative {self.name}", self.unit, mode=self.mode, of=self.of, operation="neg", parts=(self,))
 
     def __pow__(self, power: float) -> Quantity:
-        if not isinstance(power, (int, float)) or isinstance(power, bool):
-            raise InputError(self.name, f"is raised to {power!r}; give a plain number")
+        power = number_in(power, "", f"the power of {self.words}")
         unit = f"({self.unit})**{power:g}" if self.unit else ""
-        return _made("**", f"({self.words})^{power:g}", unit, self, _constant(float(power), ""))
+        return _made("**", f"({self.words})^{power:g}", unit, self, _constant(power, ""))
 
     def __lt__(self, other: Operand) -> Demand:
         return Demand.of(self, other, "at most")
@@ -300,20 +299,13 @@ def _constant(value: float, unit: str) -> Combined:
 
 
 def _with_unit(value: Operand, name: str) -> Quantity:
-    """A quantity of what is given: a number has no unit, a text such as "2 mm" its own, in SI."""
+    """Return a value as a quantity: a number has no unit, a text such as "2 mm" its own, in SI."""
     if isinstance(value, Quantity):
         return value
-    if isinstance(value, str):
-        import pint
-
-        try:
-            given = pint.get_application_registry().Quantity(value).to_base_units()
-            return replace(_constant(float(given.magnitude), str(given.units)), name=value.strip())
-        except (pint.PintError, AttributeError, TypeError, ValueError, AssertionError) as error:
-            raise InputError(name, f"is combined with {value!r}, which is no number with a unit") from error
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(name, f"is combined with {value!r}; give a quantity, a finite number or text with a unit")
-    return _constant(float(value), "")
+    if isinstance(value, (str, UnitQuantity)):
+        magnitude, unit = in_own_unit(value, f"the value beside {name}")
+        return replace(_constant(magnitude, unit), name=str(value).strip())
+    return _constant(number_in(value, "", f"the value beside {name}"), "")
 
 
 def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
@@ -322,9 +314,17 @@ def _made(operation: str, name: str, unit: str, *parts: Quantity) -> Combined:
     return Combined(name, unit, mode=mode, of=of, operation=operation, parts=parts)
 
 
+def _term(value: Operand, unit: str, name: str) -> Quantity:
+    """Return an operand of a sum as a quantity: a text is read in the unit of the quantity beside it, as a limit is."""
+    if isinstance(value, Quantity) or not isinstance(value, (str, UnitQuantity)):
+        return _with_unit(value, name)
+    return replace(_constant(number_in(value, unit, f"the value beside {name}"), unit), name=str(value).strip())
+
+
 def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
-    names = [x.words if isinstance(x, Quantity) else repr(x) for x in (one, other)]
-    left, right = _with_unit(one, names[1]), _with_unit(other, names[0])
+    names = [x.words if isinstance(x, Quantity) else shown(x) for x in (one, other)]
+    unit = next(x.unit for x in (one, other) if isinstance(x, Quantity))
+    left, right = (_term(x, unit, name) for x, name in zip((one, other), names[::-1], strict=True))
     if not same_unit(left.unit, right.unit):
         raise InputError(
             f"{names[0]} {sign} {names[1]}",

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scenes import scene
 
+from jaxvib import InputError
 from optimize import Quantity, amplitude, foundation_force, largest, least
 from optimize.wishes.answers import Answers
 from optimize.wishes.quantity import Asking, Demand
@@ -88,7 +89,7 @@ def test_units_and_words_of_expressions():
 
 @pytest.mark.parametrize("wrong", [True, float("inf"), None, [1.0]])
 def test_what_is_no_number_is_refused(wrong):
-    with pytest.raises(ValueError, match="give a quantity, a finite number or text with a unit"):
+    with pytest.raises(ValueError, match=r"the value beside a is .*(write a number in|finite number|one number)"):
         A + wrong
     with pytest.raises(ValueError, match="give one quantity or several"):
         largest(A, 3.0)
@@ -125,3 +126,31 @@ def test_what_asks_knows_its_tiers():
     assert len(asked) == 1
     parted = Asking("p", "", function, settings=(7,), parted=lambda answers, sign, tier, seven: sign * jnp.array([1.0, seven]))
     np.testing.assert_array_equal(parted.pieces(Answers(SCENE), -1.0), [-1.0, -7.0])
+
+
+@pytest.mark.parametrize("text", ["10 Hz", "600 rpm", "600 1/min", "10 rps", "62.83185307179586 rad/s"])
+def test_a_text_in_a_sum_is_read_in_the_quantitys_unit(text):
+    speed = constant("speed", 100.0, "rad/s")
+    np.testing.assert_allclose((speed - text)(SCENE), 100.0 - 20.0 * np.pi, rtol=1e-14)
+    np.testing.assert_allclose((text + speed)(SCENE), 100.0 + 20.0 * np.pi, rtol=1e-14)
+    np.testing.assert_allclose((speed < text).constant, 20.0 * np.pi, rtol=1e-14)
+
+
+def test_a_ratio_to_a_text_in_hertz_counts_turns():
+    speed = constant("speed", 100.0, "rad/s")
+    assert (speed / "10 Hz").unit == ""
+    np.testing.assert_allclose((speed / "10 Hz")(SCENE), 5.0 / np.pi, rtol=1e-14)
+
+
+def test_hertz_and_radians_per_second_are_not_compared():
+    speed, frequency = constant("speed", 100.0, "rad/s"), constant("frequency", 10.0, "Hz")
+    for wrong in (lambda: frequency < speed, lambda: speed > frequency, lambda: speed - frequency):
+        with pytest.raises(InputError, match=r"rad/s"):
+            wrong()
+    np.testing.assert_allclose((frequency < "600 rpm").constant, 10.0, rtol=1e-14)
+    np.testing.assert_allclose((frequency - "62.83185307179586 rad/s")(SCENE), 0.0, atol=1e-14)
+
+
+def test_an_acceleration_is_compared_across_radians():
+    size, speed = constant("size", 2e-3, "m"), constant("speed", 100.0, "rad/s")
+    assert (size * speed**2 < "2 m/s^2").constant == 2.0

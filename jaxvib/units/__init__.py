@@ -1,13 +1,11 @@
-"""Numbers with units come in here and nowhere else; inside, everything is SI."""
+"""Numbers of users: their units are read here and nowhere else; inside, everything is SI."""
 
 from __future__ import annotations
 
 import math
 import os
-import re
-import tokenize
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,41 +13,25 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, shown
 from jaxvib.runtime.compat import traced
+from jaxvib.units.reading import Number, Numbers, Quantity, in_own_unit, require_real, to_float, unit_name, unit_ratio
 
-__all__ = ["FIELD_UNITS", "Number", "Numbers", "count", "known_number", "number", "numbers", "to_float", "traced"]
-
-
-@runtime_checkable
-class Quantity(Protocol):
-    """A number with a unit, such as pint's."""
-
-    def m_as(self, units: str, /) -> Any:
-        """Its magnitude in a unit."""
-        ...
-
-
-Number: TypeAlias = float | Array | np.ndarray | np.number | str | Quantity
-"""A number as public functions accept it: a float, an array, a traced value, a string with a unit, a pint quantity."""
-
-Numbers: TypeAlias = Number | Sequence[Number]
-"""Several of them, or one that stands for all."""
-
-
-_TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\W\d_](?:(?!\s\d)[^,;()])*)")
-"""One number with a decimal point, then one unit: everything else a unit library might make a number of is a slip."""
-
-_FACTORS = {
-    "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
-    "N/m": {"N/m": 1.0, "N/mm": 1e3, "kN/m": 1e3, "kN/mm": 1e6},
-    "N s/m": {"N s/m": 1.0, "N s/mm": 1e3, "kN s/m": 1e3},
-    "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
-    "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
-}
-"""What most drawings are written in. pint reads everything else, and takes half a second to get ready for it."""
+__all__ = [
+    "FIELD_UNITS",
+    "Number",
+    "Numbers",
+    "Quantity",
+    "count",
+    "in_own_unit",
+    "known_number",
+    "number",
+    "numbers",
+    "require_real",
+    "to_float",
+    "traced",
+    "unit_ratio",
+]
 
 FIELD_UNITS = {
     "mass": "kg",
@@ -65,65 +47,8 @@ FIELD_UNITS = {
 """The unit of each number of a scene that a design may free or hold."""
 
 
-_UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
-"""What pint, which reads a unit as Python, raises beside its own errors for a text that is none."""
-
-
-def _unit_name(unit: str) -> str:
-    return unit or "no unit"
-
-
-def _example(unit: str) -> str:
-    return "'1500 rpm', '157.1 rad/s' or '25 Hz'" if unit == "rad/s" else f"'1.5 {unit}'" if unit else "1.5"
-
-
-def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
-    """The SI magnitude of `value` in `unit`; numbers without a unit are taken to be in `unit` already.
-
-    Strings and pint quantities are converted. A frequency in hertz given where rad/s is wanted counts as
-    revolutions per second (pint alone would take 25 Hz for 25 rad/s).
-
-    **Raises** `InputError` for a text that is no number, an unknown unit or a unit of another dimension.
-
-    >>> round(to_float("1500 rpm", "rad/s", "drive.speed"), 4)
-    157.0796
-    >>> round(to_float("25 Hz", "rad/s", "drive.speed"), 4)
-    157.0796
-    >>> to_float("3 kg", "N/m", "machine.stiffness")
-    Traceback (most recent call last):
-        ...
-    jaxvib.errors.InputError: machine.stiffness is '3 kg', which is not in N/m; write for example '1.5 N/m'
-    """
-    if isinstance(value, bool):
-        raise InputError(field, f"is {value}, which is not a number; write a number in {_unit_name(unit)}")
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            pass
-    if isinstance(value, (str, Quantity)):
-        wrong = InputError(field, f"is {str(value)!r}, which is not in {_unit_name(unit)}; write for example {_example(unit)}")
-        parts = _TEXT.fullmatch(value.strip()) if isinstance(value, str) else None
-        if isinstance(value, str) and parts is None:
-            raise wrong
-        if parts is not None and parts[2] in _FACTORS.get(unit, ()):
-            return float(parts[1]) * _FACTORS[unit][parts[2]]
-        import pint
-
-        try:
-            given: Any = value if parts is None else pint.get_application_registry().Quantity(float(parts[1]), parts[2])
-            magnitude = given.m_as(unit or "dimensionless")
-        except (pint.PintError, *_UNREADABLE) as error:
-            raise wrong from error
-        hertz = sum(power for name, power in given.unit_items() if name.endswith("hertz"))
-        return magnitude * (2.0 * math.pi) ** hertz if "rad" in unit else magnitude
-    if value is None or isinstance(value, (dict, set)):
-        raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}")
-    return value
-
-
 def _checked(value: Array | np.ndarray, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
-    """Value checks, for concrete numbers only: a traced value has none to look at."""
+    """Check known values; a traced one has no value yet."""
     if traced(value):
         return
     flat = np.atleast_1d(np.asarray(value))
@@ -151,7 +76,7 @@ def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf
     """`number` as NumPy has it where JAX does not yet: it goes to a program with the call, in a tenth of the time that moving
     it there first takes."""
     if isinstance(value, (list, tuple)):
-        raise InputError(field, f"is a list of {len(value)} values; one number in {_unit_name(unit)} is needed")
+        raise InputError(field, f"is a list of {len(value)} values; one number in {unit_name(unit)} is needed")
     return _converted(to_float(value, unit, field), unit, field, (), low, open_low)
 
 
@@ -174,11 +99,11 @@ def numbers(
     >>> numbers(["44 N/mm", 5e4], "N/m", "machine.stiffness", 2).tolist()
     [44000.0, 50000.0]
     """
-    if isinstance(value, Sequence) and not isinstance(value, str):
+    if isinstance(value, Sequence) and not isinstance(value, (str, bytes, bytearray)):
         parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         for i, part in enumerate(parts):
             if np.ndim(part) != 0:
-                raise InputError(f"{field}[{i}]", f"is not a single number; write a number in {_unit_name(unit)}")
+                raise InputError(f"{field}[{i}]", f"is not a single number; write a number in {unit_name(unit)}")
         if length is not None and len(parts) != length:
             raise InputError(field, f"has {len(parts)} values; {length} are needed")
         if not parts:
@@ -189,7 +114,8 @@ def numbers(
         known = not any(isinstance(part, jax.Array) for part in parts)
         stacked = np.asarray(parts, dtype=float) if known else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
         return _array(stacked, unit, field, stacked.shape, low, open_low)
-    magnitude = to_float(value, unit, field)
+    single: Any = value
+    magnitude = to_float(single, unit, field)
     if np.ndim(magnitude) == 0:
         scalar = _array(magnitude, unit, field, (), low, open_low)
         if shared or length is None:
@@ -215,12 +141,18 @@ def _converted(
         else:
             with np.errstate(over="ignore"):  # what single precision cannot hold is infinite, which `_checked` refuses
                 array = np.asarray(value, dtype=float).astype(jnp.result_type(float))
+    except OverflowError as error:
+        raise InputError(field, f"is {shown(value)}, which is too large; give a number below 1e308") from error
     except (TypeError, ValueError) as error:
-        raise InputError(field, f"is {value!r}, which is not a number; write a number in {_unit_name(unit)}") from error
+        raise InputError(field, f"is {shown(value)}, which is not a number; write a number in {unit_name(unit)}") from error
     if array.shape != shape:
-        raise InputError(field, f"has shape {array.shape}; one number in {_unit_name(unit)} is needed")
+        raise InputError(field, f"has shape {array.shape}; one number in {unit_name(unit)} is needed")
     _checked(array, field, unit, low, open_low, place="each" if shape else "")
     return array
+
+
+_MAX_COUNT = 2**31 - 1
+"""The largest count: arrays are indexed by numbers of 32 bits on accelerators."""
 
 
 def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
@@ -233,11 +165,13 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
         ...
     jaxvib.errors.InputError: loads.count is 0; it must be a whole number, at least 1
     """
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < low:
-        raise InputError(field, f"is {value!r}; it must be a whole number, at least {low}")
-    if each and value * each > 2.0**30:
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < low:
+        raise InputError(field, f"is {shown(value)}; it must be a whole number, at least {low}")
+    if each and 2.0**30 / each < value < 2**63:
         room = 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2.0**33
         if value * each > room:
             needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of this machine's memory"
             raise InputError(field, f"is {value}, which {needs}; {int(room / each)} at most fit")
+    if value > _MAX_COUNT:
+        raise InputError(field, f"is {shown(value)}; it must be a whole number from {low} to {_MAX_COUNT}")
     return int(value)

@@ -1,0 +1,271 @@
+"""Units: texts and pint quantities as SI numbers."""
+
+from __future__ import annotations
+
+import math
+import numbers as numbers_of
+import re
+import tokenize
+from collections.abc import Sequence
+from decimal import Decimal
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError, shown
+
+__all__ = ["Number", "Numbers", "Quantity", "in_own_unit", "require_real", "to_float", "unit_name", "unit_ratio"]
+
+
+@runtime_checkable
+class Quantity(Protocol):
+    """A number with a unit, such as pint's."""
+
+    def m_as(self, units: str, /) -> Any:
+        """Its magnitude in a unit."""
+        ...
+
+
+Number: TypeAlias = float | Array | np.ndarray | np.number | str | Quantity
+"""A number as public functions accept it: a float, an array, a traced value, a string with a unit, a pint quantity."""
+
+Numbers: TypeAlias = Number | Sequence[Number]
+"""Several of them, or one that stands for all."""
+
+
+_TEXT = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(\s*[^\W\d_]|\s+1\s*/|\s*[%°])((?:(?!\s\d)[^,;()])*)")
+"""One number with a decimal point, then one unit, which may begin with "1/": other texts are mistakes, even those that a unit
+library could evaluate."""
+
+_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*(?:[^\W\d_%°][^,;()]*)?")
+
+_SPELLINGS = {
+    **dict.fromkeys(("RPM", "Rpm", "r/min", "U/min", "rev/min"), "rpm"),
+    **dict.fromkeys(("cps", "rps", "r/s", "U/s", "rev/s"), "turn/s"),
+    "hz": "Hz",
+    "HZ": "Hz",
+    "khz": "kHz",
+}
+"""Other spellings of units of speed, as on rating plates and in catalogues."""
+
+_PER_MINUTE = ("1/min", "min^-1", "min**-1", "min⁻¹")
+"""Spellings that are turns only where a speed is needed."""
+
+_JOINED = {
+    "Ns": "N s",
+    "kNs": "kN s",
+    "Nms": "N m s",
+    "Nm": "N m",
+    "kNm": "kN m",
+    "Nmm": "N mm",
+    "kgm": "kg m",
+    "kgmm": "kg mm",
+}
+"""Products that are often written without a space; pint reads "Nm" as a number of meters per gram."""
+
+_JOINED_PATTERN = re.compile(rf"(?<![^\W\d_])({'|'.join(_JOINED)})((?:\^|\*\*)\d|[²³])?(?![^\W\d_])")
+
+_FACTORS = {
+    "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "N/m": {"N/m": 1.0, "N/mm": 1e3, "kN/m": 1e3, "kN/mm": 1e6},
+    "N s/m": {"N s/m": 1.0, "N s/mm": 1e3, "kN s/m": 1e3},
+    "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
+    "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
+}
+"""What most drawings are written in. pint reads everything else, and takes half a second to get ready for it."""
+
+_UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
+"""What pint, which reads a unit as Python, raises beside its own errors for a text that is none."""
+
+
+def unit_name(unit: str) -> str:
+    return unit or "no unit"
+
+
+def _example(unit: str) -> str:
+    return "'1500 rpm', '157.1 rad/s' or '25 Hz'" if unit == "rad/s" else f"'1.5 {unit}'" if unit else "1.5"
+
+
+def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray | np.number:
+    """Return the SI magnitude of `value` in `unit`; numbers without a unit are in `unit` already.
+
+    Strings and pint quantities are converted. A frequency in hertz counts as revolutions per second if `unit` has an angle in
+    it (pint alone would take 25 Hz for 25 rad/s); "1500 1/min" is 1500 rpm there, and a bare 1/s is refused.
+
+    **Raises** `InputError` for a text that is no number, an unknown unit, a unit of another dimension, and for what is no
+    real number (`require_real`).
+
+    >>> round(to_float("1500 rpm", "rad/s", "drive.speed"), 4)
+    157.0796
+    >>> round(to_float("25 Hz", "rad/s", "drive.speed"), 4)
+    157.0796
+    >>> to_float("3 kg", "N/m", "machine.stiffness")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: machine.stiffness is '3 kg', which is not in N/m; write for example '1.5 N/m'
+    """
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+        text = value.strip()
+        parts = _TEXT.fullmatch(text) if len(text) < 100 else None
+        if parts is None:
+            if len(text) < 100 and _COMMA.fullmatch(text):
+                point, none = shown(text.replace(",", ".")), shown(text.replace(",", ""))
+                raise InputError(field, f"is {shown(value)}, with a comma; write {point} for a decimal comma, else {none}")
+            raise _wrong_unit(value, unit, field)
+        magnitude, written = float(parts[1]), (parts[2] + parts[3]).strip()
+        factor = _FACTORS.get(unit, {}).get("rpm" if written in _PER_MINUTE else _SPELLINGS.get(written, written))
+        if factor is not None:
+            return magnitude * factor
+        return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
+    if isinstance(value, Quantity):
+        return _magnitude(value, unit, field, str(value))
+    require_real(value, unit, field)
+    return value
+
+
+def require_real(value: object, unit: str, field: str) -> None:
+    """Check that a value is a real number or an array of real numbers: the one check of all numbers of users.
+
+    **Raises** `InputError` for Booleans, complex numbers, dates, masked values, bytes, lists, None and objects that are no
+    number.
+
+    >>> require_real(True, "kg", "machine.mass")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: machine.mass is True, which is not a number; write a number in kg
+    """
+    if type(value) is float or type(value) is int:
+        return
+    kind = getattr(value, "dtype", None)
+    if np.ma.is_masked(value):
+        raise InputError(field, "has masked values; fill them in or leave them out")
+    if getattr(kind, "kind", "O") == "O":
+        entries = np.asarray(value, dtype=object).ravel() if isinstance(value, np.ndarray) else (value,)
+        real = all(isinstance(each, (numbers_of.Real, Decimal)) and not isinstance(each, (bool, np.bool_)) for each in entries)
+    else:
+        assert kind is not None
+        real = kind.kind != "m" and (jnp.issubdtype(kind, np.floating) or jnp.issubdtype(kind, np.integer))
+    if not real and not (kind is None and hasattr(value, "__jax_array__")):
+        raise InputError(field, f"is {shown(value)}, which is not a number; write a number in {unit_name(unit)}")
+
+
+def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
+    """Return the error about a text that is not in `unit`, None for a text without a readable unit of its own."""
+    wanted = "no number with a unit" if unit is None else f"not in {unit}" if unit else "no plain number"
+    return InputError(
+        field, f"is {shown(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
+    )
+
+
+def _parsed(unit: str) -> Any:
+    """Return pint's unit for a text. **Raises** what `_UNREADABLE` and pint list."""
+    import pint
+
+    name = _SPELLINGS.get(unit, unit)
+    return pint.get_application_registry().Unit(
+        _JOINED_PATTERN.sub(lambda found: f"({_JOINED[found[1]]}{found[2] or ''})", name) or "dimensionless"
+    )
+
+
+def _quantity(magnitude: float, written: str, value: str, unit: str | None, field: str) -> Any:
+    """Return a pint quantity for a number and the text of its unit. **Raises** `InputError` for a text that is no unit."""
+    import pint
+
+    try:
+        return pint.get_application_registry().Quantity(magnitude, _parsed(written))
+    except (pint.PintError, *_UNREADABLE) as error:
+        raise _wrong_unit(value, unit, field) from error
+
+
+def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
+    """Return the magnitude of a pint quantity, written as `text`, in `unit`. **Raises** `InputError` for another dimension,
+    and for a bare 1/s where a speed is needed."""
+    import pint
+
+    require_real(given.m, unit, field)
+    try:
+        registry, wanted = pint.get_application_registry(), _parsed(unit)
+        units = registry.Unit(str(given.units))
+        (rest, angle, hertz), (wanted_rest, wanted_angle, wanted_hertz) = _roots(units), _roots(wanted)
+        if wanted_angle + wanted_hertz and units == registry.Unit("1/min"):
+            given, angle = registry.Quantity(given.m, "rpm"), 1.0
+        if rest != wanted_rest:
+            raise _wrong_unit(text, unit, field)
+        magnitude = given.m_as(str(wanted))
+    except (pint.PintError, *_UNREADABLE) as error:
+        if isinstance(error, InputError):
+            raise
+        raise _wrong_unit(text, unit, field) from error
+    if angle + hertz == wanted_angle + wanted_hertz:  # hertz count as turns on both sides
+        return magnitude * (2.0 * math.pi) ** (hertz - wanted_hertz)
+    if angle != wanted_angle and not rest.keys() - {"second"}:
+        if unit == "rad/s":
+            raise InputError(field, f"is {shown(text)}, which does not say what it counts; write {_example(unit)}")
+        raise _wrong_unit(text, unit, field)
+    return magnitude
+
+
+def _roots(units: Any) -> tuple[dict[str, float], float, float]:
+    """Return the powers of the base units of a pint unit other than angles, the power of its angles, and that of hertz."""
+    import pint
+
+    _, roots = pint.get_application_registry().get_root_units(units)
+    powers = {name: float(power) for name, power in roots._units.items()}
+    angle = powers.pop("radian", 0.0)
+    return powers, angle, float(sum(power for name, power in units._units.items() if name.endswith("hertz")))
+
+
+def unit_ratio(one: str, other: str) -> float | None:
+    """Return the value of 1 `one` in `other`, None for units of different dimensions; hertz are turns beside angles.
+
+    >>> round(unit_ratio("Hz", "rad/s"), 3), unit_ratio("kg", "N")
+    (6.283, None)
+    """
+    import pint
+
+    try:
+        return float(_magnitude(pint.get_application_registry().Quantity(1.0, _parsed(one)), other, "unit", one))
+    except (InputError, pint.PintError, *_UNREADABLE):
+        return None
+
+
+def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
+    """Return the magnitude and the SI unit of a text or a pint quantity in its own dimension; hertz become rad/s.
+
+    **Raises** `InputError` for a text that is no number with a unit.
+
+    >>> in_own_unit("2 mm", "limit")
+    (0.002, 'meter')
+    """
+    import pint
+
+    given: Any = value
+    if isinstance(value, str):
+        parts = _TEXT.fullmatch(value.strip()) if len(value) < 100 else None
+        if parts is None:
+            return _finite(to_float(value, "", field), field), ""
+        given = _quantity(float(parts[1]), (parts[2] + parts[3]).strip(), value, None, field)
+    require_real(given.m, "", field)
+    try:
+        _, _, hertz = _roots(pint.get_application_registry().Unit(str(given.units)))
+        given = given.to_base_units() * pint.get_application_registry().Quantity(2.0 * math.pi, "rad") ** hertz
+        magnitude = _finite(given.m, field)
+    except (pint.PintError, *_UNREADABLE) as error:
+        if isinstance(error, InputError):
+            raise
+        raise _wrong_unit(str(value), None, field) from error
+    return magnitude, "" if given.unitless else str(given.units)
+
+
+def _finite(value: Any, field: str) -> float:
+    if not math.isfinite(value):
+        raise InputError(field, f"is {shown(float(value))}; a finite number is needed")
+    return float(value)
