@@ -10,12 +10,14 @@ import pathlib
 import shutil
 import sys
 import threading
+import unittest.mock
 
 import equinox as eqx
 import jax
 import matplotlib
 import pytest
 
+from jaxvib import imported
 from jaxvib.runtime import startup
 from jaxvib.runtime.cache import keep_programs, program_folder
 from jaxvib.runtime.cpu import prepare_cpu
@@ -24,7 +26,9 @@ from jaxvib.runtime.stored import _functions, _sources
 # Modules, those of the tests too, are compiled to bytecode once, not in every worker and every process that a test starts.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-startup.start = lambda: None  # what it does is done here
+with pytest.MonkeyPatch.context() as environment:  # what it does is done here
+    environment.setenv("JAXVIB_AUTOMATIC", "off")
+    startup.start()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Workers share what they trace and compile, and so do clones: keys of programs hold the sources, the flags and the versions.
@@ -112,6 +116,13 @@ class _Patch(pytest.MonkeyPatch):
     def _unknown(self):
         if program_folder() == PROGRAMS:
             keep_programs(None)
+
+
+@pytest.fixture
+def unwatched():
+    """What a test replaces in the package keeps no program from being stored: it is about storing, not about physics."""
+    with unittest.mock.patch.object(imported._imports, "definitions", {}):
+        yield
 
 
 @pytest.fixture

@@ -5,6 +5,8 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+import jaxvib.imported  # noqa: F401  before all other modules, which it watches
+
 
 def _homes() -> dict[str, str]:
     """The module each public name lives in: the imports of the stub beside this file, which type checkers read too."""

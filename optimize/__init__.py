@@ -1,5 +1,6 @@
 """Design: what may change, what is wanted, who searches."""
 
+import jaxvib  # noqa: F401  before all other modules, which it watches
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto
 from optimize.space import DesignSpace, Held, hold

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.imported import code_state
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import beneath, traced
 from jaxvib.runtime.devices import arrays_on_device
@@ -231,7 +232,7 @@ def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Ar
     numbers, pullback, found = jax.vjp(function, *moving, has_aux=True)
     form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, numbers))
     with _noting:
-        _pullbacks[question, active, _types(arrays)] = form
+        _pullbacks[code_state(), question, active, _types(arrays)] = form
         while len(_pullbacks) > _MOST:
             _pullbacks.popitem(last=False)
     return found, pullback
@@ -246,10 +247,11 @@ _noting = threading.Lock()
 
 def _traced_pullback(question: _Question, active: tuple[bool, ...], types: Any) -> tuple[Skeleton, tuple[Any, ...]]:
     """The reverse derivative without the numbers it needs, and zeros of the kind of what it is a function of."""
-    if (question, active, types) not in _pullbacks:  # `_noted` came from the disk
+    key = code_state(), question, active, types
+    if key not in _pullbacks:  # `_noted` came from the disk
         arrays = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in types]
         jax.eval_shape(lambda *known: _pullback(question, active, known)[0], *arrays)
-    return _pullbacks[question, active, types]
+    return _pullbacks[key]
 
 
 def _types(arrays: Sequence[Array]) -> tuple[tuple[tuple[int, ...], str, bool], ...]:

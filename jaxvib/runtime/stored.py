@@ -29,6 +29,7 @@ import numpy as np
 from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
+from jaxvib.imported import CodeState, code_state, digest_of_sources, forget_derived
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, no_places
 from jaxvib.runtime.cpu import processor
@@ -64,7 +65,9 @@ class StoredFunction(Generic[T]):
     last are held in memory, others are read or traced again.
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
-    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices.
+    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices. In a
+    process whose code is not that of the sources (see `jaxvib.imported`) no program is stored or read. As soon as that is
+    noticed, nothing that was traced of the former code is used again.
     """
 
     def __init__(self, function: Callable[..., T]):
@@ -81,13 +84,15 @@ class StoredFunction(Generic[T]):
         if folder is None or is_debugging():
             return self._jitted(leaves, treedef)
         home = _home(leaves)
-        asked = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
+        question = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
+        asked = (_current_code(), question)
         try:
             program = self.ready.get(asked, _UNKNOWN)
         except TypeError:  # an argument without a hash
             return self._jitted(leaves, treedef)
         if program is _UNKNOWN:
             with self.lock:
+                asked = (_current_code(look=True), question)
                 program = self.ready.get(asked, _UNKNOWN)
                 if program is _UNKNOWN:
                     program = self.ready[asked] = self._program(folder, arrays_on_device(leaves), treedef, home)
@@ -110,6 +115,8 @@ class StoredFunction(Generic[T]):
 
     def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
         """From the disk, or traced and written there; None where this call has no program that could be stored."""
+        if not code_state().is_on_disk:
+            return None
         try:
             path = folder / f"{self.function.__name__}-{self._key(leaves, treedef)}.program"
             return _read(path, home) or self._write(path, leaves, treedef, home)
@@ -130,7 +137,7 @@ class StoredFunction(Generic[T]):
     def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
         structure: list[Description] = []
         # Not the arrays of this call, which would live as long as the program.
-        given = Skeleton.of(leaves, treedef)
+        given, state = Skeleton.of(leaves, treedef), code_state()
 
         def flat(*arrays: Array) -> list[Array]:
             args, kwargs = given.filled(arrays)
@@ -148,6 +155,8 @@ class StoredFunction(Generic[T]):
                 raise
             return _Program.of(jitted, structure[0])
         program = _Program.of(_compiled(path, exported, home), structure[0], exported, is_new=True)
+        if code_state(look=True) != state:  # it changed while it was traced
+            return program
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
         with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
@@ -316,14 +325,32 @@ def _digest(content: bytes) -> str:
 @functools.cache
 def _sources() -> str:
     """Changes whenever a line of the code that programs are traced from does."""
-    package = Path(__file__).parents[1]
-    packages = [package, package.parent / "optimize"]
-    files = [file.read_bytes() for each in packages for file in sorted(each.rglob("*.py"))]
     versions = [importlib.metadata.version(name) for name in _PACKAGES]
-    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {_digest(b''.join(files))}"
+    return f"{versions} {os.environ.get('EQX_ON_ERROR')} {digest_of_sources()}"
 
 
 @functools.cache
 def _machine() -> str:
     """What a program is compiled for."""
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
+
+
+_coding = threading.RLock()
+_coded = [code_state()]
+"""The state of the code of which JAX holds traced functions."""
+
+
+def _current_code(*, look: bool = False) -> CodeState:
+    """The state of the code, see `code_state`; after a change nothing that was traced or derived of the former code is held."""
+    state = code_state(look=look)
+    if state != _coded[0]:
+        with _coding:
+            if state != _coded[0]:
+                forget_derived()
+                eqx.clear_caches()
+                jax.clear_caches()
+                _coded[0] = state
+    return state
+
+
+_sources()  # before the modules that are imported after this one can change

@@ -59,7 +59,7 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
     assert len(begun) < 30
 
 
-def test_other_threads_begin_as_soon_as_a_program_that_has_run_before_runs_again(monkeypatch, tmp_path):
+def test_other_threads_begin_as_soon_as_a_program_that_has_run_before_runs_again(monkeypatch, tmp_path, unwatched):
     """Of a new program nobody else runs anything while the first one is at work; of a known one others do."""
     monkeypatch.setattr(many, "cores", lambda: 2)
     keep_programs(tmp_path)
@@ -162,9 +162,11 @@ import jaxvib as jv
 jv.prepare_cpu(3)
 jv.use_cache({str(tmp_path)!r})
 import jax, jax.numpy as jnp
+from jaxvib import imported
 from jaxvib.runtime import many, programs
 assert many.shared_devices() == [None]  # processors are one, however they are divided
 many.shared_devices = jax.local_devices
+imported._imports.definitions.clear()  # as `unwatched`
 
 def doubled(x):
     return 2.0 * x

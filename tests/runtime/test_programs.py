@@ -41,7 +41,7 @@ def plain(x, shift=SHIFT):
 
 
 @pytest.fixture(params=[None, from_wave], ids=["noted", "from result"])
-def asked(tmp_path, monkeypatch, request):
+def asked(tmp_path, monkeypatch, unwatched, request):
     """A function that asks as another process would: no program is held in memory, those on disk are."""
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
     monkeypatch.setitem(globals(), "wave", programs.cached(from_result=request.param)(wave))

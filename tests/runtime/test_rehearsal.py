@@ -12,7 +12,7 @@ traces = []
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, unwatched):
     traces.clear()
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
     cache.keep_programs(tmp_path)

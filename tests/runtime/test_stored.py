@@ -18,6 +18,7 @@ from scenes import scene
 
 import jaxvib as jv
 import optimize
+from jaxvib import imported
 from jaxvib.runtime import cache, programs, stored, structure
 from jaxvib.steady.jams import jam
 
@@ -44,7 +45,7 @@ def with_callback(x):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch, unwatched):
     traces.clear()
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
     cache.keep_programs(tmp_path)
@@ -168,12 +169,14 @@ for count in range(1, 3001):
 @pytest.mark.parametrize("module", [jam, jv, optimize])
 def test_the_key_holds_every_source_and_the_versions(module, monkeypatch):
     """A module of any folder, and those at the top of both packages."""
-    text, read, changed = stored._sources(), pathlib.Path.read_bytes, pathlib.Path(module.__file__)
+    text, opened, changed = stored._sources(), pathlib.Path.open, pathlib.Path(module.__file__)
     assert importlib.metadata.version("jaxlib") in text and importlib.metadata.version("diffrax") in text
-    monkeypatch.setattr(pathlib.Path, "read_bytes", lambda path: read(path) + b"#" * (path == changed))
-    assert stored._sources.__wrapped__() != text
-    monkeypatch.setattr(pathlib.Path, "read_bytes", read)
-    assert stored._sources.__wrapped__() == text
+    assert imported.digest_of_sources() in text
+    digest = imported._digested.__wrapped__
+    assert digest()[0] == imported.digest_of_sources()
+    empty = pathlib.Path(os.devnull)
+    monkeypatch.setattr(pathlib.Path, "open", lambda path, mode: opened(empty if path == changed else path, mode))
+    assert digest()[0] != imported.digest_of_sources()
 
 
 def test_what_a_change_of_the_sources_leaves_alone_is_not_compiled_again(folder, monkeypatch):
