@@ -98,7 +98,7 @@ from jaxvib.study.capture.capture import Capture, CaptureStatus, capture
 from jaxvib.study.capture.curve import ThresholdCurve, threshold_curve
 
 # Many cases
-from jaxvib.sweeps.status import CaseStatus, SweepStatus
+from jaxvib.sweeps.definition import CaseStatus, SweepStatus
 from jaxvib.sweeps.sweep import Sweep, open_sweep, sweep
 
 # Pictures and films

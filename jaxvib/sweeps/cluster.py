@@ -12,9 +12,8 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.runtime.devices import take_a_device
-from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.program import Chunk, compute
-from jaxvib.sweeps.status import CASE_STATUSES
 from jaxvib.sweeps.store import versions
 from jaxvib.units import Number, number
 

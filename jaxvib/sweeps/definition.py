@@ -1,12 +1,12 @@
-"""A study that was checked: what its results depend on, and the shape of the program that computes them."""
+"""A validated study: its identity, the shape of the program that computes its cases, and the statuses of these."""
 
 from __future__ import annotations
 
-import hashlib
-import json
+import os
+import uuid
 from dataclasses import dataclass
-from typing import cast
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -15,25 +15,65 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.lanes import LANES, Plan
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
+from jaxvib.runtime.compat import enumeration_names
 from jaxvib.sweeps.axes import Grid, Spot
-from jaxvib.sweeps.measures import Measure, identity
+from jaxvib.sweeps.identity import UnknownIdentity, digest, identity
+from jaxvib.sweeps.measures import Measure
 from optimize.wishes.quantity import Tier
 
-__all__ = ["Study"]
+__all__ = ["CASE_STATUSES", "UNKNOWN", "CaseStatus", "Study", "SweepStatus", "identify"]
+
+UNKNOWN = "unknown"
+"""Key of the reason, in the identity of what cannot be compared."""
+
+_OPTIONS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
+"""Options of JAX that change results."""
+
+
+def identify(value: object) -> Plain:
+    """Describe a value, see `identity`; one that cannot be compared is described by a text that no other one has."""
+    try:
+        return identity(value)
+    except UnknownIdentity as error:
+        return {UNKNOWN: str(error), "token": uuid.uuid4().hex}
+
+
+class CaseStatus(eqx.Enumeration):
+    """Outcome of a case; the members are the sentences a user reads. Their order is part of the format of a store."""
+
+    missing = "the case was not computed yet"
+    done = "the case was computed"
+    absent = "something that was asked for does not exist in this case, such as a jam beyond its fold"
+    not_finite = "the motion grew beyond all bounds"
+    failed = "an error was raised, see the sentence beside it"
+    lost = "the worker that computed it died, several times"
+
+
+CASE_STATUSES = enumeration_names(CaseStatus)
+"""The names of the statuses in the order of their numbers in a store."""
+
+
+class SweepStatus(eqx.Enumeration):
+    """Progress of a study; the members are the sentences a user reads."""
+
+    done = "every case was computed"
+    partly = "not every case was computed yet; run the study again to go on"
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study that was checked, see `study`.
+    """A validated study, see `study`.
 
-    **Attributes**: `scene`; `grid` of the cases; `names` and `measures` of what is measured, with the `dtypes` and shapes
-    (`extra`) that one case has; `plan` of the runs, None where there are none; `start` and `mode` they start from; `tier`.
+    **Attributes**: `scene`; `grid` of the cases; `names` of the `measures` and their `identities` when the study was made;
+    `plan` of the runs, None if there are none; their `start` and `mode`; `tier`; `specs` of the axes as they were given;
+    `forms`, shape and type of each measure in one case.
     """
 
     scene: Scene
     grid: Grid
     names: tuple[str, ...]
     measures: tuple[Measure, ...]
+    identities: dict[str, Plain]
     plan: Plan | None
     start: Start
     mode: int | None
@@ -47,9 +87,13 @@ class Study:
         return tuple(axis.spot for axis in self.grid.axes)
 
     @property
-    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], Plan | None, Start, int | None]:
-        """What the compiled program depends on beside the scene and the cases."""
-        return self.spots, self.measures, self.plan, self.start, self.mode
+    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], Plan | None, Start, int | None, str]:
+        """Static arguments of the compiled program, beside the scene and the cases.
+
+        The digest of the measures' identities is one of them: a function equals itself although a number that it refers to
+        has changed, and would find the program of before.
+        """
+        return self.spots, self.measures, self.plan, self.start, self.mode, digest(self.identities)
 
     @property
     def size(self) -> int:
@@ -59,24 +103,36 @@ class Study:
 
     @property
     def record(self) -> dict[str, Plain]:
-        """All that the results depend on, ready for JSON."""
+        """Identity of the study: every value that its results depend on, ready for JSON."""
+        options: dict[str, Plain] = {name: str(getattr(jax.config, name)) for name in _OPTIONS}
         return {
             "scene": scene_to_toml(self.scene),
+            "scene_values": identify(self.scene),
             "axes": self.specs,
+            "axis_values": {axis.name: identify(axis) for axis in self.grid.axes},
             "samples": self.grid.samples,
             "sampling": self.grid.sampling,
             "seed": self.grid.seed,
             "tier": self.tier,
-            "measure": {name: cast(Plain, identity(m)) for name, m in zip(self.names, self.measures, strict=True)},
+            "measure": self.identities,
             "run": None if self.plan is None else {**self.plan._asdict(), "start": self.start, "mode": self.mode},
             "tile": list(self.grid.tile),
             "precision": str(self.scene.drive.speed.dtype),
+            "options": options | {"EQX_ON_ERROR": os.environ.get("EQX_ON_ERROR")},
         }
 
     @property
     def key(self) -> str:
         """A text that differs from that of every other study."""
-        return hashlib.sha256(json.dumps(self.record, sort_keys=True).encode()).hexdigest()
+        return digest(self.record)
+
+    def changed(self) -> str | None:
+        """Name of a measure whose function, or a value that it refers to, has changed since the study was made; or None."""
+        for name, measure in zip(self.names, self.measures, strict=True):
+            before, now = self.identities[name], identify(measure)
+            if before != now and not (isinstance(before, dict) and UNKNOWN in before):
+                return name
+        return None
 
     def nothing(self, cases: int) -> list[np.ndarray]:
         """What stands for measures of cases that have none: NaN, of whole numbers -1."""

@@ -233,7 +233,7 @@ def _fifths(store: Store, axis: str) -> tuple[float, float]:
 
 
 def _dims(store: Store) -> list[str]:
-    return list(store.group["status"].metadata.dimension_names)
+    return store.dims
 
 
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -18,7 +16,7 @@ from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.lanes import WatchedRun
 from optimize.wishes.quantity import Quantity
 
-__all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "identity", "measure_of"]
+__all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
 
 _NEAR = 0.01
 """Loads whose mean speed differs from their last one by less, in the rotor's speed, have settled."""
@@ -116,16 +114,3 @@ def measure_of(given: Measure | str, field: str) -> Measure:
         return RUN_MEASURES[given]
     advice = closest(str(given), list(RUN_MEASURES))
     raise InputError(field, f"is {given!r}; give a quantity of optimize, such as jam_frequency(mode=3), or a name; {advice}")
-
-
-def identity(measure: Measure) -> dict[str, str]:
-    """What tells a measure from another one in a store's record; of a function of the user's own also what it says."""
-    found = {"words": measure.words, "unit": measure.unit}
-    function = measure.function
-    if function is not None and not str(function.__module__).startswith(("jaxvib.", "optimize.")):
-        found["function"] = f"{function.__module__}.{function.__qualname__}"
-        try:
-            found["source"] = hashlib.sha256(inspect.getsource(function).encode()).hexdigest()[:16]
-        except (OSError, TypeError):
-            found["source"] = ""
-    return found

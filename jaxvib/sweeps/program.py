@@ -15,9 +15,8 @@ from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
-from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
-from jaxvib.sweeps.status import CASE_STATUSES
 from optimize.wishes.answers import Answers
 
 __all__ = ["Chunk", "compute", "planned", "shapes"]
@@ -51,8 +50,10 @@ def _each(
     plan: Plan | None,
     start: Start,
     mode: int | None,
+    identities: str,
 ) -> tuple[tuple[Array, ...], Array]:
-    """What is measured in each of the cases (cases, axes), and whether its motion stayed finite."""
+    """The measures of each of the cases (cases, axes), and True for each whose motion stayed finite; `identities` is the digest
+    of those of the measures, see `Study.program`."""
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
         this = put(scene, spots, value)

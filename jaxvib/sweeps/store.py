@@ -1,16 +1,22 @@
 """The store of a study on disk: labelled arrays in Zarr's format, written chunk by chunk, each chunk whole or not at all.
 
-Numbers of a chunk are written first, its statuses last: a chunk is finished if, and only if, its statuses are there. Every
-file appears at once under its name. Nothing is ever unpickled.
+Numbers of a chunk are written first, then its statuses, its seal last: a digest of all its files (`jaxvib.sweeps.seals`). A
+chunk is finished if, and only if, its seal is that of its files. Every file appears at once under its name. Nothing is ever
+unpickled.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import os
+import re
 import shutil
+import uuid
 import warnings
+from collections.abc import Iterator
+from enum import IntEnum
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,19 +27,28 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
+from jaxvib.sweeps import seals
 from jaxvib.sweeps.axes import SAMPLE
-from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.definition import CASE_STATUSES, UNKNOWN, CaseStatus, Study
+from jaxvib.sweeps.identity import difference
 from jaxvib.sweeps.measures import RunMeasure
 from jaxvib.sweeps.program import Chunk
-from jaxvib.sweeps.status import CASE_STATUSES, CaseStatus
 
-__all__ = ["Store", "require_zarr", "versions"]
+__all__ = ["ChunkState", "Store", "require_zarr", "versions"]
 
-_FORMAT = 1
+_FORMAT = 2
 """Of the store; another number is another layout."""
 
 _PACKAGES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "numpy")
 """Whose versions may change the last digits of a result."""
+
+
+class ChunkState(IntEnum):
+    """State of a chunk on disk: not computed or cut off, finished, or with files that are not those that were written."""
+
+    missing = 0
+    finished = 1
+    damaged = 2
 
 
 def require_zarr() -> ModuleType:
@@ -51,9 +66,10 @@ def versions() -> dict[str, str]:
 
 
 class Store:
-    """A store that was opened, or made.
+    """An opened store.
 
-    **Attributes**: `path`; `attributes` the record of it: the study, versions, seed; `arrays` by name.
+    **Attributes**: `path`; `attributes` its record: the study, versions, seed; `arrays` by name; `shape` of the cases and
+    `tile` of a chunk; `names` of the measures.
     """
 
     def __init__(self, path: Path, writable: bool = False):
@@ -61,22 +77,22 @@ class Store:
         self.path = path
         if not path.exists():
             raise InputError("store", f"is {str(path)!r}; there is no such store")
+        changed = seals.changed_layout(path)
+        if changed is not None:
+            raise self.damaged(changed)
         try:
             self.group = zarr.open_group(path, mode="r+" if writable else "r", zarr_format=3)
             self.attributes: Tables = dict(self.group.attrs)
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
                 raise InputError("store", f"is {str(path)!r}, which is no store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
-            # Where a chunk has no answer at all its file is written too: one that is missing is a damage.
+            # A chunk without any answer gets its file too: one that is missing is damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
                 self.arrays = {name: self.group[name] for name in self.group.array_keys()}
             self.shape = tuple(self.group["status"].shape)
             self.tile = tuple(int(n) for n in self.record["tile"])
             self.names = tuple(self.record["measure"])
-            for name in (*self.names, "error", "status"):
-                array = self.group[name]
-                if tuple(array.shape[: len(self.shape)]) != self.shape or array.chunks[: len(self.tile)] != self.tile:
-                    raise ValueError(name)
+            self.dims = list(self.group["status"].metadata.dimension_names)
         except InputError:
             raise
         except Exception as error:  # whatever zarr and its codecs say of files that are not what they should be
@@ -89,65 +105,129 @@ class Store:
         )
 
     @classmethod
-    def made(cls, path: Path, study: Study) -> Store:
-        """A store of a study, with nothing in it yet: it appears whole, or not at all."""
+    def create(cls, path: Path, study: Study) -> None:
+        """Create the empty store of a study, whole or not at all; one that another process has just created stays."""
         zarr = require_zarr()
-        part = path.with_name(f"{path.name}.{os.getpid()}.partial")
+        part = path.with_name(f".{uuid.uuid4().hex}.partial")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that metadata in one place are an extension of the format
                 _fill(zarr, part, study)
                 zarr.consolidate_metadata(part)
+            seals.seal_layout(part)
             os.rename(part, path)
         except OSError as error:
-            raise cannot_write(path, error) from error
+            if not (path / seals.FOLDER).exists():
+                raise cannot_write(path, error) from error
         finally:
             shutil.rmtree(part, ignore_errors=True)
-        return cls(path, writable=True)
 
     @property
     def coordinates(self) -> int:
-        """How many coordinates the scene's machine has."""
+        """Number of coordinates of the scene's machine."""
         return int(self.attributes["coordinates_of_machine"])
 
     def require_same(self, study: Study) -> None:
-        """**Raises** `InputError` where the store is of another study, or was begun with other versions."""
-        mine, its = json.loads(json.dumps(study.record)), self.record
-        for name in mine:
-            if mine[name] != its.get(name):
-                problem = f"is {str(self.path)!r}, which holds another study: its {name} differs"
-                raise InputError("store", f"{problem}; name another store, or run the study that it was made by")
+        """**Raises** `InputError` if the store is of another study, or of other versions, or if that cannot be told."""
+        for name, mine in study.identities.items():
+            if isinstance(mine, dict) and UNKNOWN in mine and self.record["measure"].get(name) != mine:
+                problem = f"{mine[UNKNOWN]}, so that nobody can tell if the numbers in {str(self.path)!r} are its own"
+                raise InputError(f"measure.{name}", f"{problem}; name another store")
+        if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
+            name, mine, its = found
+            part = re.split(r"[.\[]", name)[0]
+            problem = f"is {str(self.path)!r}, which holds another study: its {part} differs"
+            where = "" if part == name else f" ({name} is {_short(its)} there and {_short(mine)} here)"
+            raise InputError("store", f"{problem}{where}; name another store, or run the study that it was made by")
         for name, version in versions().items():
             if self.attributes["versions"].get(name) != version:
                 begun = f"was begun with {name} {self.attributes['versions'].get(name)}, and this is {version}"
                 raise InputError("store", f"{begun}: digits would differ; go on with that version, or name another store")
 
-    def _file(self, name: str, place: tuple[int, ...], extra: int = 0) -> Path:
-        return self.path / name / "c" / "/".join(str(k) for k in (*place, *([0] * extra)))
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Let nobody else write. **Raises** `InputError` if another process, or thread, writes already."""
+        with seals.locked(self.path) as is_mine:
+            if not is_mine:
+                problem = f"is {str(self.path)!r}, into which another sweep writes at this moment"
+                raise InputError("store", f"{problem}; wait until that has ended, or name another store")
+            yield
 
-    def finished(self) -> np.ndarray:
-        """Which chunks are finished, (chunks,). **Raises** `InputError` where files of one are missing or damaged."""
-        tiles = tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
-        found = np.zeros(int(np.prod(tiles, dtype=np.int64)), bool)
-        extra = {name: len(self.group[name].shape) - len(self.shape) for name in self.names}
-        for chunk in range(found.size):
-            place = tuple(int(k) for k in np.unravel_index(chunk, tiles))
-            if self._file("status", place).exists():
-                found[chunk] = True
-                for name in self.names:
-                    if not self._file(name, place, extra[name]).exists():
-                        raise self.damaged(f"{name} of chunk {chunk} is missing")
+    @property
+    def tiles(self) -> tuple[int, ...]:
+        """Number of chunks along each dimension."""
+        return tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
+
+    def region(self, chunk: int) -> tuple[slice, ...]:
+        """Place of a chunk's cases along the dimensions."""
+        first = [int(k) * t for k, t in zip(np.unravel_index(chunk, self.tiles), self.tile, strict=True)]
+        return tuple(slice(a, min(a + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
+
+    def _files(self, chunk: int) -> dict[str, Path]:
+        """Files of a chunk by the name of their array: of measures, errors, statuses, sampled numbers."""
+        place = tuple(int(k) for k in np.unravel_index(chunk, self.tiles))
+        found: dict[str, Path] = {}
+        for name in (*self.sampled, *self.names, "error", "status"):
+            at = place[-1:] if name in self.sampled else place
+            extra = len(self.group[name].shape) - len(self.shape) if name in self.names else 0
+            found[name] = self.path / name / "c" / "/".join(str(k) for k in (*at, *([0] * extra)))
         return found
 
+    @property
+    def sampled(self) -> tuple[str, ...]:
+        """Names of the axes whose numbers are sampled."""
+        return tuple(str(self.attributes.get("coordinates", "")).split())
+
+    def states(self, *, writing: bool = False) -> np.ndarray:
+        """`ChunkState` of each chunk (chunks,), after reading every file once; `writing`: this process has the lock."""
+        busy = not writing and seals.is_locked(self.path)
+        return np.asarray([self._state(chunk, busy) for chunk in range(int(np.prod(self.tiles, dtype=np.int64)))], int)
+
+    def _state(self, chunk: int, busy: bool) -> ChunkState:
+        files = self._files(chunk)
+        sealed = seals.is_sealed(self.path, chunk, files)
+        if sealed:
+            return ChunkState.finished
+        if busy or (sealed is None and not files["status"].exists() and self._is_readable(chunk, files)):
+            return ChunkState.missing
+        return ChunkState.damaged
+
+    def _is_readable(self, chunk: int, files: dict[str, Path]) -> bool:
+        """True if what a killed process left of a chunk can be read."""
+        if not any(file.exists() for file in files.values()):
+            return True
+        region = self.region(chunk)
+        try:
+            for name in files:
+                self.group[name][region[-1:] if name in self.sampled else region]
+        except Exception:  # whatever zarr and its codecs say
+            return False
+        return True
+
+    def clear(self, chunk: int) -> None:
+        """Remove the files of a damaged chunk, its seal first: what stops now leaves a chunk that was not computed."""
+        try:
+            for file in (seals.seal_of(self.path, chunk), *reversed(self._files(chunk).values())):
+                shutil.rmtree(file) if file.is_dir() and not file.is_symlink() else file.unlink(missing_ok=True)
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+    def require_whole(self) -> None:
+        """**Raises** `InputError` if a chunk is damaged."""
+        bad = np.flatnonzero(self.states() == ChunkState.damaged)
+        if bad.size:
+            problem = f"is {str(self.path)!r}, in which {bad.size} of {int(np.prod(self.tiles))} chunks are damaged"
+            advice = "run the study again, which computes them again"
+            raise InputError("store", f"{problem}, the first of them chunk {bad[0]}; {advice}")
+
     def write(self, study: Study, chunk: int, cases: Chunk) -> None:
-        """Writes a chunk: its numbers, then its statuses, which say that it is finished."""
+        """Write a chunk: its numbers, then its statuses, then its seal, which says that it is finished."""
         region = study.grid.region(chunk)
         shape = tuple(s.stop - s.start for s in region)
         try:
             if study.grid.samples:
                 drawn = study.grid.drawn(region[-1])
-                sampled = [axis.name for axis in study.grid.axes if axis.values is None]
-                for k, name in enumerate(sampled):
+                for k, name in enumerate(self.sampled):
                     self.arrays[name][region[-1]] = drawn[:, k]
             for name, leaf in cases.found.items():
                 self.arrays[name][region] = leaf.reshape(*shape, *leaf.shape[1:])
@@ -157,15 +237,27 @@ class Store:
                     said[place] = words
                 self.group["error"][region] = said.reshape(shape)
             self.arrays["status"][region] = cases.status.reshape(shape)
+            seals.seal(self.path, chunk, self._files(chunk))
         except OSError as error:
             raise cannot_write(self.path, error) from error
 
-    def counts(self) -> np.ndarray:
-        """How many cases have each status, in the order of `CASE_STATUSES`; read piece by piece."""
+    def counts(self, states: np.ndarray) -> np.ndarray:
+        """Cases with each status, in the order of `CASE_STATUSES`; those of chunks that are not finished are missing."""
         total = np.zeros(len(CASE_STATUSES), np.int64)
+        finished = (states == ChunkState.finished).reshape(self.tiles)
         for rows in self.pieces():
-            total += np.bincount(self.read("status", rows).ravel(), minlength=total.size)[: total.size]
+            among = finished[rows.start // self.tile[0] : -(-rows.stop // self.tile[0])]
+            if np.all(among):
+                total += self._counted(rows)
+                continue
+            for place in np.argwhere(among):
+                place[0] += rows.start // self.tile[0]
+                total += self._counted(self.region(int(np.ravel_multi_index(tuple(place), self.tiles))))
+        total[0] += int(np.prod(self.shape, dtype=np.int64)) - np.sum(total)
         return total
+
+    def _counted(self, region: slice | tuple[slice, ...]) -> np.ndarray:
+        return np.bincount(self._values("status", region).ravel(), minlength=len(CASE_STATUSES))[: len(CASE_STATUSES)]
 
     def pieces(self) -> list[slice]:
         """Slices of the first dimension, each of whole chunks and of about a million cases at most."""
@@ -174,11 +266,24 @@ class Store:
         return [slice(k, min(k + rows, self.shape[0])) for k in range(0, self.shape[0], rows)]
 
     def read(self, name: str, region: slice | tuple[slice, ...] = slice(None)) -> np.ndarray:
-        """Numbers of an array. **Raises** `InputError` for what is damaged."""
+        """Numbers of an array. **Raises** `InputError` if a chunk of the store is damaged."""
+        if not self.is_whole:
+            self.require_whole()
+            self.is_whole = True
+        return self._values(name, region)
+
+    is_whole = False
+
+    def _values(self, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:
         try:
             return np.asarray(self.group[name][region])
         except (OSError, RuntimeError, ValueError, TypeError, KeyError) as error:
             raise self.damaged(f"{name}: {error}") from error
+
+
+def _short(value: Plain) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 80 else f"{text[:60]} ..."
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:

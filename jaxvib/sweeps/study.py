@@ -14,11 +14,10 @@ from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
-from jaxvib.sweeps.axes import AxisSpec, Grid, axis_of, corners, require_apart, tile_of
-from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_apart, tile_of
+from jaxvib.sweeps.definition import Study, identify
 from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
 from jaxvib.sweeps.program import planned, shapes
-from jaxvib.sweeps.samples import SAMPLINGS
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
 from optimize.wishes.quantity import TIERS, Quantity, Tier
@@ -87,7 +86,8 @@ def study(
     most = count(_CHUNK["time" if runs else chosen] if chunk is None else chunk, "chunk")
     grid = grid._replace(tile=tile_of(grid.shape, most))
     specs = {name: _plain(spec) for name, spec in axes.items()}
-    made = Study(scene, grid, names, measures, plan, start, mode, chosen, specs)
+    identities = {name: identify(m) for name, m in zip(names, measures, strict=True)}
+    made = Study(scene, grid, names, measures, identities, plan, start, mode, chosen, specs)
     forms = shapes(made)
     for name, m, form in zip(names, measures, forms, strict=True):
         wanted = 1 if isinstance(m, RunMeasure) and m.axis else 0

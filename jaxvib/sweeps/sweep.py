@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +20,11 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member, sentence
 from jaxvib.sweeps.axes import AxisSpec
-from jaxvib.sweeps.definition import Study
+from jaxvib.sweeps.definition import CASE_STATUSES, CaseStatus, Study, SweepStatus
 from jaxvib.sweeps.execute import Report, in_this_process, timed
-from jaxvib.sweeps.status import CASE_STATUSES, CaseStatus, SweepStatus
-from jaxvib.sweeps.store import Store
+from jaxvib.sweeps.store import ChunkState, Store
 from jaxvib.sweeps.study import Measures, study
-from jaxvib.units import Number
+from jaxvib.units import Number, count
 from optimize.wishes.quantity import Tier
 
 if TYPE_CHECKING:
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn
 
 __all__ = ["CaseCount", "Sweep", "open_sweep", "run_study", "sweep"]
+
+
+_MAX_WORKERS = 16
+"""Processes that may be asked for on any machine; on one with many cores, four for each."""
 
 
 class CaseCount(NamedTuple):
@@ -47,7 +51,8 @@ class Sweep(Result):
     """A study's store, and how far it is; the numbers themselves stay on disk.
 
     **Attributes**: `status` a `SweepStatus`; `store` its path; `cases` how many there are; `counts` how many ended with each
-    status; `computed` cases in this call, in `seconds`, compiling included.
+    status; `computed` cases in this call, in `seconds`, compiling included; `damaged` cases whose files were found damaged, or
+    cut off while they were written: `sweep` has computed them again, `open_sweep` counts them as missing.
     """
 
     status: SweepStatus
@@ -56,17 +61,19 @@ class Sweep(Result):
     counts: tuple[CaseCount, ...] = eqx.field(metadata=in_unit("", "kind"))
     computed: int = eqx.field(metadata=in_unit(""))
     seconds: float = eqx.field(metadata=in_unit("s"))
+    damaged: int = eqx.field(metadata=in_unit(""), default=0)
 
     @property
     def data(self) -> xarray.Dataset:
         """The labelled numbers, read from disk as far as they are asked for; `xarray.open_zarr(found.store)` gives them too.
 
-        **Raises** `InputError` where xarray is not installed.
+        **Raises** `InputError` if xarray is not installed, or a chunk of the store is damaged.
         """
         try:
             import xarray
         except ImportError as error:
             raise InputError("data", "needs xarray; install it with: pip install 'jaxvib[sweep]'") from error
+        Store(Path(self.store)).require_whole()
         return xarray.open_dataset(self.store, engine="zarr")
 
     @property
@@ -79,6 +86,9 @@ class Sweep(Result):
         lines = [f"{self.message}: {self.cases} cases in {self.store}"]
         for name, cases in self.counts:
             lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")
+        if self.damaged:
+            again = "they were computed again" if self.computed else "run the study again, which computes them again"
+            lines.append(f"  {self.damaged} cases were in damaged files, or cut off while they were written: {again}")
         if self.computed:
             each = 1e3 * self.seconds / self.computed
             lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
@@ -184,12 +194,36 @@ def run_study(
     """Computes what is missing in the store of a study; for the arguments see `sweep`."""
     begun = time.perf_counter()
     path = Path(store)
-    if path.exists():
-        kept = Store(path, writable=True)
-        kept.require_same(asked)
-    else:
-        kept = Store.made(path, asked)
-    finished = kept.finished()
+    if workers is not None:
+        count(workers, "workers")
+        if workers > (most := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
+            raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {most}")
+    if not path.exists():
+        Store.create(path, asked)
+    kept = Store(path, writable=True)
+    with kept.locked():
+        return _computed(kept, asked, begun, workers, scheduler, timeout, report)
+
+
+def _computed(
+    kept: Store,
+    asked: Study,
+    begun: float,
+    workers: int | None,
+    scheduler: str | None,
+    timeout: Number,
+    report: Report | None,
+) -> Sweep:
+    """Compute what is missing in a store that this process has locked, and again what is damaged."""
+    if (changed := asked.changed()) is not None:
+        problem = "is a function of which a part, or a value that it refers to, has changed since the study was made"
+        raise InputError(f"measure.{changed}", f"{problem}; make the study again")
+    kept.require_same(asked)
+    states = kept.states(writing=True)
+    damaged = np.flatnonzero(states == ChunkState.damaged)
+    for chunk in damaged:
+        kept.clear(int(chunk))
+    finished = states == ChunkState.finished
     sizes = np.asarray([_cases(asked, chunk) for chunk in range(finished.size)])
     add = timed(asked.grid.cases, int(np.sum(sizes[finished])), report)
     todo = np.flatnonzero(~finished).tolist()
@@ -204,7 +238,8 @@ def run_study(
             for chunk, cases in source:
                 kept.write(asked, chunk, cases)
                 add(int(sizes[chunk]))
-    return _found(kept, int(np.sum(sizes[~finished])), time.perf_counter() - begun)
+    states[:] = ChunkState.finished
+    return _found(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
 
 
 def _cases(asked: Study, chunk: int) -> int:
@@ -212,12 +247,19 @@ def _cases(asked: Study, chunk: int) -> int:
 
 
 def open_sweep(store: str | Path) -> Sweep:
-    """The store of a study that was run, or is being run. **Raises** `InputError` for what is no store, or a damaged one."""
-    return _found(Store(Path(store)), 0, 0.0)
+    """Read the store of a study that was run, or is being run: every file once, so that damaged chunks are known and counted.
+
+    **Returns** `Sweep`. **Raises** `InputError` for a folder that is no store, or a store whose metadata are damaged.
+    """
+    opened = Store(Path(store))
+    states = opened.states()
+    damaged = np.flatnonzero(states == ChunkState.damaged)
+    cases = sum(int(np.prod([s.stop - s.start for s in opened.region(int(chunk))])) for chunk in damaged)
+    return _found(opened, states, 0, 0.0, cases)
 
 
-def _found(store: Store, computed: int, seconds: float) -> Sweep:
-    counts = store.counts()
+def _found(store: Store, states: np.ndarray, computed: int, seconds: float, damaged: int) -> Sweep:
+    counts = store.counts(states)
     rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
     status = SweepStatus.partly if counts[0] else SweepStatus.done
-    return Sweep(status, str(store.path), int(np.prod(store.shape, dtype=np.int64)), rows, computed, seconds)
+    return Sweep(status, str(store.path), int(np.prod(store.shape, dtype=np.int64)), rows, computed, seconds, damaged)

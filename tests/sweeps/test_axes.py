@@ -7,8 +7,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.sweeps.axes import Grid, axis_of, put, put_start, tile_of
-from jaxvib.sweeps.samples import samples
+from jaxvib.sweeps.axes import Grid, axis_of, put, put_start, samples, tile_of
 from jaxvib.sweeps.study import study
 from optimize import jam_frequency
 

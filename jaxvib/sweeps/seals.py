@@ -1,0 +1,152 @@
+"""Seals of a store: digests of its files, and the lock of the process that writes.
+
+The folder `.seals` holds for every finished chunk a file with a digest of all files of that chunk, the digests of those files
+that are written once, when the store is created, and the file that a process locks to write.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from jaxvib.errors import InputError, open_regular, read_text, written
+
+__all__ = ["FOLDER", "changed_layout", "is_locked", "is_sealed", "locked", "seal", "seal_layout", "seal_of"]
+
+FOLDER = ".seals"
+
+_LAYOUT, _LOCK = "layout", "lock"
+
+_intact: dict[str, tuple[object, ...]] = {}
+"""Stamps of the files of chunks that this process has read and found intact, by the path of the seal."""
+
+
+def seal_of(store: Path, chunk: int) -> Path:
+    """Path of a chunk's seal."""
+    return store / FOLDER / str(chunk)
+
+
+def _digest(files: Mapping[str, Path]) -> str:
+    """Digest of names and contents; a file that is not there counts as such."""
+    found = hashlib.sha256()
+    for name, path in files.items():
+        try:
+            with open_regular(path) as file:
+                content = hashlib.sha256(file.read()).hexdigest()
+        except FileNotFoundError:
+            content = "absent"
+        except OSError as error:
+            content = f"unreadable: {error}"
+        found.update(f"{name} {content}\n".encode())
+    return found.hexdigest()
+
+
+def _stamps(files: Mapping[str, Path]) -> tuple[object, ...]:
+    """Change whenever a file is written anew or replaced."""
+
+    def stamp(path: Path) -> object:
+        try:
+            seen = path.stat()
+            return seen.st_mtime_ns, seen.st_size, seen.st_ino
+        except OSError:
+            return None
+
+    return tuple(stamp(path) for path in files.values())
+
+
+def seal(store: Path, chunk: int, files: Mapping[str, Path]) -> None:
+    """Write a chunk's seal."""
+    with written(seal_of(store, chunk)) as part:
+        part.write_text(f"{chunk} {_digest(files)}\n", encoding="ascii")
+
+
+def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None:
+    """True if the seal of a chunk is that of its files, None if it has none."""
+    path = seal_of(store, chunk)
+    stamps = _stamps({**files, "": path})
+    if _intact.get(str(path)) == stamps:
+        return True
+    try:
+        with open_regular(path) as file:
+            said = file.read(256)
+    except FileNotFoundError:
+        return None
+    except OSError:
+        return False
+    if said != f"{chunk} {_digest(files)}\n".encode():
+        return False
+    _intact[str(path)] = stamps
+    return True
+
+
+def seal_layout(store: Path) -> None:
+    """Write down all files of a store that has no chunks yet: metadata, values of axes."""
+    files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
+    told = {name: _digest({name: path}) for name, path in files.items()}
+    (store / FOLDER).mkdir()
+    (store / FOLDER / _LOCK).touch()
+    body = json.dumps(told, sort_keys=True)
+    (store / FOLDER / _LAYOUT).write_text(json.dumps({"files": told, "digest": hashlib.sha256(body.encode()).hexdigest()}))
+
+
+def changed_layout(store: Path) -> str | None:
+    """Description of the first file that is not as it was when the store was created; None if there is none."""
+    try:
+        layout = json.loads(read_text(store / FOLDER / _LAYOUT, "a store"))
+        told = layout["files"]
+        body = json.dumps(told, sort_keys=True)
+        if layout["digest"] != hashlib.sha256(body.encode()).hexdigest():
+            return f"{FOLDER}/{_LAYOUT} is not what was written"
+        for name, digest in told.items():
+            if Path(name).is_absolute() or ".." in Path(name).parts or digest != _digest({name: store / name}):
+                return f"{name} is missing or not what was written"
+    except (InputError, RecursionError, ValueError, KeyError, TypeError, AttributeError):
+        return f"{FOLDER}/{_LAYOUT} is missing or not what was written"
+    return None
+
+
+def _lock(file: int, *, exclusive: bool) -> bool:
+    """Try to lock an open file, which the system frees when the process ends, however it ends; False if another one has it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        import msvcrt
+
+        try:
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+        except OSError:
+            return False
+        return True
+    try:
+        fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def locked(store: Path) -> Iterator[bool]:
+    """Hold the lock of a store; gives False if another process or thread has it."""
+    file = os.open(store / FOLDER / _LOCK, os.O_RDWR if os.access(store / FOLDER / _LOCK, os.W_OK) else os.O_RDONLY)
+    try:
+        yield _lock(file, exclusive=True)
+    finally:
+        os.close(file)
+
+
+def is_locked(store: Path) -> bool:
+    """True if a process writes into a store at this moment."""
+    try:
+        file = os.open(store / FOLDER / _LOCK, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        return not _lock(file, exclusive=False)
+    finally:
+        os.close(file)
