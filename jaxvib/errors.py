@@ -1,12 +1,52 @@
-"""The two ways in which a question to jaxvib can fail."""
+"""Errors of jaxvib, and checks that are the same everywhere: allowed words, files read and written."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import stat
+import threading
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import IO
 
-__all__ = ["ComputationError", "InputError", "require_one_of", "shown", "written"]
+__all__ = [
+    "CONTROL",
+    "MAX_TEXT_BYTES",
+    "ComputationError",
+    "InputError",
+    "legible",
+    "open_regular",
+    "read_text",
+    "require_one_of",
+    "shown",
+    "written",
+]
+
+MAX_TEXT_BYTES = 2**24
+"""Largest file that is read as a text that a person wrote."""
+
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+"""Characters that steer a terminal, or turn the direction of writing; line breaks and tabs are none of them."""
+
+_MAX_WORD, _MAX_MESSAGE = 300, 2000
+"""Letters of a word, and of a message, beyond which the middle is left out."""
+
+
+def legible(text: str) -> str:
+    """A text on one line for a terminal: control characters as escapes, the middle of long words and texts left out.
+
+    >>> legible("a\\x1b[31m" + 1000 * "b")[:20]
+    'a\\\\x1b[31mbbbbbbbbbbb'
+    """
+    plain = re.sub(f"{CONTROL.pattern}|[\n\t\ud800-\udfff]", lambda found: repr(found[0])[1:-1], text)
+    plain = re.sub(rf"\S{{{_MAX_WORD + 1},}}", lambda found: _shortened(found[0], _MAX_WORD), plain)
+    return _shortened(plain, _MAX_MESSAGE)
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
 
 
 class InputError(ValueError):
@@ -25,9 +65,11 @@ class InputError(ValueError):
     problem: str
 
     def __init__(self, field: str, problem: str):
-        super().__init__(f"{field} {problem}")
-        self.field = field
-        self.problem = problem
+        self.field, self.problem = legible(str(field)), legible(str(problem))
+        super().__init__(f"{self.field} {self.problem}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str]]:
+        return type(self), (self.field, self.problem)  # processes hand errors to each other
 
 
 def shown(value: object, longest: int = 60) -> str:
@@ -59,12 +101,71 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
 
 
 @contextlib.contextmanager
-def written(path: Path) -> Iterator[None]:
-    """**Raises** `InputError` where what stands inside cannot write the file."""
+def written(path: Path) -> Iterator[Path]:
+    """Give a path beside the file to write to, and move it into the file's place at the end: a file that was there before stays
+    whole until then. **Raises** `InputError` if the file cannot be written.
+
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "a.txt"
+    >>> with written(path) as part:
+    ...     _ = part.write_text("whole")
+    >>> path.read_text(), len(list(path.parent.iterdir()))
+    ('whole', 1)
+    """
+    part = None
     try:
-        yield
+        home = path.resolve()  # through a link to the file that it names
+        if home.exists() and not home.is_file():  # a device such as /dev/null is not replaced
+            yield path
+            return
+        part = home.with_name(f".{os.getpid()}-{threading.get_ident()}.part{path.suffix}")
+        yield part
+        os.replace(part, home)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ValueError) and "null" not in str(error):
+            raise
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError("path", f"is {str(path)!r}, which cannot be written ({why}); name another file") from error
+    finally:
+        if part is not None:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+
+
+def open_regular(path: str | Path) -> IO[bytes]:
+    """Open a file for reading. **Raises** `OSError` for one that is missing, or a folder, a pipe or a device."""
+
+    def opener(name: str, flags: int) -> int:
+        file = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))  # a pipe that nobody writes to would wait
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            os.close(file)
+            raise OSError(None, "it is a folder, a pipe or a device, not a file")
+        return file
+
+    try:
+        return open(path, "rb", opener=opener)
+    except ValueError as error:  # a name with a null character
+        raise OSError(None, str(error)) from error
+
+
+def read_text(path: str | Path, what: str) -> str:
+    """Text of a file that a person wrote; `what` says in messages which file is expected, such as "a TOML file".
+
+    **Raises** `InputError` for a file that cannot be read, is no UTF-8 text, or is larger than 16 MB.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise InputError("path", f"is {path!r}; give the path of {what}")
+    try:
+        with open_regular(path) as file:
+            content = file.read(MAX_TEXT_BYTES + 1)
     except OSError as error:
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({error.strerror}); name another file") from error
+        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of {what}") from error
+    if len(content) > MAX_TEXT_BYTES:
+        raise InputError(str(path), f"is larger than {MAX_TEXT_BYTES >> 20} MB; give the path of {what}")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "is not UTF-8 text; save it as UTF-8") from error
 
 
 class ComputationError(RuntimeError):
@@ -81,5 +182,8 @@ class ComputationError(RuntimeError):
     status: str
 
     def __init__(self, status: str, message: str):
-        super().__init__(f"{status}: {message}")
-        self.status = status
+        super().__init__(f"{status}: {legible(message)}")
+        self.status, self.message = status, message
+
+    def __reduce__(self) -> tuple[type[ComputationError], tuple[str, str]]:
+        return type(self), (self.status, self.message)

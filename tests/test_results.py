@@ -1,8 +1,8 @@
 """Every result: status, sentence, text, figure, plain and labelled data, files and back."""
 
+import dataclasses
 import json
 import math
-import pathlib
 import subprocess
 import sys
 
@@ -17,9 +17,10 @@ from small_machine import checked_gradients, small_sweep
 import jaxvib as jv
 from jaxvib.motion.growth import Growth, GrowthStatus
 from jaxvib.motion.run import RunStatus
+from jaxvib.results.files import _digest
 from jaxvib.results.result import Result
-from jaxvib.results.status import Computed, failure, member, sentence, status_name, status_names
-from jaxvib.runtime.compat import enumeration_names
+from jaxvib.results.status import Computed, failure, is_status, member, sentence, status_name, status_names
+from jaxvib.runtime.compat import enumeration_names, enumeration_of
 from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import balanced_stability
 from jaxvib.steady.jams.phase_search import phase_branch
@@ -43,7 +44,6 @@ from jaxvib.study.stress.result import stress_of
 from optimize.pareto import Front
 from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
 
-DATA = pathlib.Path(__file__).parent / "data"
 MACHINE = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
 SCENE = jv.Scene(MACHINE, jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
 ROTOR = jv.Scene(
@@ -187,17 +187,25 @@ def result(request):
 
 
 def alike(one, other):
-    """The same tree of the same leaves, bit for bit."""
-    (ours, shape), (theirs, again) = (jax.tree.flatten(tree) for tree in (one, other))
-    assert len(ours) == len(theirs) and type(one) is type(other)
-    for mine, its in zip(ours, theirs, strict=True):
-        if isinstance(mine, (jax.Array, np.ndarray, np.generic)):
-            assert np.asarray(mine).dtype == np.asarray(its).dtype
-            np.testing.assert_array_equal(np.asarray(mine), np.asarray(its))
-        else:
-            assert type(mine) is type(its) and (mine == its or mine != mine)
-    if not any(isinstance(leaf, np.ndarray) for leaf in ours):
-        assert shape == again
+    """The same classes with the same values, bit for bit: arrays of JAX stay arrays of JAX, with their type."""
+    assert type(one) is type(other)
+    if is_status(one):
+        assert enumeration_of(one) is enumeration_of(other)
+        np.testing.assert_array_equal(status_names(one), status_names(other))
+    elif isinstance(one, (jax.Array, np.ndarray, np.generic)):
+        assert one.dtype == other.dtype and one.shape == other.shape
+        assert np.asarray(one).tobytes() == np.asarray(other).tobytes()
+    elif dataclasses.is_dataclass(one):
+        for field in dataclasses.fields(one):
+            alike(getattr(one, field.name), getattr(other, field.name))
+    elif isinstance(one, dict):
+        alike(list(one.items()), list(other.items()))
+    elif isinstance(one, (tuple, list)):
+        assert len(one) == len(other)
+        for mine, its in zip(one, other, strict=True):
+            alike(mine, its)
+    else:
+        assert one == other or (one != one and other != other)
 
 
 def test_speaks(result):
@@ -249,7 +257,8 @@ def test_file_and_back_is_bit_for_bit(result, tmp_path):
     path = result.save(tmp_path / "answer")
     assert path.suffix == ".npz"
     alike(jv.load(path), result)
-    alike(type(result).load(path), result)
+    with jax.enable_x64(False):  # single precision, which could not hold them
+        alike(type(result).load(path), result)
     with pytest.raises(jv.InputError, match="it is no Jam but holds a|no result" if type(result) is not jv.Jam else "no Orbit"):
         (jv.Orbit if type(result) is jv.Jam else jv.Jam).load(path)
 
@@ -297,18 +306,6 @@ def test_names_of_statuses():
         jax.jit(lambda x: status_name(RunStatus.where(x, RunStatus.done, RunStatus.no_start)))(True)
 
 
-def test_runs_of_the_first_format():
-    run = jv.load(DATA / "run_0_1.npz")
-    assert type(run) is jv.Run and run.status_name == "done" and int(run.steps) == 59
-    assert float(run.omega) == 26.198174990667866 and run.trajectory.time.shape == (4,) and run.window.time.shape == (3,)
-    assert float(run.scene.drive.speed) == 60.0 and run.window.state.rotor is None
-    np.testing.assert_array_equal(run.window.rotor_speed, 60.0)
-    assert "the run reached its end" in run.summary()
-    motor = jv.Run.load(DATA / "run_0_1_motor.npz")
-    assert motor.status_name == "max_steps_reached" and motor.trajectory is None
-    np.testing.assert_allclose(motor.window.state.rotor[1], [16.31837549, 16.32160004, 16.32482427], rtol=1e-9)
-
-
 def test_a_file_alone_is_enough(tmp_path):
     path = RESULTS["JamModes"]().save(tmp_path / "modes.npz")
     code = f"import jaxvib as jv; print(type(jv.load({str(path)!r})).__name__)"
@@ -337,8 +334,9 @@ def test_a_class_that_moved_is_found_by_its_public_name(tmp_path):
     path = RESULTS["JamModes"]().save(tmp_path / "modes")
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files}
-    arrays["result"] = np.asarray(str(arrays["result"]).replace("jaxvib.steady.jams.jam:", "jaxvib.steady.elsewhere:"))
-    np.savez(path, **arrays)
+    layout = str(arrays.pop("result")).replace("jaxvib.steady.jams.jam:", "jaxvib.steady.elsewhere:")
+    arrays["digest"] = np.asarray(_digest(layout, {name: array for name, array in arrays.items() if name != "digest"}))
+    np.savez(path, result=np.asarray(layout), **arrays)
     alike(jv.load(path), RESULTS["JamModes"]())
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from jaxvib.errors import InputError, written
+from jaxvib.errors import CONTROL, InputError, read_text, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
 from jaxvib.machine.effects.registry import EFFECTS
@@ -72,17 +72,32 @@ def closest(name: str, allowed: list[str]) -> str:
 
 
 def read_toml(path: str | Path) -> Tables:
-    """The tables of a TOML file. **Raises** `InputError` for a file that is missing or no TOML."""
+    """The tables of a TOML file. **Raises** `InputError` for a file that is missing, no TOML, or not written by hand: larger
+    than 16 MB, nested too deep, with control characters or numbers of thousands of digits."""
+    text = read_text(path, "a TOML file, in UTF-8 as `jaxvib new ... --out DIR` writes it")
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a TOML file") from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            str(path), "is not UTF-8 text; save it as UTF-8 (or let `jaxvib new ... --out DIR` write it)"
-        ) from error
-    except tomllib.TOMLDecodeError as error:
+        tables = tomllib.loads(text)
+        _require_plain(tables, "")
+    except InputError:
+        raise
+    except RecursionError as error:
+        raise InputError(str(path), "is nested too deep; the files of jaxvib need four levels") from error
+    except ValueError as error:  # no TOML, or a number of more digits than Python reads
         raise InputError(str(path), f"is no TOML file: {error}") from error
+    return tables
+
+
+def _require_plain(value: object, name: str) -> None:
+    """**Raises** `InputError` for control characters in names and texts: they would steer the terminal that shows them."""
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            _require_plain(key, name)
+            _require_plain(entry, f"{name}.{key}" if name else key)
+    elif isinstance(value, list):
+        for k, entry in enumerate(value):
+            _require_plain(entry, f"{name}[{k}]")
+    elif isinstance(value, str) and (found := CONTROL.search(value)):
+        raise InputError(name or "the file", f"holds the control character {found[0]!r}; leave it out")
 
 
 _MARKS = {
@@ -142,8 +157,8 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
     True
     """
     path = Path(path)
-    with written(path):
-        path.write_text(scene_to_toml(scene), encoding="utf-8")
+    with written(path) as part:
+        part.write_text(scene_to_toml(scene), encoding="utf-8")
     return path
 
 

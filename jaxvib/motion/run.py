@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -12,10 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import normal_force
 from jaxvib.errors import InputError
-from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
@@ -23,7 +19,6 @@ from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
@@ -177,26 +172,3 @@ class Run(AbstractMeasured, Result):
         }
         paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
-
-
-_FIRST_STATUSES = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")
-"""The names of statuses in the order of their numbers in the first format."""
-
-
-def from_first_format(archive: Mapping[str, np.ndarray]) -> Run:
-    """The run in an archive that has no layout, but its arrays numbered in the order of the fields."""
-    scene = scene_from_toml(str(archive["scene"]))
-    leaves = (jnp.asarray(archive[f"leaf{k}"]) for k in itertools.count())
-
-    def motion() -> Trajectory:
-        time, displacement, velocity, angle, rate = (next(leaves) for _ in range(5))
-        rotor = (next(leaves), next(leaves)) if not scene.drive.ideal else None
-        state = State(displacement, velocity, (angle,), (rate,), rotor)
-        return Trajectory(time, state, *(next(leaves) for _ in range(3)))
-
-    measured = {name: next(leaves) for name in ("omega", "load_speed", "amplitude", "foundation_force", "drift")}
-    status = member(RunStatus, _FIRST_STATUSES[int(next(leaves))])
-    trajectory = motion() if bool(archive["kept_all"]) else None
-    window = motion()
-    cost = {name: next(leaves) for name in ("error", "steps", "rejected", "evaluations", "seconds")}
-    return Run(**measured, status=status, trajectory=trajectory, window=window, **cost, scene=scene)

@@ -97,8 +97,8 @@ def html_report(
         scene = own
     drawn = [(kind, result.plot())] if figures is None else figures
     page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
-    with written(path):
-        path.write_text(page.html(), encoding="utf-8")
+    with written(path) as part:
+        part.write_text(page.html(), encoding="utf-8")
     return path
 
 

@@ -51,7 +51,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     if not rows:
         raise InputError("axis", f"is {axis!r}; {type(result).__name__} holds nothing along it")
     path = Path(path)
-    with written(path), path.open("w", newline="", encoding="utf-8") as file:
+    with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(heads)
         writer.writerows([_shown(x) for x in row] for row in zip(*rows, strict=True))

@@ -1,13 +1,20 @@
-"""Results in files: NumPy archives of arrays with a text that says where each belongs; nothing is ever unpickled."""
+"""Results in files: NumPy archives of arrays with a text that says where each belongs.
+
+Nothing is ever unpickled, and no constructor is called that a file names: objects are rebuilt from their fields, named tuples
+from their entries, and only those that jaxvib and optimize define. An archive holds a digest of its contents.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
+import io
 import json
+import math
 import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +23,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import InputError, written
+from jaxvib.errors import CONTROL, InputError, open_regular, written
 from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
 
 __all__ = ["load", "save"]
 
-_LAYOUT = "result"
-"""The archive's entry that holds the layout, a JSON text."""
+_LAYOUT, _DIGEST = "result", "digest"
+"""Entries of the archive: the layout, a JSON text, and the digest of it and of all arrays."""
 
 _PACKAGES = ("jaxvib", "optimize")
-"""Only classes of these packages are looked for."""
+"""Packages whose classes a file may name."""
 
-_FIRST_FORMAT = ("jaxvib.motion.run", "from_first_format")
-"""What reads an archive without a layout: runs as the first versions wrote them."""
+_KINDS = "biufcUS"
+"""Kinds of NumPy's types that a file may hold: numbers, truth values, texts."""
 
 
 def save(result: eqx.Module, path: str | Path) -> Path:
     """Writes a result to a NumPy archive (".npz", added where it is missing) that `load` reads back bit for bit.
 
-    Arrays are entries of the archive, a scene is a TOML text, all else stands in a JSON text.
+    Arrays are entries of the archive, a scene is a TOML text, all else stands in a JSON text. A file that was there before
+    is replaced once the new one is complete.
 
     **Returns** the path written to. **Raises** `InputError` for a result that holds what cannot be written, and for a path that
     cannot be written to.
@@ -45,15 +53,17 @@ def save(result: eqx.Module, path: str | Path) -> Path:
     layout = json.dumps(_encoded(result, arrays))
     path = Path(path)
     path = path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
-    with written(path):
-        np.savez(path, **{_LAYOUT: np.asarray(layout)}, **arrays)  # pyright: ignore[reportArgumentType]
+    head = {_LAYOUT: np.asarray(layout), _DIGEST: np.asarray(_digest(layout, arrays))}
+    with written(path) as part, part.open("wb") as file:
+        np.savez(file, **head, **arrays)  # pyright: ignore[reportArgumentType]
     return path
 
 
 def load(path: str | Path) -> Any:
-    """Reads a result written by `save`, of whatever class it is; runs of the first versions too.
+    """Reads a result written by `save`, of whatever class it is.
 
-    **Raises** `InputError` for a file that is missing, was not written by `save`, or holds a class that there is no more.
+    **Raises** `InputError` for a file that is missing, was not written by `save` or was changed since, or holds a class that
+    there is no more.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -63,18 +73,59 @@ def load(path: str | Path) -> Any:
     >>> type(again).__name__, bool((again.stable == modes.stable).all())
     ('JamModes', True)
     """
+    if not isinstance(path, (str, Path)):
+        raise InputError("path", f"is {path!r}; give the path of a result written by save")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if _LAYOUT not in archive.files:
-                module, name = _FIRST_FORMAT
-                return getattr(importlib.import_module(module), name)(archive)
-            return _decoded(json.loads(str(archive[_LAYOUT])), archive)
+        with open_regular(path) as file:
+            arrays = _arrays(file)
+        layout, told = (str(arrays.pop(name, "")) for name in (_LAYOUT, _DIGEST))
+        if told != _digest(layout, arrays):
+            raise ValueError("changed since it was saved")
+        found = _decoded(json.loads(layout), arrays)
+        if not isinstance(found, eqx.Module):
+            raise ValueError("not a result")
+        return found
     except FileNotFoundError as error:
         raise InputError("path", f"is {str(path)!r}; there is no such file") from error
-    except (KeyError, TypeError, ValueError, AttributeError, OSError, EOFError, ImportError, zipfile.BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
+    except _ODD as error:
         raise InputError("path", f"is {str(path)!r}; it is no result written by save") from error
+
+
+_ODD = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, MemoryError, OSError, RuntimeError,
+    TypeError, ValueError, zipfile.BadZipFile,
+)  # fmt: skip
+"""Errors of reading a file that holds anything at all; `RecursionError` is a `RuntimeError`."""
+
+
+def _arrays(file: Any) -> dict[str, np.ndarray]:
+    """Arrays of an archive by name. **Raises** an error of `_ODD` for entries that are compressed, or larger than the file: a
+    few bytes of those can fill any memory."""
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        size = file.seek(0, io.SEEK_END)
+        if sum(entry.file_size for entry in entries) > size or any(e.compress_type != zipfile.ZIP_STORED for e in entries):
+            raise ValueError("compressed")
+        return {entry.filename.removesuffix(".npy"): _array(archive.read(entry)) for entry in entries}
+
+
+def _array(content: bytes) -> np.ndarray:
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, is_fortran, kind = read(stream)
+    begin = stream.tell()
+    if kind.kind not in _KINDS or math.prod(shape) * kind.itemsize != len(content) - begin:
+        raise ValueError("no array of numbers or text")
+    return np.ndarray(shape, kind, bytearray(content), begin, order="F" if is_fortran else "C")
+
+
+def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:
+    found = hashlib.sha256(layout.encode())
+    for name, array in sorted(arrays.items()):
+        found.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
 
 
 def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
@@ -96,16 +147,23 @@ def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
     if isinstance(value, (tuple, list)):
         return {type(value).__name__: [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, Mapping):
-        return {"dict": [[name, _encoded(entry, arrays)] for name, entry in value.items()]}
+        return {"dict": [[_encoded(name, arrays), _encoded(entry, arrays)] for name, entry in value.items()]}
     raise InputError("result", f"holds {value!r}, which no file can hold; save what it was made from")
 
 
 def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np.ndarray]) -> Plain:
     value = getattr(owner, field.name)
-    return {"text": field.metadata["write"](value)} if "write" in field.metadata else _encoded(value, arrays)
+    if "write" not in field.metadata:
+        return _encoded(value, arrays)
+    double = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves(value))
+    return {"text": field.metadata["write"](value), "double": double}
 
 
 def _stored(array: np.ndarray, arrays: dict[str, np.ndarray]) -> str:
+    if array.dtype.kind not in _KINDS:
+        raise InputError(
+            "result", f"holds an array of the type {array.dtype}, which no file can hold; save what it was made from"
+        )
     name = f"array{len(arrays)}"
     arrays[name] = array
     return name
@@ -115,43 +173,58 @@ def _class(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
 
-def _decoded(value: Any, archive: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> Any:
-    """The value that `_encoded` made this of."""
+def _decoded(value: Any, arrays: Mapping[str, np.ndarray], read: Callable[[str], object] | None = None) -> Any:
+    """The value that `_encoded` made this of; `read` is that of a field that is written as a text of its own."""
+    if isinstance(value, str) and CONTROL.search(value):
+        raise ValueError("control characters")
+    if isinstance(value, list):
+        raise ValueError("a list without its kind")
     if not isinstance(value, dict):
         return value
-    if "text" in value:
-        assert metadata is not None
-        return metadata["read"](value["text"])
-    if "status" in value:
-        return member(_found(value["status"]), archive[value["names"]])
-    if "array" in value:
-        array = archive[value["array"]]
-        return jnp.asarray(array) if value["kind"] == "jax" else array[()] if value["kind"] == "scalar" else array
-    if "complex" in value:
-        return complex(*value["complex"])
-    if "entries" in value:
-        return _found(value["class"])(*(_decoded(entry, archive) for entry in value["entries"]))
-    if "fields" in value:
-        return _rebuilt(_found(value["class"]), value["fields"], archive)
-    if "dict" in value:
-        return {name: _decoded(entry, archive) for name, entry in value["dict"]}
-    ((name, entries),) = value.items()
-    return {"tuple": tuple, "list": list}[name](_decoded(entry, archive) for entry in entries)
+    match value:
+        case {"text": str(text), "double": bool(double)} if read is not None:
+            with jax.enable_x64(double):  # the precision that it was saved in
+                return read(text)
+        case {"status": str(name), "names": str(names)}:
+            return member(_class_named(name, eqx.Enumeration), arrays[names])
+        case {"array": str(name), "kind": "jax"}:
+            with jax.enable_x64(True):  # single precision could not hold all
+                return jnp.asarray(arrays[name])
+        case {"array": str(name), "kind": "scalar"}:
+            return arrays[name][()]
+        case {"array": str(name), "kind": "numpy"}:
+            return arrays[name]
+        case {"complex": [float(real), float(imag)]}:
+            return complex(real, imag)
+        case {"class": str(name), "entries": list(entries)}:
+            return _class_named(name, tuple)(*(_decoded(entry, arrays) for entry in entries))
+        case {"class": str(name), "fields": dict(fields)}:
+            return _rebuilt(_class_named(name, object), fields, arrays)
+        case {"dict": list(pairs)}:
+            return {_decoded(name, arrays): _decoded(entry, arrays) for name, entry in pairs}
+        case {"tuple": list(entries)}:
+            return tuple(_decoded(entry, arrays) for entry in entries)
+        case {"list": list(entries)}:
+            return [_decoded(entry, arrays) for entry in entries]
+        case _:
+            raise ValueError("unknown layout")
 
 
-def _rebuilt(kind: type, fields: Mapping[str, Plain], archive: Mapping[str, np.ndarray]) -> object:
+def _rebuilt(kind: type, fields: Mapping[str, Plain], arrays: Mapping[str, np.ndarray]) -> object:
     """An object with these fields as they were: a constructor would read units and check values once more."""
     whole = object.__new__(kind)
     for field in dataclasses.fields(kind):
-        value = _decoded(fields[field.name], archive, field.metadata) if field.name in fields else field.default
+        given = field.name in fields
+        value = _decoded(fields[field.name], arrays, field.metadata.get("read")) if given else field.default
         if value is dataclasses.MISSING:
             raise KeyError(field.name)
         object.__setattr__(whole, field.name, value)
     return whole
 
 
-def _found(name: str) -> type:
-    """The class of that name, where it was when the file was written, or else among the public names."""
+def _class_named(name: str, base: type) -> Any:
+    """The class of that name, found in its module or else among the public names: a result or a part of one, a status, a named
+    tuple, defined by one of the packages. **Raises** `ValueError` for any other."""
     module, _, inner = name.partition(":")
     if module.split(".")[0] not in _PACKAGES or not inner.isidentifier():
         raise ValueError(f"{name} is no class of a result")
@@ -159,6 +232,11 @@ def _found(name: str) -> type:
         found = getattr(importlib.import_module(module), inner)
     except (ImportError, AttributeError):
         found = getattr(sys.modules[module.split(".")[0]], inner)
-    if not isinstance(found, type):
+    ours = isinstance(found, type) and issubclass(found, base) and found.__module__.split(".")[0] in _PACKAGES
+    if (
+        not ours
+        or (base is tuple and not hasattr(found, "_fields"))
+        or (base is object and not dataclasses.is_dataclass(found))
+    ):
         raise ValueError(f"{name} is no class of a result")
     return found

@@ -6,6 +6,7 @@ import math
 import pytest
 from matplotlib.figure import Figure
 from scenes import scene
+from small_machine import small_run
 
 import jaxvib as jv
 from jaxvib.cli.app import run
@@ -95,8 +96,7 @@ def test_parameters_of_every_template_have_units(kind, tmp_path):
 
 
 def test_units_are_those_of_the_fields():
-    run = jv.load(__file__.replace("report/test_page.py", "data/run_0_1.npz"))
-    units = units_of(run)
+    units = units_of(small_run())
     assert units["omega"] == "rad/s" and units["foundation_force"] == "N" and units["time"] == "s" and "steps" not in units
 
 

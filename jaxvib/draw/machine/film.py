@@ -90,11 +90,11 @@ class Film(FuncAnimation):
         if path.suffix.lower() not in (".gif", ".html", ".htm") or rest or options:
             super().save(str(filename), *rest, **options)
             return
-        with written(path):
+        with written(path) as part:
             if path.suffix.lower() == ".gif":
-                self._gif(path)
+                self._gif(part)
             else:
-                path.write_text(self._page(path.stem), encoding="utf-8")
+                part.write_text(self._page(path.stem), encoding="utf-8")
 
     def _gif(self, path: Path) -> None:
         first, *others = self._few_colours()
