@@ -53,7 +53,7 @@ from jaxvib.study.maps.stability_onset import stability_map, stability_onset
 # Auto-balancing, whirl
 from jaxvib.steady.balance.criterion import Criterion, criterion
 from jaxvib.steady.balance.states import BalancedStates, balanced_states
-from jaxvib.steady.whirl import Whirl, critical_speeds, whirl
+from jaxvib.steady.whirl import Whirl, WhirlStatus, critical_speeds, whirl
 from jaxvib.study.maps.criterion_map import criterion_map
 
 # Motion in time
@@ -202,6 +202,7 @@ __all__ = [
     "BalancedStates",
     "whirl",
     "Whirl",
+    "WhirlStatus",
     "critical_speeds",
     # Motion in time
     "simulate",

@@ -16,15 +16,18 @@ from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
+from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
 
 __all__ = [
     "AbstractLinearModel",
+    "FrequencyStatus",
     "JammedModel",
     "LinearModel",
     "circular_loads",
+    "estimated_frequencies",
     "jammed_loads",
     "jammed_model",
     "linear_model",
@@ -37,6 +40,13 @@ __all__ = [
     "turning",
     "turning_loads",
 ]
+
+
+class FrequencyStatus(eqx.Enumeration):
+    """Outcome of a computation of natural frequencies; the members are the sentences a user reads."""
+
+    done = "the answer was computed"
+    lost_digits = "rounding hides a natural frequency: use double precision, or stiffnesses and masses that differ less"
 
 
 class AbstractLinearModel(eqx.Module):
@@ -136,6 +146,9 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Derivatives are finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
+    **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, as that of a soft spring beside a link
+    1e8 times as stiff does in single precision; under a JAX transformation it is NaN.
+
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
     ...                         rho=1.0, eps=1e-3, beta=1.0, speed=3.0)
@@ -144,12 +157,28 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return _natural_frequencies(checked(scene))
+    frequencies, lost = _natural_frequencies(checked(scene))
+    if not traced(frequencies) and np.asarray(lost).any():
+        raise failure(FrequencyStatus.lost_digits)
+    return jnp.where(lost, jnp.nan, frequencies) if traced(lost) else frequencies
+
+
+def estimated_frequencies(scene: Scene) -> Array:
+    """`natural_frequencies` with the digits that rounding leaves: for marks in figures and choices of step sizes."""
+    return _natural_frequencies(checked(scene))[0]
 
 
 @cached
-def _natural_frequencies(scene: Scene) -> Array:
-    return linear_model(scene).modes()[0]
+def _natural_frequencies(scene: Scene) -> tuple[Array, Array]:
+    """Natural frequencies (nd,) rad/s, and which of them rounding hides."""
+    model = linear_model(scene)
+    frequencies, shapes = model.modes()
+    w, x, mass, carrier = jax.lax.stop_gradient((frequencies, shapes, model.mass, model.carrier))
+    lost = hermitian_error((carrier.stiffness, mass), w**2, x) > 2.0 * TRUSTED
+    # A motion of frequency 0 is free to drift unless a spring to the bed resists it.
+    bed = jnp.max(jnp.abs(carrier.bed_stiffness @ x), axis=0)
+    resisted = bed > 1e-3 * jnp.max(jnp.abs(carrier.bed_stiffness)) * jnp.max(jnp.abs(x), axis=0)
+    return frequencies, jnp.where(w > 0.0, lost, resisted)
 
 
 def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import Spin, State, vector_field
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -93,7 +93,7 @@ def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
     """
     scene = jax.lax.stop_gradient(scene)
-    frequencies, speed = natural_frequencies(scene), scene.drive.speed
+    frequencies, speed = estimated_frequencies(scene), scene.drive.speed
     own = scene.loads.own_frequency(speed)
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))

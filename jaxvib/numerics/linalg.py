@@ -14,8 +14,10 @@ from jax import Array
 from jaxvib.runtime.compat import custom_vmap
 
 __all__ = [
+    "TRUSTED",
     "eigenvalues_in_turn",
     "eliminate",
+    "hermitian_error",
     "hermitian_modes",
     "magnitude",
     "relative_to",
@@ -31,6 +33,9 @@ __all__ = [
 
 _WRITTEN = 8
 """Up to so many equations `eliminate` is as fast as a library call for each system of a batch."""
+
+TRUSTED = 1e-2
+"""Largest relative error of an eigenvalue that is still an answer; beyond it its digits are lost to rounding."""
 
 _compiled = functools.partial(jax.jit, inline=True)
 """Asked for outside a program, a loop would be traced and compiled at every call; within one, nothing changes."""
@@ -106,6 +111,22 @@ def root_or_zero(values: Array) -> Array:
     """Roots of eigenvalues that are never negative; what rounding cannot tell from 0 is 0, and so is its derivative."""
     there = values > 4.0 * values.shape[0] * jnp.finfo(values.dtype).eps * jnp.max(values, initial=0.0)
     return jnp.where(there, jnp.sqrt(jnp.where(there, values, 1.0)), 0.0)
+
+
+def hermitian_error(pencil: tuple[Array, Array], values: Array, shapes: Array) -> Array:
+    """Relative errors (k,) of eigenvalues of A x = value B x, both Hermitian, by Rayleigh's quotient x^H A x / x^H B x.
+
+    Its error is of second order in that of the shape; the rounding of its terms, which cancel where a soft spring stands beside
+    a stiff one, is counted.
+
+    **Arguments**: `pencil` A and B (n, n), B positive definite; `values` (k,); `shapes` (n, k).
+    """
+    sizes, eps = jnp.abs(shapes), jnp.finfo(values.dtype).eps
+    top, bottom = (jnp.sum(shapes.conj() * (matrix @ shapes), axis=0).real for matrix in pencil)
+    rough, base = (jnp.sum(sizes * (jnp.abs(matrix) @ sizes), axis=0) for matrix in pencil)
+    rounding = shapes.shape[0] * eps * (rough + jnp.abs(values) * base) / bottom
+    length = jnp.abs(values)
+    return jnp.where(length > 0.0, (jnp.abs(top / bottom - values) + rounding) / jnp.where(length > 0.0, length, 1.0), jnp.inf)
 
 
 @jax.custom_jvp

@@ -116,6 +116,10 @@ def in_chunks(
     {'sum': array([1., 2., 3., 4., 5., 6.])}
     """
     count = jax.tree.leaves(cases)[0].shape[0]
+    if count == 0:
+        rows = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype), cases)
+        like = jax.eval_shape(lambda *rows: function(*rows, *shared), *rows)
+        return jax.tree.map(lambda leaf: np.zeros((0, *leaf.shape[1:]), leaf.dtype), like)
     chunks = -(-count // size)
     index = np.minimum(np.arange(chunks * size), count - 1).reshape(chunks, size)
     if any(traced(leaf) for leaf in jax.tree.leaves((cases, shared))):

@@ -1,4 +1,4 @@
-"""Whirl of a rotor: natural motions that go round, with the rotor or against it."""
+"""Whirl of a rotor: natural motions that turn with the rotor or against it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from jaxvib.errors import InputError, require_one_of
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.numerics.linalg import hermitian_modes, relative_to
+from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Numbers, numbers, traced
 
@@ -27,23 +26,31 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, SpeedUnit
 
-__all__ = ["CriticalSpeeds", "Whirl", "critical_speeds", "whirl"]
+__all__ = ["CriticalSpeeds", "Whirl", "WhirlStatus", "critical_speeds", "whirl"]
 
 Weights = Literal["fixed", "none"]
 
-_TIE = 1e-9
-"""Size of the coupling that tells two whirls of one speed apart, relative to the machine's own matrices."""
+_TIE, _TIE_ROUNDINGS = 1e-9, 100.0
+"""Size of the coupling that tells two whirls of one speed apart, relative to the machine's own matrices, and the least size in
+units of the rounding."""
+
+
+class WhirlStatus(eqx.Enumeration):
+    """Outcome of a computation of whirls; the members are the sentences a user reads."""
+
+    done = "the answer was computed"
+    lost_digits = "rounding hides some of these motions, which are NaN: use double precision, or numbers that differ less"
 
 
 class CriticalSpeeds(Result):
     """Rotor speeds at which a whirl turns as fast as the rotor, no damping.
 
     **Attributes**: `speed` (nd,) rad/s, ascending, inf where there is none (a thin disc has no second forward one); `forward`
-    (nd,) whether the whirl goes round with the rotor; only then does an imbalance excite it where supports are alike both ways.
+    (nd,) True if the whirl goes round with the rotor; only then does an imbalance excite it where supports are alike both ways;
+    `status` a `WhirlStatus`.
     """
 
-    status = Computed.done
-
+    status: WhirlStatus
     speed: Array = eqx.field(metadata=in_unit("rad/s", "whirl"))
     forward: Array = eqx.field(metadata=in_unit("", "whirl"))
 
@@ -51,7 +58,8 @@ class CriticalSpeeds(Result):
         """A line for each speed, for a person to read."""
         pairs = zip(np.asarray(self.speed), np.asarray(self.forward), strict=True)
         lines = [f"critical speed {w:.6g} rad/s, {'forward' if f else 'backward'}" for w, f in pairs if np.isfinite(w)]
-        return "\n".join(lines) or "no critical speed"
+        lost = [self.message] if self.status_name != "done" else []
+        return "\n".join([*lines, *lost]) or "no critical speed"
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Forward and backward critical speeds, on a line each, in `unit`.
@@ -67,13 +75,18 @@ class CriticalSpeeds(Result):
 class Whirl(Result):
     """Natural motions of a turning rotor over rotor speeds: the Campbell diagram.
 
-    **Attributes** (ns rotor speeds, nd natural motions each, ascending): `rotor_speed` (ns,) rad/s; `speed` (ns, nd) rad/s
-    of the whirl, 0 where damping allows no oscillation; `decay` (ns, nd) 1/s, negative where the motion grows; `forward`
-    (ns, nd) whether it goes round with the rotor; `critical` the synchronous speeds.
+    **Attributes** (ns rotor speeds, nd natural motions each, ascending in speed)
+
+    - `rotor_speed`: (ns,) rad/s
+    - `speed`: (ns, nd) rad/s of the whirl, 0 where damping allows no oscillation
+    - `decay`: (ns, nd) 1/s, negative where the motion grows. An overdamped motion has two decays; this is the smaller, of the
+      displacement that creeps back. Several of them come by rising decay
+    - `forward`: (ns, nd) True if it goes round with the rotor, False if it turns against it or not at all
+    - `critical`: the synchronous speeds
+    - `status`: a `WhirlStatus`; motions that rounding hides are NaN
     """
 
-    status = Computed.done
-
+    status: WhirlStatus
     rotor_speed: Array = eqx.field(metadata=in_unit("rad/s", "rotor_speed"))
     speed: Array = eqx.field(metadata=in_unit("rad/s", "rotor_speed", "whirl"))
     decay: Array = eqx.field(metadata=in_unit("1/s", "rotor_speed", "whirl"))
@@ -84,9 +97,10 @@ class Whirl(Result):
         """The whirls at each rotor speed, and the critical speeds, for a person to read."""
         lines = []
         for n, *whirls in zip(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), strict=True):
-            shown = ", ".join(f"{w:.6g} {'forward' if f else 'backward'}" for w, f in zip(*whirls, strict=True))
+            shown = ", ".join(f"{w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
             lines.append(f"rotor {n:.6g} rad/s: whirl {shown} rad/s")
-        return "\n".join([*lines, self.critical.summary()])
+        lost = [self.message] if self.status_name != "done" else []
+        return "\n".join([*lines, *lost, self.critical.summary()])
 
     def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, the synchronous line with the
@@ -129,38 +143,79 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
     return _whirl(model, jnp.atleast_1d(speeds), loads)
 
 
+def _sense_word(speed: float, forward: bool) -> str:
+    if speed == 0.0:
+        return " (overdamped)"
+    return " forward" if forward else " backward"
+
+
 @cached
 def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
     carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
     gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
-    part = _TIE * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
+    part = _tie(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
 
-    def first_order(n: Array, coupling: Array) -> Array:
-        resisting = carrier.damping + n * gyroscopic + coupling
+    def first_order(resisting: Array) -> Array:
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
         return jnp.concatenate([jnp.eye(nd, 2 * nd, nd, dtype=mass.dtype), flow])
 
-    def one_of_each(values: Array) -> tuple[Array, Array]:
-        # Of each conjugate pair the one that turns forward in time; real ones, where damping is heavy, come last in pairs.
-        scale = jnp.max(jnp.abs(values))
-        oscillates = jnp.abs(values.imag) > 1e-12 * scale
-        order = jnp.argsort(jnp.where(oscillates, jnp.where(values.imag > 0.0, values.imag, jnp.inf), 0.0))
-        heavy = jnp.sum(~oscillates)
-        # Real eigenvalues come first in this order; every other one of them stands for a pair.
-        picks = jnp.where(jnp.arange(nd) < heavy // 2, 2 * jnp.arange(nd), jnp.arange(nd) + heavy - heavy // 2)
-        return order[picks], oscillates
+    def one_of_each(values: Array, stops: Array) -> tuple[Array, Array]:
+        # Of each conjugate pair the one that turns forward in time. Real ones come in pairs too, one of a displacement that
+        # creeps back and one of a velocity that stops: without gyroscopic coupling as many of each, see `_stopping`.
+        oscillates = jnp.abs(values.imag) > 1e-12 * jnp.max(jnp.abs(values))
+        rank = jnp.argsort(jnp.argsort(jnp.where(oscillates, jnp.inf, stops)))
+        creeps = rank < jnp.sum(~oscillates) // 2
+        speed = jnp.where(creeps, 0.0, jnp.where(oscillates & (values.imag > 0.0), values.imag, jnp.inf))
+        return jnp.lexsort((-values.real, speed))[:nd], oscillates
 
-    def at(n: Array) -> tuple[Array, Array, Array]:
-        values = jnp.linalg.eigvals(first_order(n, jnp.zeros_like(mass)))
-        chosen, oscillates = one_of_each(values)
-        speed = jnp.where(oscillates[chosen], values.imag[chosen], 0.0)
+    def at(n: Array) -> tuple[Array, Array, Array, Array]:
+        resisting = carrier.damping + n * gyroscopic
+        values = jnp.linalg.eigvals(first_order(resisting))
         # Two whirls of one speed are told apart by a coupling too small to be seen in the speeds.
-        apart, shapes = jnp.linalg.eig(jax.lax.stop_gradient(first_order(n, part)))
-        return speed, -values.real[chosen], _sense(carrier, shapes[:nd, one_of_each(apart)[0]]) > 0.0
+        coupled = jax.lax.stop_gradient(resisting + part)
+        apart, vectors = jnp.linalg.eig(jax.lax.stop_gradient(first_order(coupled)))
+        shapes = vectors[:nd]
+        stops, error = _stopping(jax.lax.stop_gradient((mass, coupled, carrier.stiffness)), apart, shapes)
+        nearest = jnp.argmin(jnp.abs(values[:, None] - apart[None, :]), axis=1)
+        chosen, oscillates = one_of_each(values, stops[nearest])
+        turns = oscillates[chosen]
+        forward = turns & (_sense(carrier, shapes[:, one_of_each(apart, stops)[0]]) > 0.0)
+        return jnp.where(turns, values.imag[chosen], 0.0), -values.real[chosen], forward, error[nearest][chosen] > TRUSTED
 
-    whirls = jax.vmap(at)(speeds)
-    return Whirl(speeds, *whirls, critical=_critical_speeds(model, loads))
+    speed, decay, forward, lost = jax.vmap(at)(speeds)
+    status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
+    speed, decay = (jnp.where(lost, jnp.nan, x) for x in (speed, decay))
+    return Whirl(status, speeds, speed, decay, forward, critical=_critical_speeds(model, loads))
+
+
+def _tie(dtype: np.dtype) -> float:
+    return max(_TIE, _TIE_ROUNDINGS * float(jnp.finfo(dtype).eps))
+
+
+def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array) -> tuple[Array, Array]:
+    """Kind of each natural motion, and the relative error of its eigenvalue.
+
+        (s^2 M + s C + K) x = 0,      m s^2 + c s + k = 0 with m = x^H M x, c = x^H C x, k = x^H K x
+
+    The kind is - Re(2 s + c/m): of the two real roots of a single equation it is negative for the slower one, in which damping
+    holds back what the spring pulls, and positive for the faster one, in which damping stops a mass. Several overdamped motions
+    are told apart by it too, whatever their roots: it is the sign characteristic of the Hermitian matrix polynomial.
+
+    The error is the step of Newton's method for the scalar equation, with the rounding of its terms counted.
+
+    **Arguments**: M, C (gyroscopic terms included) and K (nd, nd); `values` s (k,); `shapes` x (nd, k).
+    """
+    sizes = jnp.abs(shapes)
+    m, c, k = (jnp.sum(shapes.conj() * (matrix @ shapes), axis=0) for matrix in matrices)
+    rough = [jnp.sum(sizes * (jnp.abs(matrix) @ sizes), axis=0) for matrix in matrices]
+    slope, length = jnp.abs(2.0 * m * values + c), jnp.abs(values)
+    rounding = len(sizes) * jnp.finfo(sizes.dtype).eps * (rough[0] * length**2 + rough[1] * length + rough[2])
+    residual = jnp.abs((m * values + c) * values + k) + rounding
+    # Two roots that nearly coincide are apart by the square root of the rounding.
+    step = jnp.minimum(residual / jnp.where(slope > 0.0, slope, 1.0), jnp.sqrt(residual / m.real))
+    step = jnp.where(slope > 0.0, step, jnp.sqrt(residual / m.real))
+    return -(2.0 * values + c / m).real, step / length
 
 
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
@@ -186,14 +241,19 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     carrier, mass = model.carrier, _mass(model, loads)
     inertia = mass if carrier.gyroscopic is None else mass - 1j * carrier.gyroscopic
-    part = 1j * _TIE * jnp.trace(mass) * _sense_matrix(carrier)
+    part = 1j * _tie(mass.dtype) * jnp.trace(mass) * _sense_matrix(carrier)
     values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
     square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
     shapes = inverse.T @ hermitian_modes(square)[1]
     values, shapes = values[::-1], shapes[:, ::-1]
-    there = values > 1e-14 * jnp.max(values)
+    # A whirl 1e7 times as fast as the slowest one counts as none.
+    none = 1e-14 * jnp.max(values)
+    there, decided = values > none, jnp.abs(values) < none
+    error = hermitian_error(jax.lax.stop_gradient((inertia, carrier.stiffness)), values, shapes)
+    lost = ~decided & (error > 2.0 * TRUSTED)
     speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
-    return CriticalSpeeds(speed, _sense(carrier, shapes) > 0.0)
+    status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
+    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), _sense(carrier, shapes) > 0.0)
 
 
 def _two_directions(scene: Scene) -> LinearModel:
@@ -207,14 +267,18 @@ def _two_directions(scene: Scene) -> LinearModel:
             "whirl needs a rotor such as rotor(...)",
         )
     if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):
-        raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
+        single = carrier.stiffness.dtype.itemsize < 8
+        problem = "leaves a motion of the rotor without a spring" + (", as far as single precision can tell" if single else "")
+        raise InputError(
+            "machine.stiffness", f"{problem}; give every motion one{', or use double precision' if single else ''}"
+        )
     return model
 
 
 def _held(stiffness: np.ndarray) -> bool:
-    """Whether springs hold every motion, as far as rounding can tell."""
+    """True if springs hold every motion, as far as rounding can tell."""
     size = np.sqrt(np.where(np.diag(stiffness) > 0.0, np.diag(stiffness), 1.0))
-    rounding = 100.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps
+    rounding = 4.0 * stiffness.shape[0] * np.finfo(stiffness.dtype).eps
     return bool(np.all(np.linalg.eigvalsh(stiffness / np.outer(size, size)) > rounding))
 
 

@@ -208,3 +208,9 @@ def test_workers_of_a_machine_have_a_device_each(tmp_path):
     for one in workers[1:]:
         one.communicate("")
         assert one.returncode == 0
+
+
+def test_no_case_at_all_has_a_result_of_its_form():
+    found = many.in_chunks(4, lambda x, y: {"sum": x + y, "low": x[:, 0] < y}, np.zeros((0, 2)), shared=(1.0,))
+    assert found["sum"].shape == (0, 2) and found["low"].shape == (0,) and found["low"].dtype == bool
+    assert jax.jit(lambda x: many.in_chunks(4, jnp.sin, x))(jnp.zeros((0, 3))).shape == (0, 3)

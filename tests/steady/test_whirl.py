@@ -115,3 +115,80 @@ def test_whirls_of_one_speed_are_told_apart_in_machines_of_every_size(size):
 def test_springs_hold_whatever_the_units_of_their_coordinates():
     assert _held(1e-9 * np.eye(3)) and _held(np.diag([1e12, 1e-12]))
     assert not _held(1e10 * np.array([[1.0, 1.0], [1.0, 1.0]])) and not _held(np.diag([1e-9, 0.0]))
+
+
+def overdamped(translation, tilt, speed=0.0, polar=0.1):
+    """A rotor of 20 kg and 0.5 kg m^2 whose motions have these pairs of real roots -a, -b, 1/s, while it is at rest."""
+    (a, b), (c, d) = translation, tilt
+    machine = jv.rotor(
+        mass=20.0,
+        transverse_inertia=0.5,
+        polar_inertia=polar,
+        stiffness=(1.0, 1.0),
+        damping=(1.0, 1.0),
+        position=(0.2, -0.2),
+        stiffness_terms=[20.0 * a * b, 0.0, 0.5 * c * d],
+        damping_terms=[20.0 * (a + b), 0.0, 0.5 * (c + d)],
+    )
+    loads = jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0)
+    return jv.whirl(jv.Scene(machine, loads, jv.ConstantSpeed(60.0)), [speed], loads="none")
+
+
+@pytest.mark.parametrize(
+    ("translation", "tilt"), [((1.0, 9e3), (1.5, 2e4)), ((1.0, 100.0), (200.0, 300.0)), ((40.0, 50.0), (3.0, 800.0))]
+)
+def test_an_overdamped_motion_has_its_slower_decay(translation, tilt):
+    """m s^2 + c s + k = m (s + a) (s + b), a < b, whether the roots of the motions lie apart or between each other."""
+    found = overdamped(translation, tilt)
+    np.testing.assert_array_equal(found.speed, 0.0)
+    np.testing.assert_allclose(found.decay[0], sorted([translation[0]] * 2 + [tilt[0]] * 2), rtol=1e-6)
+    assert not np.any(found.forward) and found.summary().count("(overdamped)") == 4
+
+
+@pytest.mark.parametrize("speed", [1.0, 20.0, 60.0, 3e3])
+def test_overdamped_whirls_keep_their_decays_at_speed(speed):
+    """Across and up keep their real roots; tilts z = theta + i psi turn: 0.5 z'' + (c - 0.1 i n) z' + k z = 0."""
+    found = overdamped((1.0, 9e3), (1.5, 2e4), speed)
+    roots = np.roots([0.5, 0.5 * (1.5 + 2e4) - 0.1j * speed, 0.5 * 1.5 * 2e4])
+    roots = roots[np.argsort(np.abs(roots.imag))]
+    np.testing.assert_allclose(found.speed[0], [0.0, 0.0, *np.abs(roots.imag)], rtol=1e-4)
+    np.testing.assert_allclose(found.decay[0], [1.0, 1.0, *-roots.real], rtol=1e-6)
+    assert found.forward[0].tolist() == [False, False, *(roots.imag > 0.0)]
+
+
+def test_an_overdamped_motion_creeps_back_at_its_decay():
+    """A rotor on two stiff dampers, its equations integrated from a displacement at rest: x falls as exp(-1.0001 t)."""
+    c, k, m = 2e5, 2e5, 20.0
+    machine = jv.rotor(
+        mass=m, transverse_inertia=0.5, polar_inertia=0.1, stiffness=(1e5, 1e5), damping=(1e5, 1e5), position=(0.2, -0.2)
+    )
+    scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    decay = (c - np.sqrt(c**2 - 4.0 * k * m)) / (2.0 * m)
+    for speed in (0.0, 60.0):
+        found = jv.whirl(scene, [speed], loads="none")
+        assert int(np.sum(np.isclose(found.decay[0], decay, rtol=1e-9))) == 2
+
+
+@pytest.mark.parametrize("soft", [1e6, 1e4, 1e3, 300.0])
+def test_single_precision_says_which_whirls_it_loses(soft):
+    """Two supports of which one is soft: all is right to 1 % or NaN under a status of its own."""
+
+    def found(stiffness):
+        machine = jv.rotor(
+            mass=20.0, transverse_inertia=0.5, polar_inertia=0.1, stiffness=stiffness, damping=0.0, position=(0.2, -0.155)
+        )
+        scene = jv.Scene(machine, jv.balls(count=2, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+        return jv.whirl(scene, [0.0, 60.0])
+
+    exact = found((1e8, soft))
+    assert exact.status_name == "done" and exact.critical.status_name == "done"
+    with jax.enable_x64(False):
+        single = found((1e8, soft))
+        for ours, theirs in ((single, exact), (single.critical, exact.critical)):
+            speed, right = np.asarray(ours.speed, float), np.asarray(theirs.speed)
+            lost = np.isnan(speed)
+            assert ours.status_name == ("lost_digits" if np.any(lost) else "done")
+            np.testing.assert_allclose(speed[~lost & np.isfinite(right)], right[~lost & np.isfinite(right)], rtol=0.01)
+        assert bool(np.any(np.isnan(np.asarray(single.speed)))) == (soft < 1e4)
+        with pytest.raises(jv.InputError, match=r"as far as single precision can tell.*or use double precision"):
+            found((1e8, 10.0))

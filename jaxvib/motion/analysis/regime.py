@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
@@ -245,6 +245,6 @@ def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
     carrier = scene.machine.carrier()
     if carrier.gyroscopic is None:
-        return natural_frequencies(scene)
+        return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
     return jnp.sort(jnp.where(found.forward[0], found.speed[0], jnp.inf))

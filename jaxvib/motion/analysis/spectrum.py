@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import equinox as eqx
 import numpy as np
 
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -136,7 +136,7 @@ def spectrum_of(scene: Scene, window: Trajectory, trajectory: Trajectory | None,
         force=amplitudes(np.asarray(kept.foundation_force, float)),
         rotor_speed=means(speed),
         load_speed=means(np.mean(np.asarray(kept.state.azimuth_rate, float), axis=1)),
-        resonances=np.asarray(natural_frequencies(scene), float),
+        resonances=np.asarray(estimated_frequencies(scene), float),
         coordinates=structure.coordinates,
         units=structure.units,
     )

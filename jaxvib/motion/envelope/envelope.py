@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
 from jaxvib.equations.dynamics import State
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -211,7 +211,7 @@ def _run(
     field, nd = averaged_field(scene), begin.displacement.shape[0]
     frozen = jax.lax.stop_gradient(scene)
     units = _units(frozen)
-    speed, frequencies = frozen.drive.speed, natural_frequencies(frozen)
+    speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
     window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _LONGEST / speed)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]

@@ -162,11 +162,10 @@ def _jams_near(scene: Scene, parts: Parts, omega: np.ndarray, phase: np.ndarray)
     groups = _equal_loads(parts)
     starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
-    # Where a start was solved for hardly, the same jam comes out once more: what is distinct is told of the jams themselves.
-    # With nothing to solve from, one that is no jam: the arrays have their shapes, and end up empty.
-    first = (omega[starts_at[places]], phase[starts_at[places]]) if places else (np.array([float(parts.speed)]), phase[:1])
-    jams = in_chunks(_JAMS, lambda w, a: _jams_from(scene, w, a), *first)
-    found = np.flatnonzero(status_names(jams.status) == "found") if places else np.zeros(0, dtype=int)
+    # If a start was barely solved, the same jam comes out once more: only the jams themselves tell which are distinct.
+    first = starts_at[np.asarray(places, dtype=int)]
+    jams = in_chunks(_JAMS, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
+    found = np.flatnonzero(status_names(jams.status) == "found")
     places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]
     order = sorted(range(keep.size), key=lambda i: (-round(float(jams.omega[keep[i]]), 6), not jams.stable[keep[i]]))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.scene import Scene
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], j
     """The ranges of a branch and its special points (kind, load speed, rotor speed), for a person to read; how stability is
     `judged`."""
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
-    natural = ", ".join(f"{float(w):.6g}" for w in natural_frequencies(branch.scene))
+    natural = ", ".join(f"{float(w):.6g}" for w in estimated_frequencies(branch.scene))
     lines = [
         f"{omega.size} points from {np.min(omega):.6g} to {np.max(omega):.6g} rad/s, {np.mean(stable):.1%} of them stable "
         f"{judged}; resonances {natural} rad/s"
@@ -79,7 +79,7 @@ def picture(
     shown = {kind: np.array([(w, n) for k, w, n in marks if k == kind and n <= top]).reshape(-1, 2) for kind in kinds}
     rotor_speed = np.asarray(branch.rotor_speed)
     if resonances is None:
-        resonances = np.asarray(natural_frequencies(branch.scene))
+        resonances = np.asarray(estimated_frequencies(branch.scene))
     if modes is None:
         modes = 2 * np.searchsorted(resonances, np.asarray(branch.omega)) + (np.asarray(branch.slope) > 0.0)
     return branch_diagram(

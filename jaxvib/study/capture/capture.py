@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.equations.linear import natural_frequencies
+from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -212,7 +212,7 @@ def capture(
     shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
     shifts[0] = 0.0
     if stepsize_controller is None:
-        fastest = max(steps_per_second(scene), PER_RADIAN * float(jnp.max(natural_frequencies(scene))))
+        fastest = max(steps_per_second(scene), PER_RADIAN * float(jnp.max(estimated_frequencies(scene))))
         stepsize_controller = EqualSteps(max(16, math.ceil(end * fastest)))
 
     def outcomes(which: np.ndarray) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """A phase pattern followed over the load speed."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -91,3 +92,31 @@ def test_more_starts_than_fit_are_refused():
             jv.phase_jams(scene, starts=10**12)
         fit.append(int(str(error.value).split("; ")[1].split()[0]))
     np.testing.assert_allclose(fit[0] / fit[1], 3.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("speed", "damping", "count"), [(5.0, 843.0, 1), (5.0, 0.0, 1), (460.0, 0.0, 1), (5.0, 843.0, 2)])
+def test_no_jam_is_an_empty_result(speed, damping, count):
+    """Far below the resonance no load needs what its drag takes."""
+    machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=damping)
+    loads = jv.pendulums(count=count, mass=0.05, radius=0.08, drag=0.04)
+    found = jv.phase_jams(jv.Scene(machine, loads, jv.ConstantSpeed(speed)), starts=8)
+    assert found.omega.shape == (0,) and found.phase.shape == (0, count) and found.starts.shape == (0,)
+    assert found.summary() == "no jam" and found.plot().axes
+
+
+def test_jams_come_by_falling_speed_and_stable_ones_first(monkeypatch):
+    speeds, growth = np.array([200.0, 410.0, 200.0, 300.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    phases = np.array([[0.0, 0.5], [0.0, 1.0], [0.0, 1.5], [0.0, 2.0]])
+    one = phase_jam(SCENE, 165.0, jnp.zeros(2))
+
+    def solved(scene, omega, phase):
+        jams = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], len(omega), axis=0), one)
+        rate = growth[np.argmin(np.abs(phase[:, None, 1] - phases[None, :, 1]), axis=1)]
+        return eqx.tree_at(lambda j: (j.omega, j.phase, j.growth, j.stable), jams, (omega, phase, rate, rate < 0.0))
+
+    monkeypatch.setattr(phase_search, "_balanced_many", lambda parts, omega, phase: (omega, phase))
+    monkeypatch.setattr(phase_search, "_jams_from", solved)
+    found = phase_search._jams_near(SCENE, parts_of(SCENE), speeds, phases)
+    np.testing.assert_array_equal(found.omega, [410.0, 300.0, 200.0, 200.0])
+    np.testing.assert_array_equal(found.stable, [False, True, True, False])
+    np.testing.assert_array_equal(found.growth, [1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,46 @@
+"""Natural frequencies beside what rounding leaves of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvib as jv
+
+
+def two_masses(support, link):
+    """Two masses of 10.1 kg, the first on a support, joined by a link."""
+    machine = jv.two_mass(
+        mass=(10.1, 10.0), stiffness=(support, 0.0), damping=(1.0, 1.0), link_stiffness=link, link_damping=1.0, exciter=2
+    )
+    return jv.Scene(machine, jv.balls(count=1, mass=0.1, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+
+
+def closed(support, link):
+    """m w^2 = [(k + 2 l) -+ sqrt(k^2 + 4 l^2)] / 2, the lower one from the product k l of both."""
+    high = (support + 2.0 * link + np.hypot(support, 2.0 * link)) / 2.0
+    return np.sqrt(np.array([support * link / high, high]) / 10.1)
+
+
+@pytest.mark.parametrize(("double", "support", "link"), [(True, 1e3, 1e12), (False, 1e4, 1e6), (False, 3e3, 3e7)])
+def test_natural_frequencies_are_right_or_refused(double, support, link):
+    with jax.enable_x64(double):
+        found = jv.natural_frequencies(two_masses(support, link))
+        np.testing.assert_allclose(np.asarray(found, float), closed(support, link), rtol=0.01)
+
+
+@pytest.mark.parametrize(("double", "support", "link"), [(True, 1.0, 1e15), (False, 1e3, 1e8), (False, 1.0, 1e8)])
+def test_natural_frequencies_without_digits_are_refused(double, support, link):
+    with jax.enable_x64(double):
+        scene = two_masses(support, link)
+        with pytest.raises(jv.ComputationError, match=r"lost_digits: rounding hides a natural frequency: use double precision"):
+            jv.natural_frequencies(scene)
+        found = jax.jit(jv.natural_frequencies)(scene)
+        assert jnp.isnan(found[0]) and abs(float(found[1]) / closed(support, link)[1] - 1.0) < 1e-3
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_a_carrier_that_is_free_to_drift_has_frequency_0(double):
+    with jax.enable_x64(double):
+        found = jv.natural_frequencies(two_masses(0.0, 1e8))
+        np.testing.assert_allclose(found, closed(0.0, 1e8), rtol=1e-3)
