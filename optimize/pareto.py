@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
-from jaxvib.errors import ComputationError
+from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
@@ -30,7 +31,10 @@ __all__ = ["Front", "pareto"]
 
 
 _ALIKE = 1e-6
-"""Machines whose quantities differ by less, relative, are one point."""
+"""Machines whose quantities differ by less, in parts of the range that the front covers, are one point."""
+
+_NO_LIMIT = 1e100
+"""A limit that no quantity reaches."""
 
 
 class Front(Result):
@@ -48,7 +52,9 @@ class Front(Result):
     machines: tuple[str, ...]
 
     def scene(self, k: int) -> Scene:
-        """The machine behind a point."""
+        """The machine behind point `k`, counted from 0. **Raises** `InputError` for a point that the front does not have."""
+        if count(k, "k", low=0) >= len(self.machines):
+            raise InputError("k", f"is {k}; the points of this front are numbered 0 to {len(self.machines) - 1}")
         return scene_from_toml(self.machines[k])
 
     def summary(self) -> str:
@@ -88,44 +94,61 @@ def pareto(
     starts: int = 32,
     seed: int = 0,
 ) -> Front:
-    """The trade-off of two quantities that both shall be small: the least of the first for each of some limits on the second.
+    """Return the trade-off of two quantities that are both to be small.
 
-    The limits are spread evenly from the second's least value to what it is where the first is least. Each point is a search
-    of its own; all of them share their programs.
+    Each end of the front is the least value of one quantity and, among the machines that have it, the least of the other one.
+    Between the ends, limits on the second quantity are spread evenly: each point is the least of the first under its limit,
+    then the least of the second at that value of the first. Every point is a search of its own (two, counting the second
+    step); all of them share their programs. Machines that another one beats are left out.
 
     **Arguments**: `points` at most so many machines, the rest as `synthesize`.
 
-    **Returns** `Front`, machines with the least `first` first; a single one where it is the best of both. **Raises** as
+    **Returns** `Front`, machines with the least `first` first; a single one if it is the best of both. **Raises** as
     `synthesize`.
     """
     count(points, "points", low=2)
-
-    def search(objective: Quantity, demands: Sequence[Demand]) -> Synthesis:
-        return synthesize(space, objective, subject_to=demands, starts=starts, seed=seed, verify=False)
+    given = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
 
     def both(found: Synthesis) -> tuple[float, float]:
         return float(first(found.scene)), float(second(found.scene))
 
-    given = list(subject_to)
-    ends = [search(first, given), search(second, given)]
-    (_, worst), (_, least) = (both(end) for end in ends)
-    found = [ends[0]]
-    # Where one machine is the best of both there is nothing to give up.
-    limits = [] if np.isclose(worst, least, rtol=_ALIKE, atol=0.0) else np.linspace(worst, least, points)[1:]
-    for limit in limits:
-        try:
-            found.append(search(first, [*given, second < float(limit)]))
-        except ComputationError:  # the least value itself may be out of reach by a rounding
-            continue
+    def searched(objective: Quantity, other: Quantity, limit: float) -> list[Synthesis]:
+        """The least of the objective where the other quantity keeps the limit; then the least of that quantity among the
+        machines whose objective is as small."""
+        best = synthesize(space, objective, subject_to=[*given, other < limit], starts=starts, seed=seed, verify=False)
+        # A flat objective is least at many machines, of which the first search ends at any.
+        alike = [*given, objective < float(objective(best.scene))]
+        then = synthesize(space, other, subject_to=alike, begin=best, seed=seed, verify=False, throw=False)
+        return [best, then] if then.status_name != "contradictory" else [best]
+
+    # Limits that nothing reaches: machines without the other quantity are left out, and all searches share two programs.
+    lowest = searched(first, second, _NO_LIMIT)
+    highest = searched(second, first, _NO_LIMIT)
+    (_, worst), (_, least) = both(lowest[-1]), both(highest[-1])
+    found = [*lowest, *highest]
+    for limit in np.linspace(worst, least, points)[1:-1] if worst > least else ():
+        with contextlib.suppress(ComputationError):  # a search may miss a narrow range of feasible machines
+            found += searched(first, second, float(limit))
     values = np.asarray([both(each) for each in found])
-    kept: list[int] = []
-    for k, own in enumerate(values):
-        beaten = np.any(np.all(values < own * (1.0 - 1e-9 * np.sign(own)), axis=1))
-        if not beaten and not any(np.allclose(values[j], own, rtol=_ALIKE, atol=0.0) for j in kept):
-            kept.append(k)
+    kept = not_dominated(values)
     return Front(
         values=values[kept],
         names=(first.words, second.words),
         units=(first.unit, second.unit),
         machines=tuple(scene_to_toml(found[k].scene) for k in kept),
     )
+
+
+def not_dominated(values: np.ndarray) -> list[int]:
+    """Return the rows of `values` (n, q) that no other row equals or beats, by their first column; of rows that are alike, one.
+
+    A row counts as no worse than another one if it exceeds it by less than 1e-6 of the range of each column, or 1e-7 of the
+    largest value where that is more: no search keeps its demands better.
+    """
+    span = np.maximum(np.ptp(values, axis=0), 0.1 * np.max(np.abs(values), axis=0))
+    scaled = values / np.where(span > 0.0, span, 1.0)
+    kept: list[int] = []
+    for k in np.argsort(np.sum(scaled, axis=1), kind="stable"):  # no row is beaten by one with a larger sum
+        if not any(np.all(scaled[j] <= scaled[k] + _ALIKE) for j in kept):
+            kept.append(int(k))
+    return sorted(kept, key=lambda k: (values[k, 0], -values[k, 1]))

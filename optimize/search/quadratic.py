@@ -130,7 +130,7 @@ def elastic(
             return dx, ds, target / slack - weight * ds
 
         def longest(value: np.ndarray, step: np.ndarray) -> np.ndarray:
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 return np.minimum(1.0, np.where(step < 0.0, -value / step, np.inf).min(axis=1))
 
         _, ds, dl = solved(-slack * dual)
