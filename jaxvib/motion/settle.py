@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from jax import Array
 
 from jaxvib.equations.dynamics import State
+from jaxvib.equations.linear import linear_model
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -18,6 +21,7 @@ from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
+from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import count, number
@@ -32,6 +36,9 @@ _REMEMBERED = 32
 
 _SCATTER = 3.6
 """The means over the four quarters of these lie within so many of their standard errors where they are the same (95 %)."""
+
+_AWAY = 10.0
+"""A settled motion may still be so many drifts away from its end."""
 
 _FALLS = -3.0
 """A drift whose logarithm falls by so many standard errors of its slope is not there to stay."""
@@ -60,8 +67,10 @@ def settle(
     **Arguments**
 
     - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
-    - `drift`: the change that counts as none, see `Measured`; where it is given the motion must come to less. Unless said
-      otherwise it is 1e-6, in single precision 1e-3, and a motion that is steady in the mean has settled too
+    - `drift`: the change that counts as none, see `Measured`; if it is given the motion must come to less. The default is 1e-6,
+      in single precision 1e-3, and a motion that is steady in the mean has settled too. What the motion is still away from
+      its end, estimated from the slowest decay of the carrier or from how the drift falls, must be below ten times as much:
+      with little damping a motion changes slowly long before it has settled
     - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
     - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
@@ -99,12 +108,15 @@ def settle(
     slow = float(slowest) or float(scene.drive.speed)  # 0 where programs are compiled only, see `compiled_together`
     stretch = whole_turns(scene, 2.0 * math.pi * periods / slow)
     remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
+    decay = _slowest_decay(scene)
     seen: list[list[float]] = []
-    run, together = None, True
+    run, together, ended = None, True, False
     for _ in range(count(stretches, "stretches")):
         run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
         together = together and bool(run.together)
-        if float(run.drift) < drift or status_name(run.status) != "done":
+        drifts = [*(each[0] for each in seen), float(run.drift)]
+        ended = drifts[-1] < drift and _distance(drifts, run, decay, stretch) < _AWAY * drift
+        if ended or status_name(run.status) != "done":
             break
         seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
         if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
@@ -113,7 +125,7 @@ def settle(
         state = last_state(scene, run)
     assert run is not None
     run = dataclasses.replace(run, together=on_device(np.asarray(together)))
-    if throw and not (float(run.drift) < drift or status_name(run.status) == "beating"):
+    if throw and not (ended or status_name(run.status) == "beating"):
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
@@ -122,6 +134,38 @@ def settle(
     if throw and mode is not None:
         _require_mode(scene, run, mode)
     return run
+
+
+@cached
+def _matrices(scene: Scene) -> tuple[Array, Array, Array]:
+    model = linear_model(scene)
+    return model.mass, model.carrier.stiffness, model.damping(scene.drive.speed)
+
+
+def _slowest_decay(scene: Scene) -> float:
+    """The slowest rate at which free vibrations of the carrier with its loads decay, 1/s; 0 if one of them does not."""
+    mass, stiffness, damping = (np.asarray(matrix, float) for matrix in _matrices(scene))
+    flow = np.linalg.solve(mass, -np.concatenate([stiffness, damping], axis=1))
+    poles = np.linalg.eigvals(np.concatenate([np.eye(len(mass), 2 * len(mass), len(mass)), flow]))
+    slowest = float(np.min(-poles.real))
+    return slowest if slowest > 1e-12 * float(np.max(np.abs(poles))) else 0.0
+
+
+def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -> float:
+    """How far a motion is from its end, relative, estimated from the drifts of its stretches so far.
+
+    A distance that decays at the rate a falls by 1 - exp(-a T) of itself from one half of the measuring window to the other,
+    T apart: that fall is the drift. Free vibrations that beat with the jam make some drifts small by chance, so the largest of
+    three counts unless they decay within a window. The rate is the carrier's slowest `decay`, or if it has none the one at
+    which drifts fall from stretch to stretch, of the time `stretch` each.
+    """
+    half, recent = 0.5 * float(run.window.time[-1] - run.window.time[0]), max(drifts[-3:])
+    if decay == 0.0 and len(drifts) >= 6 and recent > 0.0:
+        decay = max(math.log(max(drifts[-6:-3]) / recent) / (3.0 * stretch), 0.0)
+    fall = -math.expm1(-decay * half)
+    if recent == 0.0:
+        return 0.0
+    return math.inf if fall == 0.0 or (fall < 0.5 and len(drifts) < 3) else recent / fall
 
 
 def _steady_in_the_mean(seen: np.ndarray) -> bool:

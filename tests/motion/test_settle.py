@@ -1,15 +1,17 @@
 """Runs until nothing changes: where they end, and how they go on from stretch to stretch."""
 
+from types import SimpleNamespace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import scene
+from scenes import published, scene
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
-from jaxvib.motion.settle import _steady_in_the_mean
+from jaxvib.motion.settle import _distance, _slowest_decay, _steady_in_the_mean
 from jaxvib.motion.simulate import last_state, whole_turns
 
 
@@ -209,3 +211,41 @@ def test_less_than_half_the_drift_is_not_seen(share, steady):
     drift = 1e-3 * np.resize([0.9, 1.1, 1.1, 0.9], 128)
     values = 5.0 * (1.0 + share * np.median(drift) * np.repeat([0.0, 0.0, 0.0, 1.0], 32))
     assert _steady_in_the_mean(np.column_stack([drift, values, values, values])) == steady
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_weakly_damped_motions_settle_at_the_exact_one(count):
+    """Free vibrations, which lose 1e-4 of themselves a radian, carry most of the force of an antiphase machine."""
+    s = published(damping=1e-4, count=count).scene()
+    run, exact = jv.settle(s, mode=3), jv.jam_orbit(s, mode=3)
+    np.testing.assert_allclose(run.foundation_force, exact.foundation_force, rtol=1e-5)
+    np.testing.assert_allclose(run.amplitude, exact.amplitude, rtol=1e-6)
+    assert float(run.drift) < 1e-6
+
+
+def test_the_slowest_decay_is_that_of_the_free_carrier():
+    """x'' + 2 z w x' + w^2 x = 0 decays at z w; heavily damped at w^2/(2 z w) about; an undamped platform not at all."""
+    s = scene("one_mass", "rollers")
+    mass = 50.0 + 0.5
+    np.testing.assert_allclose(_slowest_decay(s), 30.0 / (2.0 * mass), rtol=1e-9)
+    heavy = eqx.tree_at(lambda s: s.machine.damping, s, jnp.array([1e5]))
+    np.testing.assert_allclose(_slowest_decay(heavy), min(-np.roots([mass, 1e5, 4e4])), rtol=1e-6)
+    two = eqx.tree_at(lambda s: (s.machine.damping, s.machine.link_damping), scene("two_mass"), (jnp.zeros(2), jnp.zeros(1)))
+    assert _slowest_decay(two) == 0.0
+
+
+def test_the_distance_from_the_end_follows_from_decays():
+    """exp(-a t) falls by 1 - exp(-a T) of itself from one half of the window to the other."""
+    run = SimpleNamespace(window=SimpleNamespace(time=np.array([3.0, 5.0])))
+
+    def far(drifts, decay):
+        return _distance(drifts, run, decay, 10.0)
+
+    np.testing.assert_allclose(far([1e-3], 1.0), 1e-3 / (1.0 - np.exp(-1.0)), rtol=1e-12)
+    weak = 1.0 - np.exp(-0.1)
+    assert far([1e-3], 0.1) == far([1e-3, 1e-4], 0.1) == np.inf  # a single drift may be small by chance
+    np.testing.assert_allclose(far([9.0, 1e-4, 1e-3, 1e-5], 0.1), 1e-3 / weak, rtol=1e-12)
+    # Without a decay of the carrier that of the drifts counts: the largest of three fall to a hundredth in three stretches.
+    falling = [1e-2, 5e-3, 1e-3, 1e-4, 2e-5, 1e-5]
+    np.testing.assert_allclose(far(falling, 0.0), 1e-4 / (1.0 - 100.0 ** (-1.0 / 30.0)), rtol=1e-12)
+    assert far(falling[::-1], 0.0) == far(falling[:5], 0.0) == np.inf and far([0.0], 0.0) == 0.0

@@ -17,10 +17,21 @@ from jaxvib.ode.scalarize import scalarized_vmap
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 
-__all__ = ["LEAST", "STATE", "AbstractMeasured", "Measured", "Trajectory", "mean_speeds", "measure", "unmeasured"]
+__all__ = [
+    "LEAST",
+    "STATE",
+    "AbstractMeasured",
+    "Measured",
+    "Trajectory",
+    "mean_speeds",
+    "measure",
+    "natural_force",
+    "unmeasured",
+]
 
 LEAST = 1e-4
-"""Changes of amplitudes below this share of the unbalance radius S/M, such as a balanced rotor's, are told relative to that."""
+"""Changes are relative to no less than this share of the unbalance radius S/M, of forces to S n^2: a balanced rotor has next to
+no amplitude and force of its own."""
 
 STATE = {
     "displacement": in_unit("m or rad", "coordinate"),
@@ -54,10 +65,13 @@ class AbstractMeasured(eqx.Module):
 
     **Attributes**: `omega` mean speed of the loads over whole turns, rad/s; `load_speed` (count,) the same for each load;
     `amplitude` (nd,) m, of tilts rad, and `foundation_force` N, zero to peak, that is half of peak to peak, where it has two
-    directions the root of the sum of both squares; `drift` the largest change of an amplitude from the first to the second half
-    of those turns, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M where that is more (a balanced
-    rotor has no amplitude of its own), or the relative change of `omega` where that is more; `settled` whether it is
-    below 1e-3.
+    directions the root of the sum of both squares; `drift` the largest of three relative changes from the first to the second
+    half of those turns; `settled`: True if it is below 1e-3. The changes are
+
+    - of an amplitude, relative to the largest amplitude or to 1e-4 of the unbalance radius S/M where that is more (a balanced
+      rotor has no amplitude of its own);
+    - of the foundation force, relative to the largest one or to 1e-4 of S n^2, n the rotor's speed, where that is more;
+    - of the loads' speeds, relative to `omega`.
     """
 
     omega: Array = eqx.field(metadata=in_unit("rad/s"))
@@ -102,8 +116,9 @@ def measure(scene: Scene, field: Field, times: Array, states: State, unit: State
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
     speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
-    top = jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
-    drift = jnp.max(jnp.abs(late - early)[:nd]) / top
+    change = jnp.abs(late - early)
+    drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
+    force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), LEAST * natural_force(scene, unit))
     omega = jnp.mean(speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
@@ -111,8 +126,14 @@ def measure(scene: Scene, field: Field, times: Array, states: State, unit: State
         load_speed=speeds,
         amplitude=whole[:nd],
         foundation_force=whole[nd] if whole.shape[0] == nd + 1 else jnp.sqrt(jnp.sum(whole[nd:] ** 2)),
-        drift=jnp.maximum(drift, speed_drift),
+        drift=jnp.maximum(jnp.maximum(drift, force_drift), speed_drift),
     )
+
+
+def natural_force(scene: Scene, unit: State) -> Array:
+    """S n^2 N: the loads' unbalance turning with the rotor at its speed n; `unit` the scene's `natural_units`."""
+    (speed,) = unit.rate
+    return jnp.mean(jnp.diagonal(scene.machine.carrier().mass)) * unit.displacement * speed**2
 
 
 def unmeasured(states: State) -> Measured:

@@ -19,7 +19,7 @@ from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.analysis.measure import LEAST, Measured
+from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
@@ -309,15 +309,17 @@ def _measure(scene: Scene, window: Envelopes) -> Measured:
     amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
-    top, omega = jnp.maximum(jnp.max(amplitude), LEAST * natural_units(scene).displacement), jnp.mean(speeds)
-    drift = jnp.max(change) / top
+    unit, omega = natural_units(scene), jnp.mean(speeds)
+    drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), LEAST * unit.displacement)
+    force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
+    force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), LEAST * natural_force(scene, unit))
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,
         load_speed=speeds,
         amplitude=amplitude,
         foundation_force=force[0] if force.shape[0] == 1 else jnp.sqrt(jnp.sum(force**2)),
-        drift=jnp.maximum(drift, speed_drift),
+        drift=jnp.maximum(jnp.maximum(drift, force_drift), speed_drift),
     )
 
 

@@ -1,5 +1,6 @@
 """Amplitudes, speeds and forces read from samples of a motion."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -146,3 +147,32 @@ def test_rounding_counts_for_every_step_and_radian():
     np.testing.assert_allclose(estimated_error(1e-4, 0.5, s), 5e-5, rtol=1e-12)
     bent = scene("one_mass", "balls", effects=(jv.Stop(1e6, gap=1e-3),))
     np.testing.assert_allclose(estimated_error(1e-4, 0.5, bent), 2e-4, rtol=1e-12)
+
+
+def test_a_force_that_changes_alone_is_a_drift():
+    """k1 y1 + k2 y2 = k2 d where y1 = a cos, y2 = d - k1/k2 y1: amplitudes repeat themselves to 1e-6 while d grows by half."""
+    s = scene("two_mass", "balls")
+    s = eqx.tree_at(lambda s: s.machine.damping, s, jnp.zeros(2))
+    w, a, size, end = 50.0, 0.01, 1e-8, 8.0
+    t = jnp.linspace(0.0, end, 4001)
+    ratio = float(s.machine.stiffness[0] / s.machine.stiffness[1])
+
+    def moving(t):
+        d = size * (1.0 + 0.5 * t / end) * jnp.cos(w * t)
+        return jnp.stack([a * jnp.cos(w * t), d - ratio * a * jnp.cos(w * t)])
+
+    displacement = jax.vmap(moving)(t)
+    velocity = jax.vmap(jax.jacfwd(moving))(t)
+    turning = jnp.broadcast_to((w * t)[:, None], (4001, 3))
+    states = jv.State(displacement, velocity, (turning,), (jnp.full((4001, 3), w),))
+
+    def field(t, y):
+        return jv.State(y.velocity, jax.jacfwd(jax.jacfwd(moving))(t), y.rate, (jnp.zeros(3),))
+
+    force, mass = 3e4 * 1.5 * size, float(jnp.mean(jnp.diagonal(s.machine.carrier().mass)))
+    for least, share in ((0.0, 0.25 / 1.5), (1e4 * force, 0.25 / 1.5 / 1e4)):
+        # Far below the loads' centrifugal force, length * mass * n^2, a change is relative to 1e-4 of that.
+        length = jnp.asarray(least / 1e-4 / mass / 120.0**2)
+        unit = eqx.tree_at(lambda u: u.displacement, natural_units(s), length)
+        measured = stored_jit(measure)(s, jax.tree_util.Partial(field), t, states, unit)
+        np.testing.assert_allclose(measured.drift, share, rtol=0.02)

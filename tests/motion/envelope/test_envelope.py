@@ -252,8 +252,8 @@ def test_what_cannot_be_averaged_is_refused(change, says):
 
 
 def test_what_is_measured_of_a_window():
-    """Amplitudes of millimetres, the larger one 3 % larger in the later half; loads that speed up, the mean of the later half
-    1 % above that of all."""
+    """Forces, the larger one of which grows from 3 to 4 N; amplitudes of millimetres, the larger one 3 % larger in the later
+    half; loads that speed up, the mean of the later half 1 % above that of all."""
     late = np.arange(8) >= 4
     window = SimpleNamespace(
         time=np.arange(8.0),
@@ -262,10 +262,12 @@ def test_what_is_measured_of_a_window():
         load_speed=jnp.full((8, 2), 50.0),
     )
     found = _measure(published().scene(), window)
-    np.testing.assert_allclose(found.drift, 0.03 / 1.03, rtol=1e-9)
+    np.testing.assert_allclose(found.drift, 0.25, rtol=1e-9)
     np.testing.assert_allclose(found.amplitude, [1.03e-3, 2e-4])
     np.testing.assert_allclose(found.foundation_force, 5.0)
     np.testing.assert_allclose([found.omega, *found.load_speed], 50.0)
+    window.foundation_force = jnp.full((8, 2), 4.0)
+    np.testing.assert_allclose(_measure(published().scene(), window).drift, 0.03 / 1.03, rtol=1e-9)
     window.load_speed = jnp.asarray(np.where(late, 50.5, 49.5)[:, None] + np.zeros(2))
     window.amplitude = jnp.full((8, 2), 1e-3)
     np.testing.assert_allclose(_measure(published().scene(), window).drift, 0.01, rtol=1e-9)
