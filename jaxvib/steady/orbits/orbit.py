@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.equations.linear import JammedModel
+from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
 from jaxvib.numerics.roots import bracketed_root
@@ -29,6 +30,7 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
+from jaxvib.units import count
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -104,7 +106,14 @@ class Orbit(Result):
         return _at(self, theta if isinstance(theta, Array) else np.asarray(theta, self.offsets.dtype))
 
     def relative_amplitude(self, i: int, j: int) -> Array:
-        """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period."""
+        """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period.
+
+        **Raises** `InputError` for a coordinate that the machine does not have.
+        """
+        most = self.displacement_harmonics.shape[-2]
+        for name, coordinate in (("i", i), ("j", j)):
+            if count(coordinate, name) > most:
+                raise InputError(name, f"is {coordinate}; the coordinates are numbered 1 to {most}")
         return _relative_amplitude(self.orders, self.displacement_harmonics, i, j)
 
     def force_peaks(self) -> Array:

@@ -1,6 +1,7 @@
 """Exact jams against the full equations, solved by other means."""
 
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -18,7 +19,7 @@ import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
-from jaxvib.steady.orbits.orbit import _peaks, _swing
+from jaxvib.steady.orbits.orbit import Orbit, _peaks, _swing
 
 
 class Shaker(jv.Machine):
@@ -375,3 +376,12 @@ def test_peaks_are_found_from_samples_that_mislead():
     dense = np.max((harmonics @ np.exp(1j * orders[:, None] * np.linspace(0.0, 2.0 * np.pi, 200001))).real, axis=1)
     for one, highest in zip(harmonics, dense, strict=True):
         np.testing.assert_allclose(_peaks(orders, jnp.asarray(one)).max(), highest, rtol=3e-9)
+
+
+def test_relative_amplitudes_count_coordinates_from_one():
+    """Amplitudes 2 and 5 in antiphase: 7 apart; 0 is no coordinate, and not the last one."""
+    orbit = SimpleNamespace(orders=(1,), displacement_harmonics=jnp.array([[2.0 + 0.0j], [-5.0 + 0.0j]]))
+    np.testing.assert_allclose(Orbit.relative_amplitude(orbit, 1, 2), 7.0, rtol=1e-9)
+    for i, j in ((0, 1), (1, 0), (-1, 1), (3, 1), (1, 3), (True, 2)):
+        with pytest.raises(jv.InputError, match=r"whole number, at least 1|numbered 1 to 2"):
+            Orbit.relative_amplitude(orbit, i, j)
