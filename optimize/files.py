@@ -149,8 +149,8 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
 TEMPLATE = """# A design: which numbers of the scene may change, what keeps its value, what is wanted.
 scene = "machine.toml"            # path of the scene file, from here
 
-[free]                            # bounds, SI or with units; of every support, also of one that is not there yet (0);
-                                  # machine.stiffness[0] frees one entry only
+[free]                            # bounds, SI or with units; of every support that is there: 0 stays 0;
+                                  # machine.stiffness[0] frees one entry, also of a support that is not there yet
 "machine.stiffness" = ["10 N/mm", "200 N/mm"]
 "machine.link_stiffness" = ["50 N/mm", "500 N/mm"]    # of a single platform leave this line out
 

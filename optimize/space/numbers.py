@@ -17,7 +17,7 @@ from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
 from jaxvib.units import FIELD_UNITS, Number, number
 
-__all__ = ["Place", "changed", "names_of", "places_of", "shown_unit", "value_of"]
+__all__ = ["Place", "changed", "names_of", "places_of", "present_places", "set_present", "shown_unit", "value_of"]
 
 _EFFECT_UNITS = {"static_imbalance.moment": "kg m", "moment_imbalance.moment": "kg m^2"}
 """Units of the numbers of effects that may be named."""
@@ -59,6 +59,28 @@ def changed(scene: Scene, place: Place, values: Array) -> Scene:
     leaf = place.leaf(scene)
     new = jnp.reshape(values, jnp.shape(leaf)) if place.entry is None else leaf.at[place.entry].set(values[0])
     return eqx.tree_at(place.leaf, scene, new)
+
+
+def present_places(scene: Scene, place: Place, field: str) -> tuple[Place, ...]:
+    """The place itself; if it is an array with zeros, the places of the other entries: a spring or damper of 0 is one that the
+    machine does not have, and it is added only if its entry is named.
+
+    **Raises** `InputError`, of `field`, for an array that is 0 in every entry.
+    """
+    values = np.asarray(place.leaf(scene))
+    if place.entry is not None or values.ndim == 0 or np.all(values != 0.0):
+        return (place,)
+    if not np.any(values):
+        advice = f"name the entry that shall be added, for example {place.name}[0]"
+        raise InputError(f"{field}.{place.name}", f"is 0 in every entry, and zeros stay as they are; {advice}")
+    return tuple(Place(place.path, int(k), f"{place.name}[{k}]", place.unit, 1) for k in np.flatnonzero(values))
+
+
+def set_present(scene: Scene, place: Place, value: float) -> Scene:
+    """The scene with this value in that place; zeros of an array stay, see `present_places`."""
+    now, new = place.read(scene), jnp.full(place.size, value)
+    several = place.entry is None and jnp.ndim(place.leaf(scene)) > 0
+    return changed(scene, place, jnp.where(now != 0.0, new, now) if several else new)
 
 
 def _all(scene: Scene) -> dict[str, tuple[tuple[str | int, ...], str, Array]]:

@@ -14,7 +14,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
-from optimize.space.numbers import Place, changed, names_of, places_of
+from optimize.space.numbers import Place, changed, names_of, places_of, present_places
 from optimize.wishes.answers import Answers
 from optimize.wishes.quantity import Quantity, require_quantity
 
@@ -79,11 +79,12 @@ class DesignSpace(eqx.Module):
 
     - `scene`: the design the search begins with
     - `free`: name to (low, high), SI or text with units; a name such as "machine.stiffness" frees every entry of an array
-      (each within the bounds), "machine.stiffness[0]" one of them, "loads.drag" the one number all loads share, "drive.speed"
-      the rotor's speed; (low, high, "log") divides the range by ratio, (low, high, "even") evenly
+      that is not 0 (each within the bounds), "machine.stiffness[0]" one of them, also a spring that is not there yet (0),
+      "loads.drag" the one number all loads share, "drive.speed" the rotor's speed; (low, high, "log") divides the range by
+      ratio, (low, high, "even") evenly
     - `hold`: quantities that keep their value, made by `optimize.hold`; sums and products too (`total`, `product`)
     - `ties`: name to what it follows: another number's name (equal), (name, factor), or (name, "keep") for the ratio that both
-      have in the scene
+      have in the scene; zeros of an array stay, as in `free`
     - `choices`: name to the values that can be had, such as the springs of a catalogue; "loads.count" to numbers of loads
 
     Inside, a design is a vector z in [0, 1]^d; ranges over a factor of 10 or more are divided by ratio, others evenly, unless
@@ -126,30 +127,27 @@ class DesignSpace(eqx.Module):
         chosen, counts = _chosen(scene, choices or {})
         if not free and not chosen:
             raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
-        ranges = {name: _bounds(scene, name, bounds) for name, bounds in free.items()}
+        ranges = [(name, *_bounds(scene, name, bounds)) for name, bounds in free.items()]
         for name, values in chosen.items():
-            if name in ranges:
+            if name in free:
                 raise InputError(f"choices.{name}", "is free already; name it once, as free or as a choice")
             wide = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
-            ranges[name] = (places_of(scene, name, "choices"), values[0], values[-1], wide)
+            ranges.append((name, places_of(scene, name, "choices"), values[0], values[-1], wide))
         taken: set = set()
-        for name, (place, *_) in ranges.items():
-            if place.entries & taken:
+        free_places, lows, highs, logs, choices_ = [], [], [], [], []
+        for name, whole, low, high, log in ranges:
+            if whole.entries & taken:
                 raise InputError(f"free.{name}", "frees a number that is free already; name each one once")
-            taken |= place.entries
+            taken |= whole.entries
+            for place in present_places(scene, whole, "choices" if name in chosen else "free"):
+                if name in chosen:
+                    choices_ += [Choice(name, chosen[name], len(lows) + k) for k in range(place.size)]
+                free_places.append(place)
+                lows, highs, logs = lows + [low] * place.size, highs + [high] * place.size, logs + [log] * place.size
         self.scene = scene
-        self.places = tuple(place for place, *_ in ranges.values())
-        self.low = np.concatenate([np.full(p.size, low) for p, low, _, _ in ranges.values()])
-        self.high = np.concatenate([np.full(p.size, high) for p, _, high, _ in ranges.values()])
-        self.logs = tuple(log for p, _, _, log in ranges.values() for _ in range(p.size))
+        self.places, self.logs, self.choices = tuple(free_places), tuple(logs), tuple(choices_)
+        self.low, self.high = np.asarray(lows), np.asarray(highs)
         self.ties = _tied(scene, ties or {}, taken)
-        starts = np.cumsum([0, *(p.size for p in self.places)])
-        where = {p.name: int(start) for p, start in zip(self.places, starts, strict=False)}
-        self.choices = tuple(
-            Choice(name, values, where[name] + k)
-            for name, values in chosen.items()
-            for k in range(places_of(scene, name, "choices").size)
-        )
         self.counts = counts
         for held in hold:
             if not isinstance(held, Held):
@@ -283,6 +281,8 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
             ratio = np.full(target.size, float(factor))
         else:
             raise InputError(f"ties.{name}", f"has the factor {factor!r}; give a number greater than 0, or 'keep'")
+        if target.entry is None and target.leaf(scene).ndim > 0:  # what the machine does not have follows nothing
+            ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
             raise InputError(f"ties.{name}", f"keeps its ratio to {source_name}, which is 0 in the scene; give a factor")
         taken = taken | target.entries

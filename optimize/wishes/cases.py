@@ -16,7 +16,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
-from optimize.space.numbers import Place, changed, places_of, value_of
+from optimize.space.numbers import Place, changed, places_of, set_present, value_of
 from optimize.wishes.answers import Answers, Key, Recorder
 from optimize.wishes.quantity import Quantity, require_quantity
 
@@ -35,8 +35,7 @@ class Changed:
     def scenes(self, scene: Scene) -> Scene:
         """The scene with these values."""
         for name, value in self.values:
-            place = places_of(scene, name, "under")
-            scene = changed(scene, place, jnp.full(place.size, value))
+            scene = set_present(scene, places_of(scene, name, "under"), value)
         return scene
 
 
@@ -158,7 +157,7 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     """A quantity at another operating point or under another load: some numbers of the scene have other values.
 
     **Arguments**: `quantity`; `name` of the case, for tables; `changes` the name of a number, such as "drive.speed" or
-    "machine.mass[0]", to its value, SI or text with a unit.
+    "machine.mass[0]", to its value, SI or text with a unit; the name of an array changes each of its entries that is not 0.
 
     **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, where it is computed, a name that the
     scene does not have.

@@ -107,3 +107,28 @@ def test_a_tie_keeps_no_ratio_to_what_is_nothing():
     ties = {"machine.stiffness": ("machine.damping", "keep")}
     with pytest.raises(jv.InputError, match=r"machine\.damping, which is 0 in the scene"):
         DesignSpace(half, {"loads.drag": (1.0, 2.0)}, ties=ties)
+
+
+def test_springs_that_are_not_there_stay_away():
+    """Zeros of an array are freed, tied and chosen only if they are named."""
+    chain = scene("network")  # supports 1e4, 0, 0, 2e4, 1e3
+    space = DesignSpace(chain, {"machine.stiffness": (1e3, 9e4, "even"), "loads.drag": (1.0, 2.0)})
+    assert space.size == 4 and [place.name for place in space.places[:2]] == ["machine.stiffness[0]", "machine.stiffness[3]"]
+    np.testing.assert_allclose(space.at(jnp.array([0.0, 0.5, 1.0, 0.0])).machine.stiffness, [1e3, 0.0, 0.0, 4.55e4, 9e4])
+    assert space.words()[1] == ("stiffness of support 4", "N/m")
+    chosen = DesignSpace(chain, {"loads.drag": (1.0, 2.0)}, choices={"machine.stiffness": [1e3, 2e3, 9e3]})
+    assert [choice.start for choice in chosen.choices] == [1, 2, 3] and chosen.size == 4
+    np.testing.assert_allclose(chosen.low, [1.0, 1e3, 1e3, 1e3])
+    for tie in (("machine.stiffness[0]", 0.5), ("machine.stiffness[0]", "keep"), "machine.stiffness[0]"):
+        tied = DesignSpace(chain, {"machine.stiffness[0]": (1e4, 9e4)}, ties={"machine.damping": tie})
+        np.testing.assert_array_equal(
+            np.asarray(tied.at(jnp.array([0.5])).machine.damping) > 0.0, [True, False, False, True, True]
+        )
+    named = DesignSpace(chain, {"machine.stiffness[1]": (0.0, 1e4)}, ties={"machine.stiffness[2]": "machine.stiffness[1]"})
+    np.testing.assert_allclose(named.at(jnp.array([0.5])).machine.stiffness, [1e4, 5e3, 5e3, 2e4, 1e3])
+    free = eqx.tree_at(lambda s: s.machine.stiffness, chain, jnp.zeros(5))
+    for more in ({"free": {"machine.stiffness": (1.0, 2.0)}}, {"free": {}, "choices": {"machine.stiffness": [1.0, 2.0]}}):
+        with pytest.raises(jv.InputError, match=r"machine\.stiffness is 0 in every entry.*machine\.stiffness\[0\]"):
+            DesignSpace(free, **more)
+    one = eqx.tree_at(lambda s: s.loads.drag, SCENE, jnp.asarray(0.0))
+    assert DesignSpace(one, {"loads.drag": (0.0, 2.0)}).size == 1  # a number that all loads share is named by itself

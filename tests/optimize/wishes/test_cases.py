@@ -100,3 +100,12 @@ def test_jams_are_followed_in_every_case():
     samples = spread.parts[0].case.scenes(there)
     mean = np.mean([of(jax.tree.map(lambda a, k=k: a[k], samples)) for k in range(2)])
     np.testing.assert_allclose(point.values[0], [of(here), mean / 200.0 - 1.0], rtol=1e-9)
+
+
+def test_cases_add_no_springs():
+    """The name of an array changes what the machine has; an entry is changed by its own name."""
+    chain = scene("network")
+    budget = Quantity("k", "N/m", lambda s: s.machine.stiffness @ jnp.array([1.0, 10.0, 100.0, 1e3, 1e4]))
+    assert float(under(budget, "x", {"machine.stiffness": 2.0})(chain)) == 2.0 * 11001.0
+    assert float(under(budget, "x", {"machine.stiffness": 2.0, "machine.stiffness[1]": 3.0})(chain)) == 2.0 * 11001.0 + 30.0
+    assert float(under(Quantity("d", "", lambda s: s.loads.drag), "x", {"loads.drag": 7.0})(chain)) == 7.0
