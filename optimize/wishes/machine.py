@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import linear_model
@@ -55,22 +57,24 @@ def _budget(answers: Answers, tier: Tier) -> Array:
     return jnp.sum(machine.stiffness / jnp.diagonal(answers.model.mass))
 
 
-def _entries(field: str, what: str) -> tuple[str, str, str]:
+def _entries(field: str, what: str) -> tuple[str, str, str, str]:
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     if part not in ("machine", "loads") or name not in FIELD_UNITS:
         raise InputError("field", f"is {field!r}; it must name numbers of a scene, for example 'machine.stiffness'")
-    return part, name, f"{what} {field}"
+    return part, name, f"{what} {field}", f"all {_WORDS.get(field, field)}"
 
 
 def _leaf(scene: Scene, part: str, name: str) -> Array:
+    """The entries of an array of the scene; a number that all loads share counts once for each load."""
     leaf = getattr(getattr(scene, part), name, None)
     if not isinstance(leaf, jax.Array):
         raise InputError("field", f"is '{part}.{name}', which this scene does not have")
-    return leaf
+    return jnp.broadcast_to(leaf, (scene.loads.count,)) if part == "loads" and leaf.ndim == 0 else leaf
 
 
 def total(field: str) -> Quantity:
-    """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
+    """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries; a number that all loads share,
+    such as "loads.mass", counts once for each load.
 
     **Returns** `Quantity`. **Raises** `InputError` for a name that no scene has.
 
@@ -78,8 +82,8 @@ def total(field: str) -> Quantity:
     >>> total("machine.stiffness").unit
     'N/m'
     """
-    part, name, called = _entries(field, "total")
-    return _asking(called, FIELD_UNITS[name], _total, f"sum of all {_WORDS.get(name, name)}", part, name)
+    part, name, called, words = _entries(field, "total")
+    return _asking(called, FIELD_UNITS[name], _total, f"sum of {words}", part, name)
 
 
 def _total(answers: Answers, tier: Tier, part: str, name: str) -> Array:
@@ -87,7 +91,8 @@ def _total(answers: Answers, tier: Tier, part: str, name: str) -> Array:
 
 
 def product(field: str) -> Quantity:
-    """The product of an array of the scene, such as "machine.stiffness"; its unit is that of its entries' product, left out.
+    """The product of an array of the scene, such as "machine.stiffness", see `total`; its unit, that of its entries' product,
+    is left out.
 
     **Returns** `Quantity`. **Raises** `InputError` for a name that no scene has.
 
@@ -95,8 +100,8 @@ def product(field: str) -> Quantity:
     >>> product("machine.mass").words
     'product of all masses of platforms'
     """
-    part, name, called = _entries(field, "product of")
-    return _asking(called, "", _product, f"product of all {_WORDS.get(name, name)}", part, name)
+    part, name, called, words = _entries(field, "product of")
+    return _asking(called, "", _product, f"product of {words}", part, name)
 
 
 def _product(answers: Answers, tier: Tier, part: str, name: str) -> Array:
@@ -104,11 +109,15 @@ def _product(answers: Answers, tier: Tier, part: str, name: str) -> Array:
 
 
 _WORDS = {
-    "mass": "masses of platforms",
-    "stiffness": "support stiffnesses",
-    "damping": "support dampings",
-    "link_stiffness": "link stiffnesses",
-    "link_damping": "link dampings",
+    "machine.mass": "masses of platforms",
+    "machine.stiffness": "support stiffnesses",
+    "machine.damping": "support dampings",
+    "machine.link_stiffness": "link stiffnesses",
+    "machine.link_damping": "link dampings",
+    "loads.mass": "masses of loads",
+    "loads.drag": "drags of loads",
+    "loads.radius": "track radii of loads",
+    "loads.inertia": "moments of inertia of loads",
 }
 
 
@@ -133,10 +142,10 @@ def _mass(answers: Answers, tier: Tier) -> Array:
 def static_deflection(of: int | None = None) -> Quantity:
     """How far a platform sags under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
 
-    **Arguments**: `of` the platform; the largest of all unless said otherwise.
+    **Arguments**: `of` the platform; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`, NaN where nothing carries the platforms. A machine without platforms, or without that one, raises
-    `InputError` where the quantity is computed.
+    **Returns** `Quantity`, NaN for a platform that no support carries, directly or by links. A machine without platforms, or
+    without that one, raises `InputError` where the quantity is computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection
@@ -152,20 +161,35 @@ def static_deflection(of: int | None = None) -> Quantity:
 
 
 def _sag(answers: Answers, tier: Tier, of: int | None) -> Array:
-    _platforms(answers.scene, "the deflection")
-    model = linear_model(answers.scene)
-    sag = jnp.linalg.solve(model.carrier.stiffness, _GRAVITY * jnp.diagonal(model.mass))
+    machine = _platforms(answers.scene, "the deflection")
+    model, carried = linear_model(answers.scene), _carried(machine)
+    # The stiffness matrix of platforms that nothing carries is singular up to rounding: they are held here, and told as NaN.
+    held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
+    sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
     if of is not None and of > sag.shape[0]:
         raise InputError("of", f"is {of}; the machine has platforms 1 to {sag.shape[0]}")
-    value = jnp.max(jnp.abs(sag)) if of is None else jnp.abs(sag[of - 1])
-    return jnp.where(jnp.isfinite(value), value, jnp.nan)
+    sag = jnp.where(carried, jnp.abs(sag), jnp.nan)
+    return jnp.max(sag) if of is None else sag[of - 1]
+
+
+def _carried(machine: Platforms) -> Array:
+    """True (n,) for each platform that stands on a support or is joined, by links, to one that does."""
+    n = machine.mass.shape[0]
+    joined = jnp.eye(n, dtype=bool)
+    for (i, j), stiffness in zip(machine.links, machine.link_stiffness, strict=True):
+        joined = joined.at[[i - 1, j - 1], [j - 1, i - 1]].max(stiffness > 0.0)
+    for _ in range(max(n - 1, 1).bit_length()):  # each product doubles the length of the paths that count
+        joined = jnp.any(joined[:, :, None] & joined[None], axis=1)
+    return jnp.any(joined & (machine.stiffness > 0.0)[None], axis=1)
 
 
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
-    """What the springs of supports and links cost, from a price list: prices between two entries are interpolated.
+    """What the springs of supports and links cost, from a price list.
 
-    **Arguments**: `prices` pairs (stiffness N/m or text, price), stiffness ascending; a spring of stiffness 0 costs nothing;
-    `unit` of the prices.
+    Prices between two entries are interpolated. Beyond an end of the list they go on as between its last two entries there,
+    but never below the price at that end. A spring of stiffness 0 costs nothing.
+
+    **Arguments**: `prices` pairs (stiffness N/m or text, price), stiffness ascending, prices at least 0; `unit` of the prices.
 
     **Returns** `Quantity`. **Raises** `InputError` for a list that is no such list.
 
@@ -180,6 +204,9 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     price = tuple(float(p) for _, p in rows)
     if not all(a < b for a, b in itertools.pairwise(stiffness)) or not stiffness[0] > 0.0:
         raise InputError("prices", "has stiffnesses that do not ascend from one greater than 0")
+    for i, each in enumerate(price):
+        if not 0.0 <= each < math.inf:
+            raise InputError(f"prices[{i}]", f"has the price {each:g}; a price must be at least 0 and finite")
     return _asking("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
 
 
@@ -187,4 +214,5 @@ def _cost(answers: Answers, tier: Tier, stiffness: tuple[float, ...], price: tup
     machine = _platforms(answers.scene, "the cost of springs")
     springs = jnp.concatenate([jnp.ravel(machine.stiffness), jnp.ravel(machine.link_stiffness)])
     each = jnp.interp(springs, jnp.asarray(stiffness), jnp.asarray(price), left="extrapolate", right="extrapolate")
-    return jnp.sum(jnp.where(springs > 0.0, each, 0.0))
+    least = jnp.where(springs < stiffness[0], price[0], jnp.where(springs > stiffness[-1], price[-1], 0.0))
+    return jnp.sum(jnp.where(springs > 0.0, jnp.maximum(each, least), 0.0))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.units import Number
+from jaxvib.units import Number, count
 from optimize.wishes.answers import Answers
 from optimize.wishes.given import number_in
 from optimize.wishes.quantity import Asking, Quantity, Tier
@@ -56,6 +56,7 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     >>> settling_time(until="20 s", spin_up="5 s").unit
     's'
     """
+    count(of, "of")
     if not 0.0 < within < 1.0:
         raise InputError("within", f"is {within!r}; it must be greater than 0 and less than 1")
     text = f"time until platform {of} settles"

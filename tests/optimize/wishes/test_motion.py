@@ -56,3 +56,9 @@ def test_the_peak_of_a_force_is_its_largest_modulus():
     force = jnp.stack([3.0 * jnp.sin(TIME), 4.0 * jnp.sin(TIME)], axis=1) * jnp.exp(-TIME)[:, None]
     top = float(jnp.sin(jnp.pi / 4.0) * jnp.exp(-jnp.pi / 4.0))
     np.testing.assert_allclose(peak_force(until=10.0, spin_up=2.0).read(answers(TIME, force)), 5.0 * top, rtol=1e-5)
+
+
+def test_platforms_are_counted_from_one():
+    for wrong in (0, -1, True, 1.0, None):
+        with pytest.raises(jv.InputError, match="of is"):
+            settling_time(until=10.0, spin_up=2.0, of=wrong)
