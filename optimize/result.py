@@ -29,6 +29,13 @@ _TELLING = 1000.0
 """Changes of more per cent are told in the objective's unit."""
 
 
+_LINEAR = 10.0
+"""The largest change of the objective, in per cent, that is told from its slope."""
+
+_LEAST_MOVE = 1e-6
+"""The smallest move of a limit, in per cent, that is told."""
+
+
 class SynthesisStatus(eqx.Enumeration):
     """How a search ended; the members are the sentences a user reads."""
 
@@ -73,10 +80,14 @@ class Row(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """A demand, something held, or a bound: `what` in words; its `value` and `limit` in SI `unit`; by how much it is `broken`
-    (0: kept), in parts of the limit; whether it is `active`; the `multiplier`, the objective's change where the limit is moved
-    by the whole of itself to where it hinders less (what is held: upward); `gain`, that change in per cent of the objective
-    where the limit is moved by 1 %: negative is an improvement."""
+    """A demand, a held quantity, or a bound.
+
+    **Attributes**: `what` in words; its `value` and `limit` in SI `unit`; by how much it is `broken`, in parts of the limit (0:
+    kept; infinite: the machine has no such value); whether it is `active`; the `multiplier`, the slope of the objective over
+    the limit, times the limit, toward where it hinders less (what is held: upward); `gain`, the change of the objective in per
+    cent that this slope gives for a limit moved by 1 %: negative is an improvement. A gain of more than some per cent is beyond
+    what a slope can tell.
+    """
 
     what: str
     unit: str
@@ -86,6 +97,13 @@ class Limit(NamedTuple):
     active: bool
     multiplier: float
     gain: float
+
+    def shortfall(self) -> str:
+        """How far the machine is from keeping a broken limit, in words."""
+        if not math.isfinite(self.broken):
+            return "the nearest machine found has no such value"
+        unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))
+        return f"at best {f'{self.value * factor:.5g} {unit}'.rstrip()}, {100.0 * self.broken:.3g} % off"
 
 
 class Influence(NamedTuple):
@@ -182,9 +200,9 @@ class Synthesis(Result):
             unit, factor = shown_unit(limit.unit, max(abs(limit.value), abs(limit.limit)))
             values = f"{limit.value * factor:.5g} {unit}".rstrip()
             if limit.broken > 0.0:
-                lines.append(f"  not met: {limit.what}; at best {values}, {100.0 * limit.broken:.3g} % off")
+                lines.append(f"  not met: {limit.what}; {limit.shortfall()}")
             elif limit.active:
-                lines.append(f"  at its limit: {limit.what} ({values}); moved by 1 %: {changed(limit.gain)}")
+                lines.append(f"  at its limit: {limit.what} ({values}); {_if_moved(limit.gain)}")
             else:
                 lines.append(f"  met: {limit.what} ({values})")
         ranked = sorted(self.influences, key=lambda i: -max(abs(i.less), abs(i.more)))
@@ -226,6 +244,17 @@ def _aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     return [
         ["  " + row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))] for row in rows
     ]
+
+
+def _if_moved(gain: float) -> str:
+    """The change of the objective, in per cent, if a limit is moved, from the `gain` for 1 %: by so little that the slope still
+    tells it, at most a tenth of the objective."""
+    share = 1.0
+    while abs(gain) * share > _LINEAR:
+        share /= 10.0
+    if share < _LEAST_MOVE:
+        return "beside its slope the objective is almost nothing"
+    return f"moved by {share:g} %: about {gain * share:+.3g} % of the objective"
 
 
 def wanted(objective: str) -> str:

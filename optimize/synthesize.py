@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.checked import checked
@@ -19,6 +20,8 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
 from jaxvib.runtime.devices import on_device
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import count
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Found, Options, Searcher, choose, require_searcher
@@ -37,6 +40,9 @@ _CONVERGED = 1e-6
 
 _SAME = 1e-3
 """How near two designs must be, relative to the ranges of the free numbers, to count as the same machine."""
+
+_SPREAD = 1e-3
+"""Largest angle by which loads start beside the exact motion, rad."""
 
 Tell = Callable[[str, float], None]
 
@@ -125,9 +131,7 @@ def synthesize(
     told = reported((*(q for _, q in named), objective, *sides), batch, problem)
     limits = limits_of(problem, demands, found, told[1, len(named) + 1 :].reshape(-1, 2))
     if throw and not kept[best]:
-        broken = "; ".join(
-            f"{x.what}: at best {x.value:.5g} {x.unit}, {100.0 * x.broken:.3g} % off" for x in limits if x.broken
-        )
+        broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
         raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
     tell("checking", 0.9)
     verify = verify and bool(kept[best])
@@ -220,12 +224,23 @@ def _searched(
         if best is None or _rank(found) < _rank(best[2]):
             best = here, problem, found
     if best is None:
+        missing = _missing(space, objective, demands, options)
         raise ComputationError(
             "no_feasible_start",
-            f"of the random designs in the bounds ({options.starts} starts) none has {objective.words}; widen the bounds or "
-            "ask for another mode",
+            f"of the random designs in the bounds ({options.starts} starts) none has {missing}; widen the bounds or ask for "
+            "another mode",
         )
     return best
+
+
+def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
+    """The quantities of a search that no random design has, in words."""
+    sides = (q for demand in demands for q in (demand.quantity, demand.limit))
+    every = tuple(dict.fromkeys((objective, *(held.quantity for held in space.held), *sides)))
+    z = np.random.default_rng(options.seed).uniform(size=(options.starts, space.size))
+    values = reported(every, made(problem_of(space, objective, (), options.starts), space.numbers(z)))
+    absent = [q.words for q, there in zip(every, np.any(np.isfinite(values), axis=0).tolist(), strict=True) if not there]
+    return " or ".join(absent) or "all of: " + ", ".join(q.words for q in every)
 
 
 def _rank(found: Found) -> tuple[bool, float]:
@@ -243,14 +258,40 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
 
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:
+    """The full equations of a machine, integrated until they have settled in a jam mode; or why there is no such run."""
     if mode is None:
         return None, "the objective and the demands belong to no jam mode that could be integrated"
     if not verify:
         return None, "not asked for"
-    try:
-        return settle(scene, mode=mode), ""
-    except ComputationError as error:  # the machine that was found is worth more than the check that failed
+    try:  # the machine that was found is worth more than the check that failed
+        orbit = _exact_motion(scene, mode)
+        if orbit is None:
+            return settle(scene, mode=mode), ""
+        if not bool(orbit.stable):
+            return None, f"mode {mode} is unstable: the largest multiplier of its exact motion is {float(orbit.multiplier):.4g}"
+        run = settle(scene, start=_beside(orbit))
+    except ComputationError as error:
         return None, str(error)
+    if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME:
+        return None, f"the motion left mode {mode} and settled at {float(run.omega):.6g} rad/s"
+    return run, ""
+
+
+def _exact_motion(scene: Scene, mode: int) -> Orbit | None:
+    """The exact motion of a jam mode; None if there is none, or for a scene that its theory cannot include."""
+    try:
+        orbit = jam_orbit(scene, mode=mode, throw=False)
+    except (InputError, ComputationError):
+        return None
+    return orbit if math.isfinite(float(orbit.multiplier)) else None
+
+
+def _beside(orbit: Orbit) -> State:
+    """A state of the exact motion, with loads at slightly different angles: an unstable motion then leaves it. A machine with
+    little damping takes thousands of periods to come to the same motion from a start to leading order."""
+    displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
+    spread = _SPREAD * np.linspace(-1.0, 1.0, len(angle)) if len(angle) > 1 else np.zeros(1)
+    return State(displacement, velocity, (angle + spread,), rate)
 
 
 def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
@@ -284,7 +325,10 @@ def _table(
     """Free numbers and quantities before and after."""
     start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.places]) for s in (space.scene, scene))
     numbers = zip(space.words(), start, end, strict=True)
-    table = [Row(word, unit, float(a), float(b), math.nan, math.nan) for (word, unit), a, b in numbers]
+    table = [
+        Row(f"{word} (new)" if a == 0.0 != b else word, unit, float(a), float(b), math.nan, math.nan)
+        for (word, unit), a, b in numbers
+    ]
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)
         table.append(Row("number of loads", "", *counts, math.nan, math.nan))

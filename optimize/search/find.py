@@ -13,7 +13,7 @@ import numpy as np
 from jaxvib.errors import InputError
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
-from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, polish
+from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
 from optimize.search.problem import Point, Problem, evaluate, looked_up
 from optimize.space.space import DesignSpace
 from optimize.wishes.cases import Robust
@@ -138,7 +138,7 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     if point is None or len(point.z) == 0:
         return None
     history.append(point.values[None, :, 0])
-    last = point
+    begun = last = point
 
     def said(what: str, low: float, high: float) -> Callable[[float, Point], None]:
         def tell_of(share: float, now: Point) -> None:
@@ -160,13 +160,16 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         ended = polish(problem, last, 0, lambda *_: None)
     history.append(ended.history)
     # Followed jams may have changed their numbers: the whole branch says which they are.
-    point = _of_their_mode(problem, ended.point)
-    violation = np.where(point.exists(), ended.violation, np.inf)
+    point, broken, left, optimal = _of_their_mode(problem, ended.point), ended.violation, ended.left, ended.optimality
+    lost = ~point.exists()
+    if np.any(lost):  # a machine that has the mode is worth more than a better one that lost it on the way
+        point = _of_their_mode(problem, begun).where(lost, point)
+        broken, left, optimal = violation(problem, point), np.where(lost, np.inf, left), optimality(problem, point)
     bounds = np.asarray(problem.space.low), np.asarray(problem.space.high)
     # Of an evolution there is one value a generation; starts begin behind it.
     wide = max(part.shape[1] for part in history)
     whole = np.concatenate([np.broadcast_to(part, (len(part), wide)) for part in history])
-    return Found(point, whole, ended.left, violation, ended.optimality, drawn, existing, interrupted, bounds)
+    return Found(point, whole, left, broken, optimal, drawn, existing, interrupted, bounds)
 
 
 def _of_their_mode(problem: Problem, point: Point) -> Point:
@@ -255,7 +258,7 @@ def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.nd
         return None
     ended: Polished = polish(narrow, point, max(options.polishing, 20), lambda *_: None)
     kept = _of_their_mode(narrow, ended.point)
-    violation = np.where(kept.exists(), ended.violation, np.inf)
-    if not np.any(np.isfinite(violation)):
+    broken = np.where(kept.exists(), ended.violation, np.inf)
+    if not np.any(np.isfinite(broken)):
         return None
-    return Found(kept, ended.history, ended.left, violation, ended.optimality, 0, 0, False, (low, high))
+    return Found(kept, ended.history, ended.left, broken, ended.optimality, 0, 0, False, (low, high))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optimize.search.problem import Point, Problem, evaluate
-from optimize.search.quadratic import elastic
+from optimize.search.quadratic import Solved, elastic
 
 __all__ = ["Step", "at_kink", "curvatures", "fall", "least_norm", "modelled", "seconds", "transposed", "unlike"]
 
@@ -141,7 +141,7 @@ def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray,
     demands = point.slopes[:, 1 + m :], point.values[:, 1 + m :]
     if problem.parts == 1:
         found = elastic(bend, point.slopes[:, 0] / size[:, None], held, demands, box, price)
-        return Step(found.p, found.held, found.demands, np.ones((len(bend), 1)))
+        return Step(found.p, found.held, found.demands * _active(found, demands), np.ones((len(bend), 1)))
     values = (point.pieces - point.values[:, :1]) / size[:, None]
     slopes = point.tilts / size[:, None, None]
     # Those that could be the largest within reach, and not more than may be at one kink and some to spare.
@@ -165,7 +165,15 @@ def modelled(problem: Problem, point: Point, bend: np.ndarray, size: np.ndarray,
     shares = np.zeros_like(point.pieces)
     np.put_along_axis(shares, few, found.demands[:, mi:], axis=1)
     shares = shares / np.maximum(np.sum(shares, axis=1, keepdims=True), 1e-300)
-    return Step(found.p[:, :d], found.held, found.demands[:, :mi], shares)
+    return Step(found.p[:, :d], found.held, found.demands[:, :mi] * _active(found, demands), shares)
+
+
+def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """True (s, mi) for demands (slopes, excess) that the step has no room left for. An interior point leaves every other one a
+    small multiplier: its curvature would be left out, and beside an objective of almost nothing it would be large."""
+    slopes, excess = demands
+    room = -excess - np.einsum("smd,sd->sm", slopes, found.p[:, : slopes.shape[2]])
+    return found.demands[:, : excess.shape[1]] > room
 
 
 def fall(problem: Problem, point: Point, bend: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:

@@ -19,6 +19,9 @@ FEASIBLE = 1e-8
 _AT_REST = 1e-10
 """A fall below this that no step brings is not to be had: derivatives of an exact motion have that rounding."""
 
+_HIDDEN, _ROUNDING = 1e-13, 1e-15
+"""A fall of less than this, relative, is hidden in the rounding of the objective."""
+
 _EVEN = 4
 """Steps back onto a kink, each to first order."""
 
@@ -195,7 +198,10 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             first = merits[0] <= merits[-1]
             new, new_merit = tried[0].where(first, tried[-1]), np.minimum(merits[0], merits[-1])
             kept = violation(problem, new) < np.maximum(FEASIBLE, violation(problem, here))
-            better = new_merit < _merit(problem, here, size[index], price[index])
+            merit = _merit(problem, here, size[index], price[index])
+            better = new_merit < merit
+            # The last step, quadratically convergent: rounding of the objective hides its fall, and slopes still show the way.
+            better |= kept & (left[index] < _HIDDEN) & (new_merit <= merit + _ROUNDING * np.abs(merit))
             better |= kept & (violation(problem, here) > FEASIBLE) & new.exists()
             point = point.put(index, new.where(better, here))
             step = np.max(np.abs(np.where(first[:, None], models[0].p, models[-1].p)), axis=1)
@@ -204,7 +210,7 @@ def polish(problem: Problem, point: Point, steps: int, tell: Callable[[float, Po
             seen[index] = np.clip(dual, -1e6, 1e6)
             shares[index] = model.shares
             least = violation(problem, here) < 1e-10
-            at_rest = least & ~short & ((left[index] < 1e-13) | (~better & (left[index] < _AT_REST)))
+            at_rest = least & ~short & ((left[index] < _HIDDEN) | (~better & (left[index] < _AT_REST)))
             still[index] = ~(at_rest | (~better & (reach[index] <= 1e-9)))
             moved = np.zeros_like(still)
             moved[index] = better & still[index]

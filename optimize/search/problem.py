@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
@@ -29,6 +30,9 @@ __all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "proble
 
 _CHUNK = 64
 """Designs that are evaluated together on a core."""
+
+_NOTHING = 1e-9
+"""Values below this share of what a quantity is at other designs are roundings of 0."""
 
 Known = tuple[Any, ...]
 """Load speeds near which jams are followed, an array with a leading axis over the designs for each key."""
@@ -154,16 +158,26 @@ class Point(NamedTuple):
 
 
 def problem_of(space: DesignSpace, objective: Quantity, demands: Sequence[Demand], starts: int = _CHUNK) -> Problem:
-    """The search, with what it follows and the scale of each demand: that of its limit, or of its value at the beginning."""
+    """The search, with what it follows and the scale of each demand: its limit, or its value at the beginning; 1 if both are 0,
+    exactly or up to rounding."""
     forms = tuple(demand.form() for demand in demands)
     keys, parts = _followed(space, objective, forms)
     constants = np.asarray([demand.constant or 0.0 for demand in demands], float)
     scales = np.abs(constants)
     if np.any(scales == 0.0):
-        sides = tuple(q for d in demands for q in (d.quantity, d.limit))
-        found = np.abs(reported(sides, jax.tree.map(lambda leaf: leaf[None], space.scene))[0]).reshape(-1, 2).max(axis=1)
+        found = _sizes(space, tuple(q for d in demands for q in (d.quantity, d.limit))).reshape(-1, 2).max(axis=1)
         scales = np.where(scales > 0.0, scales, np.where(np.isfinite(found) & (found > 0.0), found, 1.0))
     return Problem(space, objective, forms, keys, constants, scales, _lanes(starts), parts)
+
+
+def _sizes(space: DesignSpace, quantities: tuple[Quantity, ...]) -> np.ndarray:
+    """The modulus of each quantity (q,) at the beginning; 0 for what is nothing beside its change over the bounds."""
+    z = np.random.default_rng(0).uniform(size=(7, space.size))
+    scenes = _made(space, on_device(space.numbers(z)))
+    batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, scenes)
+    values = np.abs(reported(quantities, batch))
+    largest = np.max(values, axis=0, initial=0.0, where=np.isfinite(values))
+    return np.where(values[0] < _NOTHING * largest, 0.0, values[0])
 
 
 def derive(

@@ -36,12 +36,12 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
         at = float(held.value)
         unit, factor = shown_unit(held.quantity.unit, abs(at))
         what = f"{held.quantity.words} held at {at * factor:.5g} {unit}".rstrip()
-        broken = abs(off) if abs(off) > 10.0 * FEASIBLE else 0.0
+        broken = 0.0 if abs(off) <= 10.0 * FEASIBLE else abs(off) if np.isfinite(off) else np.inf
         value = float(at * (1.0 + off))
         rows.append(Limit(what, held.quantity.unit, value, at, float(broken), True, float(-dual), gain(-dual)))
     for k, demand in enumerate(demands):
         excess, dual, scale = values[1 + m + k], duals.demands[best, k], float(problem.scales[k])
-        broken = excess if excess > 10.0 * FEASIBLE else 0.0
+        broken = 0.0 if excess <= 10.0 * FEASIBLE else excess if np.isfinite(excess) else np.inf
         active = bool(excess > -1e-6)
         share = -dual * abs(sides[k, 1]) / scale if active else 0.0
         value, limit = float(sides[k, 0]), float(sides[k, 1])

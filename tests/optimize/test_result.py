@@ -34,7 +34,7 @@ def test_limits_influences_and_machines_are_said_in_a_designers_units(searched):
     influences = (*(Influence(f"number {k}", float(k), -float(k) / 2.0) for k in range(7)), Influence("last", -1.5, 9.0))
     machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
     said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).said()
-    assert said[0] == "  at its limit: first at most 2 mm (2 mm); moved by 1 %: -0.5 % of the objective"
+    assert said[0] == "  at its limit: first at most 2 mm (2 mm); moved by 1 %: about -0.5 % of the objective"
     assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
@@ -80,3 +80,23 @@ def test_fronts_are_shown_in_units_of_their_largest_values():
         pareto(
             DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}), total("machine.stiffness"), total("machine.mass"), points=1
         )
+
+
+def test_shortfalls_are_told_in_a_designers_units():
+    assert limit("x", 3.3e-3, 3e-3, broken=0.1).shortfall() == "at best 3.3 mm, 10 % off"
+    assert limit("x", math.nan, 3e-3, broken=math.inf).shortfall() == "the nearest machine found has no such value"
+
+
+@pytest.mark.parametrize(
+    ("gain", "says"),
+    [
+        (-10.0, "moved by 1 %: about -10 % of the objective"),
+        (10.1, "moved by 0.1 %: about +1.01 % of the objective"),
+        (-2833.0, "moved by 0.001 %: about -2.83 % of the objective"),  # not -1360 N of a force of 48 N
+        (1e12, "beside its slope the objective is almost nothing"),
+        (0.0, "moved by 1 %: about +0 % of the objective"),
+    ],
+)
+def test_slopes_tell_small_changes_only(searched, gain, says):
+    (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).said()
+    assert line == f"  at its limit: a (1 m); {says}"

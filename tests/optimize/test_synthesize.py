@@ -1,10 +1,14 @@
 """What a search puts together: the table, the tiers that check it, which of several searches is the best."""
 
+import dataclasses
 import math
+import sys
+from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import scene
+from scenes import published, scene
 
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, total, total_mass
@@ -104,3 +108,72 @@ def test_wrong_questions_are_said_in_one_sentence():
             synthesize(space, wish, subject_to=subject_to, begin=begin)
     assert _run(SCENE, None, True)[1].startswith("the objective and the demands belong to no jam mode")
     assert _run(SCENE, 3, False) == (None, "not asked for")
+
+
+def test_unstable_modes_are_not_verified():
+    """Of mode 4 the loads slide to mode 3, in mode 5 they part: neither has amplitudes to be told."""
+    fast = scene("two_mass", speed=120.0)
+    for mode in (4, 5):
+        multiplier = float(jv.jam_orbit(fast, mode=mode).multiplier)
+        run, why = _run(fast, mode, True)
+        assert run is None and multiplier > 1.0
+        assert why == f"mode {mode} is unstable: the largest multiplier of its exact motion is {multiplier:.4g}"
+    absent, why = _run(scene("two_mass", speed=40.0), 5, True)
+    assert absent is None and "does not exist" in why
+
+
+def test_weakly_damped_machines_are_verified_to_the_exact_motion():
+    """Their free vibrations last for a hundred thousand periods; the integration begins beside the exact motion."""
+    s = published(damping=1e-5, count=3).scene()
+    exact = jv.jam_orbit(s, mode=3)
+    run, why = _run(s, 3, True)
+    assert why == "" and run is not None
+    np.testing.assert_allclose(run.foundation_force, exact.foundation_force, rtol=1e-5)
+    np.testing.assert_allclose(run.amplitude, exact.amplitude, rtol=1e-6)
+    angle = np.asarray(run.window.state.angle[0])
+    assert np.ptp(angle[0]) > 0.0  # the loads were not at one angle
+
+
+def test_a_run_that_left_its_mode_is_no_verification(monkeypatch):
+    def settled(scene, **start):
+        run = jv.simulate(scene, 1.0, estimate=False, save="window")
+        return dataclasses.replace(run, omega=run.omega * 0.0 + 50.0)
+
+    monkeypatch.setattr(sys.modules[synthesize.__module__], "settle", settled)
+    assert _run(scene("two_mass", speed=120.0), 3, True) == (None, "the motion left mode 3 and settled at 50 rad/s")
+
+
+def test_scenes_without_an_exact_motion_are_integrated_from_the_jam(monkeypatch):
+    def refused(scene, **how):
+        raise jv.InputError("effects", "has what no theory includes")
+
+    asked = []
+    monkeypatch.setattr(sys.modules[synthesize.__module__], "settle", lambda scene, **how: asked.append(how) or "run")
+    monkeypatch.setattr(sys.modules[synthesize.__module__], "jam_orbit", refused)
+    assert _run(SCENE, 3, True) == ("run", "")
+    monkeypatch.setattr(sys.modules[synthesize.__module__], "jam_orbit", lambda *_, **__: SimpleNamespace(multiplier=math.nan))
+    assert _run(SCENE, 3, True) == ("run", "")
+    assert asked == [{"mode": 3}] * 2
+
+
+def test_what_is_missing_at_the_start_is_named():
+    nowhere = Quantity("nowhere", "", lambda s: s.drive.speed * jnp.nan)
+    half = [Quantity(f"half {sign:+d}", "", lambda s, sign=sign: jnp.sqrt(sign * (s.loads.drag - 1.5))) for sign in (1, -1)]
+    for objective, demands, says in (
+        (total_mass(), [nowhere < 1.0], r"none has nowhere; widen"),
+        (nowhere, [total_mass() < 1.0], r"none has nowhere; widen"),
+        (half[0], [half[1] < 1.0], r"none has all of: half \+1, half -1, 1; widen"),
+    ):
+        with pytest.raises(jv.ComputationError, match=says) as caught:
+            synthesize(DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}), objective, subject_to=demands, starts=4)
+        assert caught.value.status == "no_feasible_start"
+
+
+def test_added_springs_are_marked_new():
+    free = DesignSpace(scene("network"), {"machine.stiffness[1]": (0.0, 1e4), "machine.stiffness[2]": (0.0, 1e4)})
+    built = free.at(jnp.array([0.5, 0.0]))
+    rows = _table(free, built, [], np.zeros((2, 0)), ([], []))
+    assert [(row.what, row.before, row.after) for row in rows] == [
+        ("stiffness of support 2 (new)", 0.0, 5e3),
+        ("stiffness of support 3", 0.0, 0.0),
+    ]

@@ -154,3 +154,25 @@ def test_between_narrower_bounds_the_best_is_at_them(bounds):
     numbers = problem.space.within(low, high).numbers(found.point.z)
     np.testing.assert_allclose(numbers, np.clip([[6e4, 5e4]] * 2, low, high), rtol=1e-9)
     np.testing.assert_array_equal(found.bounds, [low, high])
+
+
+def test_designs_that_lose_their_mode_fall_back_to_the_start(monkeypatch):
+    """A machine that has the mode is worth more than a better one without: the second of two ends without values."""
+    problem = problem_of(DesignSpace(SCENE, FREE), NEAR, [plain("x", lambda x, y: x) < 4.0], 2)
+    kept = find_module._of_their_mode
+    asked = []
+
+    def lost(problem, point):
+        asked.append(point)
+        if len(asked) > 1:
+            return kept(problem, point)
+        return point._replace(values=np.where([[True], [False]], point.values, np.nan))
+
+    monkeypatch.setattr(find_module, "_of_their_mode", lost)
+    begin = np.array([[0.1, 0.2], [0.5, 0.9]])  # x = 5 of 4 at most
+    found = find(problem, Options(2, 0, 25, 0.05, 8, begin=begin), lambda *_: None)
+    np.testing.assert_array_equal(found.point.z[1], begin[1])
+    np.testing.assert_allclose(found.point.z[0], [0.375, 0.5], atol=1e-8)
+    np.testing.assert_allclose(found.point.values[1], [1.0 + 3.2**2 + 2.0, 0.25], rtol=1e-12)
+    np.testing.assert_allclose(found.violation, [0.0, 0.25], atol=1e-9)
+    assert found.left[0] < 1e-9 and found.left[1] == np.inf and found.optimality.kkt.shape == (2,)

@@ -201,3 +201,13 @@ def test_the_size_of_an_objective_that_is_nothing_comes_from_its_slope():
     assert abs(start.values[0, 0]) < 1e-14
     ended = polish(problem, start, 6, lambda *_: None)
     np.testing.assert_allclose(xy(ended.point), [[6.0, 5.0]], atol=1e-7)
+
+
+def test_the_last_step_is_taken_where_rounding_hides_its_fall():
+    """x^2 + y^2 along x + y = 7 at 1.5e-8 from its least value: the fall is 2e-17 of it, the slope still shows the way."""
+    squares = plain("squares", lambda x, y: x**2 + y**2)
+    problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), squares, [], starts=2)
+    start = at(problem, (3.5 + 1.5e-8, 3.5 - 1.5e-8), (3.5 - 1.5e-8, 3.5 + 1.5e-8))
+    ended = polish(problem, start, 4, lambda *_: None)
+    np.testing.assert_allclose(xy(ended.point), 3.5, rtol=1e-13)
+    assert np.all(ended.violation < 1e-14)

@@ -46,13 +46,14 @@ def test_pieces_stand_beside_the_values():
 
 
 def test_a_demands_scale_is_its_limit_or_its_value_at_the_beginning():
-    """Limits of 0 have none; x - 5 is 0 at the beginning, and counts as it is."""
-    off = plain("off", lambda x, y: x - 5.0)
+    """Limits of 0 have none; x - 5 is 0 at the beginning, up to rounding, and counts as it is; a small value is no rounding."""
+    off, rounded = plain("off", lambda x, y: x - 5.0), plain("rounded", lambda x, y: x - 5.0 + 3e-16)
+    small = plain("small", lambda x, y: x - 5.0 + 1e-8)
     nowhere = plain("nowhere", lambda x, y: x * jnp.nan)
-    demands = [FIRST < -4.0, SUM < 0.0, off < 0.0, nowhere < 0.0, off < -2.0 * SUM]
+    demands = [FIRST < -4.0, SUM < 0.0, off < 0.0, rounded < 0.0, small < 0.0, nowhere < 0.0, off < -2.0 * SUM]
     problem = problem_of(DesignSpace(SCENE, FREE), NEAREST, demands)
-    np.testing.assert_allclose(problem.scales, [4.0, 8.0, 1.0, 1.0, 16.0])
-    np.testing.assert_array_equal(problem.constants, [-4.0, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(problem.scales, [4.0, 8.0, 1.0, 1.0, 1e-8, 1.0, 16.0], rtol=1e-6)
+    np.testing.assert_array_equal(problem.constants, [-4.0, *[0.0] * 6])
 
 
 @pytest.mark.parametrize(("starts", "lanes"), [(1, 1), (2, 2), (3, 4), (33, 64), (1000, 64)])

@@ -229,3 +229,11 @@ def test_influences_on_almost_nothing_are_told_in_its_unit():
     lines = [line for line in result.said() if "1 % less / more" in line]
     assert len(lines) == 2
     assert "+3.6e+05 N^2/m^2 / +3.6e+05 N^2/m^2" in lines[0] and "%" not in lines[0].split(":")[1]
+
+
+def test_demands_with_room_change_no_search():
+    """Of an objective that vanishes: small multipliers of demands with room would be large beside it."""
+    alone = found(DesignSpace(SCENE, FREE), CONE, starts=8)
+    beside = found(DesignSpace(SCENE, FREE), CONE, starts=8, subject_to=[FIRST < 8.9e4, SUM > 3e4])
+    assert alone.status_name == beside.status_name == "done" and beside.converged == 8
+    assert beside.values.min() < 1e-9 and not any(each.active for each in beside.limits)

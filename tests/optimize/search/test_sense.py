@@ -102,3 +102,12 @@ def test_machines_are_counted_by_how_far_they_are_apart():
     assert isinstance(best, Machine) and (best.often, best.value) == (2, 1.0)
     np.testing.assert_allclose(best.numbers, [1e4 + 8e4 * 0.5005, 1e4 + 8e4 * 0.4995])
     assert (second.often, second.value, third.often, third.value) == (1, 2.0, 1, 4.0)
+
+
+def test_what_the_machine_does_not_have_is_not_met():
+    """NaN keeps no demand, and nothing that is held."""
+    problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), WISH, [FIRST < 4.0])
+    found = ended([[0.5, 0.5]], [[np.nan, np.nan, np.nan]], [0.0], [0.0])
+    held, first = limits_of(problem, [FIRST < 4.0], found, np.array([[np.nan, 4.0]]))
+    assert held.broken == first.broken == np.inf
+    assert first.shortfall() == held.shortfall() == "the nearest machine found has no such value"
