@@ -81,8 +81,8 @@ def synthesize(
       alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `jaxvib[cma]`); its few best designs
       are polished
     - `begin`: go on from where another search of this space ended, in place of random starts
-    - `verify`: compute the exact motion of the best design, integrate its full equations from the jam until they have settled,
-      and measure
+    - `verify`: compute the exact motion of the best design and, if it is stable, integrate the full equations until they have
+      settled, the loads at first up to 1e-3 rad beside that motion, and measure; `unverified` says why there is no such run
     - `throw`: raise where demands contradict each other; otherwise the status and `limits` say so
     - `progress`: called with what is being done and how much of it is (0 to 1). An interrupt (Ctrl-C) ends the search with the
       best that it has

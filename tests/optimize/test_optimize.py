@@ -241,6 +241,50 @@ def test_design_file_is_read(tmp_path):
     assert all(defaults[name] == value for name, value in search.items())
 
 
+DESIGN = """
+scene = "machine.toml"
+[free]
+"machine.stiffness[0]" = [1e4, 9e4]
+"loads.drag" = [1.0, 2.0]
+[ties]
+"machine.stiffness[1]" = ["machine.stiffness[0]", 0.5]
+[[hold]]
+quantity = "total"
+field = "machine.stiffness"
+[[demand]]
+quantity = "power"
+mode = 3
+at_most = "1 kW"
+at_least = 5.0
+[objective]
+quantity = "total_mass"
+maximize = true
+tolerances = { "machine.mass" = 0.1 }
+samples = 8
+[search]
+starts = 8
+seed = 3
+"""
+
+
+def test_design_files_mean_what_they_say(tmp_path, monkeypatch):
+    (tmp_path / "machine.toml").write_text(jv.scene_to_toml(scene("two_mass")))
+    (tmp_path / "design.toml").write_text(DESIGN)
+    design = load_design(tmp_path / "design.toml")
+    assert design.objective.operation == "neg" and design.objective.parts[0].statistic == "expected"
+    assert design.objective.parts[0].case.samples == 8 and design.objective.parts[0].case.errors == (("machine.mass", 0.1),)
+    assert [(d.sense, d.constant) for d in design.subject_to] == [("at most", 1e3), ("at least", 5.0)]
+    assert float(design.space.held[0].value) == 8e4  # what it is in the scene
+    np.testing.assert_allclose(design.space.at(jnp.array([0.5, 0.0])).machine.stiffness, [5e4, 2.5e4])
+    asked = []
+    monkeypatch.setattr("optimize.files.synthesize", lambda *what, **how: asked.append((what, how)))
+    design.run(seed=9)
+    assert asked == [((design.space, design.objective), {"subject_to": design.subject_to, "starts": 8, "seed": 9})]
+    (tmp_path / "design.toml").write_text(DESIGN.replace("maximize = true", "maximize = false").replace("samples = 8", ""))
+    design = load_design(tmp_path / "design.toml")
+    assert design.objective.statistic == "expected" and design.objective.case.samples == 64
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -66,6 +66,36 @@ def test_recipes_are_designs():
         assert design.space.size == free and len(design.subject_to) == demands
 
 
+def test_recipes_seek_and_hold_what_they_are_named_for():
+    design = antiphase(SCENE, range_=4.0)
+    assert design.objective == force_per_amplitude(mode=3)
+    assert [held.quantity.name for held in design.space.held] == ["jam_frequency", "support_frequency_squared"]
+    np.testing.assert_allclose(design.space.low, np.array([5e4, 3e4, 2e5]) / 4.0)
+    np.testing.assert_allclose(design.space.high, np.array([5e4, 3e4, 2e5]) * 4.0)
+    middle = anti_resonance(scene("three_mass", speed=60.0), mode=3)
+    assert middle.objective.operation == "/" and [part.of for part in middle.objective.parts] == [2, (1, 3)]
+    assert [place.name for place in middle.space.places] == [f"machine.link_stiffness[{k}]" for k in range(3)]
+    assert [held.quantity.name for held in middle.space.held] == ["jam_frequency"]
+    light = lightest_exciter(SCENE, "5 mm", mode=3, of=2)
+    assert light.objective.name == "total_mass" and light.space.places[0].name == "loads.mass"
+    np.testing.assert_allclose([light.space.low[0], light.space.high[0]], [0.08, 8.0])
+    assert light.subject_to[0].words == "amplitude of platform 2, mode 3 at least 5 mm"
+    wide = widest_range(SCENE, mode=3, keep=0.5, of=1)
+    assert wide.objective == -fold_margin(mode=3) and wide.subject_to[0].sense == "at least"
+    np.testing.assert_allclose(wide.subject_to[0].constant, 0.5 * float(amplitude(mode=3, of=1)(SCENE)))
+
+
+def test_recipes_leave_springs_that_are_not_there():
+    hung = eqx.tree_at(lambda s: s.machine.stiffness, SCENE, jnp.array([5e4, 0.0]))
+    assert [place.name for place in widest_range(hung, mode=3).space.places] == [
+        "machine.stiffness[0]",
+        "machine.link_stiffness[0]",
+    ]
+    free = eqx.tree_at(lambda s: (s.machine.stiffness, s.machine.link_stiffness), SCENE, (jnp.zeros(2), jnp.zeros(1)))
+    with pytest.raises(jv.InputError, match="has no springs that could be changed"):
+        retune(free, None)
+
+
 def test_the_lightest_exciter_shakes_by_what_is_asked_and_no_more():
     best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=4, iterations=25, verify=False)
     assert best.status_name == "done" and best.limits[0].active
