@@ -7,6 +7,8 @@ app = marimo.App(width="full", app_title="jaxvib explore")
 
 @app.cell
 def _():
+    import html
+
     import marimo as mo
 
     from jaxvib.explore import pictures
@@ -14,7 +16,7 @@ def _():
     from jaxvib.explore.sliders import scene_at, sliders_of
     from jaxvib.machine.files import load_scene
 
-    return load_scene, mo, pictures, scene_at, served_path, sliders_of
+    return html, load_scene, mo, pictures, scene_at, served_path, sliders_of
 
 
 @app.cell
@@ -33,8 +35,9 @@ def _(load_scene, mo, served_path, sliders_of):
 
 
 @app.cell
-def _(controls, mo, path, pictures):
-    mo.sidebar([mo.md(f"**{path.name}**"), mo.vstack(list(controls.elements.values()))], width="22rem")
+def _(controls, html, mo, path):
+    # Markdown and HTML in a file's name are text.
+    mo.sidebar([mo.Html(f"<b>{html.escape(path.name)}</b>"), mo.vstack(list(controls.elements.values()))], width="22rem")
     return
 
 

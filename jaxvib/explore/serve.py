@@ -1,29 +1,43 @@
-"""Starts the page on this computer."""
+"""Server of the page, on this computer only.
+
+A browser lets every open web site send requests to servers of the same computer. The address of the page therefore begins
+with a random token, and a request is answered only if it has that token, names this computer as its host, and comes from the
+page itself.
+"""
 
 from __future__ import annotations
 
+import hmac
 import importlib.util
 import os
+import secrets
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, MutableMapping
 from pathlib import Path
+from typing import Any, TypeAlias
 
 from jaxvib.errors import InputError
 
-__all__ = ["leave", "require_free", "require_marimo", "serve", "served_path"]
+__all__ = ["guarded", "leave", "require_free", "require_marimo", "serve", "served_path"]
+
+_Message: TypeAlias = "MutableMapping[str, Any]"
+_Send: TypeAlias = "Callable[[_Message], Awaitable[None]]"
+_Receive: TypeAlias = "Callable[[], Awaitable[_Message]]"
+_Page: TypeAlias = "Callable[[_Message, _Receive, _Send], Awaitable[None]]"
+"""An ASGI application."""
 
 _VARIABLE = "JAXVIB_EXPLORE"
-"""The environment variable by which the page hears of the scene file."""
+"""Environment variable with the path of the scene file."""
 
 _HOST = "127.0.0.1"
-"""Nobody else reaches the page."""
+"""Only this computer reaches the page."""
 
 
 def served_path() -> Path:
-    """The scene file of the page that is being served. **Raises** `InputError` where none is."""
+    """Return the scene file of the page that is being served. **Raises** `InputError` if there is none."""
     path = os.environ.get(_VARIABLE)
     if not path:
         raise InputError(_VARIABLE, "is not set; start the page with: jaxvib explore machine.toml")
@@ -31,13 +45,15 @@ def served_path() -> Path:
 
 
 def require_marimo() -> None:
-    """**Raises** `InputError` where marimo, which shows the page, is not installed."""
+    """**Raises** `InputError` if marimo, which shows the page, is not installed."""
     if importlib.util.find_spec("marimo") is None:
-        raise InputError("explore", "needs marimo; install it with: pip install 'jaxvib[explore]'")
+        raise InputError(
+            "explore", "needs marimo; install it with: pip install '.[explore]' (in the folder of jaxvib's sources)"
+        )
 
 
 def require_free(port: int) -> None:
-    """**Raises** `InputError` where another program listens at that port of this computer, or none may."""
+    """**Raises** `InputError` if another program listens at that port of this computer, or if the port may not be used."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tried:
         # As the server does: a port that a page left a minute ago is free.
         tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(os.name == "posix"))
@@ -49,12 +65,44 @@ def require_free(port: int) -> None:
             ) from error
 
 
+def guarded(page: _Page, token: str, port: int) -> _Page:
+    """Return an ASGI application that passes on to `page` only requests of that page at `/token/`; others get an empty 404.
+
+    The header Host must be this computer's at `port`, which keeps out sites whose name was made to point here (DNS rebinding),
+    and Origin, which browsers add to requests of other sites and to all websockets, must be the same if there is one.
+    """
+    hosts = [f"{name}:{port}".encode() for name in (_HOST, "localhost")]
+
+    def is_own(scope: _Message) -> bool:
+        found = [value for name, value in scope["headers"] if name.lower() == b"host"]
+        origins = [value for name, value in scope["headers"] if name.lower() == b"origin"]
+        first = scope["path"].encode().split(b"/")[1:2]
+        return (
+            len(found) == 1
+            and found[0] in hosts
+            and all(origin == b"http://" + found[0] for origin in origins)
+            and len(first) == 1
+            and hmac.compare_digest(first[0], token.encode())
+        )
+
+    async def application(scope: _Message, receive: _Receive, send: _Send) -> None:
+        if scope["type"] == "lifespan" or is_own(scope):
+            await page(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await send({"type": "http.response.start", "status": 404, "headers": []})
+            await send({"type": "http.response.body", "body": b""})
+
+    return application
+
+
 def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) -> None:
-    """Serves the page of a scene file until it is interrupted, and ends the process.
+    """Serve the page of a scene file until it is interrupted, and end the process.
 
-    **Arguments**: `scene` file; `port` of this computer; whether to open a `browser`; `said` is told where the page is.
+    **Arguments**: `scene` file; `port` of this computer; `browser`: True opens the page; `said` is called with its address.
 
-    **Raises** `InputError` where marimo is not installed or the port is taken.
+    **Raises** `InputError` if marimo is not installed or the port is taken.
     """
     require_marimo()
     require_free(port)
@@ -62,14 +110,22 @@ def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) ->
     import uvicorn  # marimo's own server
 
     os.environ[_VARIABLE] = str(scene.resolve())
-    page = marimo.create_asgi_app(quiet=True).with_app(path="", root=str(Path(__file__).with_name("page.py"))).build()
-    address = f"http://{_HOST}:{port}"
+    token = secrets.token_urlsafe(32)
+    page = marimo.create_asgi_app(quiet=True)
+    page = page.with_app(path=f"/{token}", root=str(Path(__file__).with_name("page.py"))).build()
+    address = f"http://{_HOST}:{port}/{token}/"
     said(address)
     if browser:
         opener = threading.Timer(1.0, webbrowser.open, [address])
         opener.daemon = True
         opener.start()
-    uvicorn.run(page, host=_HOST, port=port, log_level="warning", timeout_graceful_shutdown=1)
+    uvicorn.run(
+        guarded(page, token, port),  # pyright: ignore[reportArgumentType]
+        host=_HOST,
+        port=port,
+        log_level="warning",
+        timeout_graceful_shutdown=1,
+    )
     leave()
 
 

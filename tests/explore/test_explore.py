@@ -117,6 +117,19 @@ def _drawn_lines(picture: str) -> list[list[str]]:
     ]
 
 
+HOSTILE = "<img src=x onerror=alert(1)> **bold** .toml"
+
+
+def test_a_files_name_is_text_on_the_page(one_mass, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXVIB_EXPLORE", str(jv.save_scene(one_mass, tmp_path / HOSTILE)))
+    from jaxvib.explore.page import app
+
+    outputs, _ = app.run()
+    shown = "".join(str(getattr(output, "text", "")) for output in outputs)
+    assert "&lt;img src=x onerror=alert(1)&gt; **bold** .toml" in shown
+    assert "<img src=x" not in shown and "<strong>" not in shown.split("</b>")[0]
+
+
 def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     """The page is run as marimo runs it; then what it does with its sliders' values is done again at others."""
     path = jv.save_scene(one_mass, tmp_path / "ma<chine.toml")
@@ -257,7 +270,8 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     monkeypatch.setattr(serve, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
-    assert "the page is at http://127.0.0.1:27180" in capsys.readouterr().out and serve.served_path() == path.resolve()
+    address = re.search(r"the page is at (http://127.0.0.1:27180/[-\w]{43}/);", capsys.readouterr().out)
+    assert address and serve.served_path() == path.resolve()
     assert counted.wait(10.0)  # beside the page, the next numbers of loads are compiled
 
 
@@ -283,7 +297,7 @@ def test_what_hinders_the_page_is_one_sentence(one_mass, tmp_path, monkeypatch, 
     assert "none.toml cannot be read" in capsys.readouterr().err
     monkeypatch.setattr(serve.importlib.util, "find_spec", lambda name: None)
     assert run(["explore", path]) == 2
-    assert "explore needs marimo; install it with: pip install 'jaxvib[explore]'" in capsys.readouterr().err
+    assert "explore needs marimo; install it with: pip install '.[explore]'" in capsys.readouterr().err
     monkeypatch.delenv("JAXVIB_EXPLORE", raising=False)
     with pytest.raises(jv.InputError, match="start the page with: jaxvib explore"):
         serve.served_path()
