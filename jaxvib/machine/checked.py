@@ -16,9 +16,9 @@ from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuilt
 from jaxvib.machine.scene import Scene, require_comparable
 from jaxvib.runtime.compat import evaluating
-from jaxvib.units import traced
+from jaxvib.units import bounds_of_unknowns, traced
 
-__all__ = ["checked"]
+__all__ = ["allowed_unknowns", "checked"]
 
 _FOUND_GOOD: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
 """Scenes that need not be looked at again, by their identity: a scene never changes."""
@@ -58,6 +58,32 @@ def checked(scene: Scene) -> Scene:
     return scene
 
 
+def allowed_unknowns(scene: Scene) -> Array | None:
+    """True if constructors would take the numbers of a scene that have no value yet, as one traced Boolean; None if all of
+    its numbers are known, and therefore checked.
+
+    >>> import equinox as eqx, jax, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+    >>> stiff = jax.jit(lambda k: allowed_unknowns(eqx.tree_at(lambda s: s.machine.stiffness, scene, k[None])))
+    >>> bool(stiff(4e4)), bool(stiff(-4e4)), allowed_unknowns(scene)
+    (True, False, None)
+    """
+    if not any(traced(leaf) for leaf in jax.tree.leaves(scene)):
+        return None
+    with bounds_of_unknowns() as found:
+        _rebuild(scene)
+    return jnp.all(jnp.stack(found)) if found else None
+
+
+def _rebuild(scene: Scene) -> None:
+    """Build each part of a scene once more. **Raises** `InputError` for a known number that is not allowed."""
+    for section in ("machine", "loads", "drive"):
+        rebuilt(getattr(scene, section), section)
+    for effect in scene.effects:
+        rebuilt(effect, f"effects.{effect.kind}")
+
+
 @dataclasses.dataclass(frozen=True)
 class _Asked:
     """A scene, known by all its numbers: under a derivative a question makes the same one again and again."""
@@ -70,10 +96,7 @@ class _Asked:
 def _require_good(asked: _Asked) -> None:
     """**Raises** `InputError` for a number that is not allowed where it stands."""
     scene = asked.scene
-    for section in ("machine", "loads", "drive"):
-        rebuilt(getattr(scene, section), section)
-    for effect in scene.effects:
-        rebuilt(effect, f"effects.{effect.kind}")
+    _rebuild(scene)
     require_comparable(scene.machine, scene.loads, scene.drive)
 
 

@@ -22,6 +22,7 @@ from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
+from jaxvib.runtime.compat import traced
 
 __all__ = [
     "DRIVES",
@@ -295,7 +296,7 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
             continue
         if isinstance(value, tuple):
             fields[name] = [list(pair) for pair in value]
-        elif isinstance(value, (int, str)):
+        elif isinstance(value, (int, str)) or traced(value):  # one without a value is for the constructor, no file
             fields[name] = value
         else:
             array = np.asarray(value, dtype=float)

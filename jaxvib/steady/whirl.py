@@ -19,6 +19,7 @@ from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, re
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.refused import REFUSED, refuse_unknowns
 from jaxvib.units import Numbers, numbers, traced
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class WhirlStatus(eqx.Enumeration):
     """Outcome of a computation of whirls; the members are the sentences a user reads."""
 
     done = "the answer was computed"
+    refused = REFUSED
     lost_digits = "rounding hides some of these motions, which are NaN: use double precision, or numbers that differ less"
 
 
@@ -140,7 +142,7 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
     """
     model = _two_directions(scene)
     speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
-    return _whirl(model, jnp.atleast_1d(speeds), loads)
+    return refuse_unknowns(scene, _whirl(model, jnp.atleast_1d(speeds), loads), WhirlStatus.refused)
 
 
 def _sense_word(speed: float, forward: bool) -> str:
@@ -234,7 +236,7 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 
     Source: Artyunin 2013, section V.
     """
-    return _critical_speeds(_two_directions(scene), loads)
+    return refuse_unknowns(scene, _critical_speeds(_two_directions(scene), loads), WhirlStatus.refused)
 
 
 @cached

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -22,6 +24,7 @@ __all__ = [
     "Number",
     "Numbers",
     "Quantity",
+    "bounds_of_unknowns",
     "count",
     "in_own_unit",
     "known_number",
@@ -47,9 +50,26 @@ FIELD_UNITS = {
 """The unit of each number of a scene that a design may free or hold."""
 
 
+_COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar("collected", default=None)
+
+
+@contextlib.contextmanager
+def bounds_of_unknowns() -> Iterator[list[Array]]:
+    """Collect, while parts of a scene are built, a condition for each number that has no value yet: that it is allowed."""
+    found: list[Array] = []
+    token = _COLLECTED.set(found)
+    try:
+        yield found
+    finally:
+        _COLLECTED.reset(token)
+
+
 def _checked(value: Array | np.ndarray, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
-    """Check known values; a traced one has no value yet."""
+    """Check known values; a traced one has no value yet, see `bounds_of_unknowns`."""
     if traced(value):
+        collected = _COLLECTED.get()
+        if collected is not None:
+            collected.append(jnp.all(jnp.isfinite(value) & ((value > low) if open_low else (value >= low))))
         return
     flat = np.atleast_1d(np.asarray(value))
     for index, entry in enumerate(flat):

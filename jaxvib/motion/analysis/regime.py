@@ -247,4 +247,4 @@ def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     if carrier.gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
-    return jnp.sort(jnp.where(found.forward[0], found.speed[0], jnp.inf))
+    return jnp.sort(jnp.where(found.forward[0] & jnp.isfinite(found.speed[0]), found.speed[0], jnp.inf))

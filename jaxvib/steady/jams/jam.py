@@ -22,6 +22,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, Pieces, branch_pieces, branch_tangent, rotor_speed_at
+from jaxvib.steady.refused import REFUSED, refuse_unknowns
 from jaxvib.units import traced
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ class JamStatus(eqx.Enumeration):
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
     apart = "these loads cannot stay together here: one needs more torque than the vibration has at any phase"
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+    refused = REFUSED
 
 
 class AbstractJam(Result):
@@ -196,7 +198,7 @@ def jam_modes(scene: Scene) -> JamModes:
     """
     scene = checked(scene)
     require_drag(jammed_loads(scene))
-    return jams_of(scene)
+    return refuse_unknowns(scene, jams_of(scene), JamStatus.refused)
 
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:

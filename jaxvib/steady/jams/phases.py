@@ -24,6 +24,7 @@ from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
+from jaxvib.steady.refused import REFUSED, refuse_unknowns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +44,7 @@ class PhaseStatus(eqx.Enumeration):
     with_rotor = "the loads turn with the rotor and leave it at rest: they balance, and are not jammed"
     not_converged = "no jam was found from this start"
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
+    refused = REFUSED
 
 
 def degrees(angle: float) -> float:
@@ -210,7 +212,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     phase = jnp.asarray(phase)
     if phase.shape != (loads.count,):
         raise InputError("phase", f"has shape {phase.shape}; one phase for each load is needed, ({loads.count},)")
-    return jam_from(scene, jnp.asarray(omega, dtype=phase.dtype), phase)
+    return refuse_unknowns(scene, jam_from(scene, jnp.asarray(omega, dtype=phase.dtype), phase), PhaseStatus.refused)
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:

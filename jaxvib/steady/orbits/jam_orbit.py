@@ -27,6 +27,7 @@ from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, numbers_of, orbits
+from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["branch_at", "exact_mode_speeds", "jam_orbit"]
@@ -176,7 +177,7 @@ def jam_orbit(
         found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, settle)
     elif throw and status_name(found.status) in ("absent", "not_converged"):
         raise failure(found.status)
-    return found
+    return refuse_unknowns(scene, found, OrbitStatus.refused)
 
 
 @cached

@@ -30,6 +30,7 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
+from jaxvib.steady.refused import REFUSED
 from jaxvib.units import count
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class OrbitStatus(eqx.Enumeration):
     coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
     held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
+    refused = REFUSED
 
 
 class Orbit(Result):

@@ -1,0 +1,39 @@
+"""Refusal of numbers that have no value until a compiled program runs, by the status of its result."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.checked import allowed_unknowns
+from jaxvib.machine.scene import Scene
+from jaxvib.results.result import Result
+
+__all__ = ["REFUSED", "refuse_unknowns"]
+
+REFUSED = "a number that was not known while the program was built is not allowed in a scene: build the scene outside to see it"
+"""Sentence of the status `refused`."""
+
+Found = TypeVar("Found", bound=Result)
+
+
+def refuse_unknowns(scene: Scene, found: Found, refused: eqx.Enumeration) -> Found:
+    """The result with the status `refused` and without numbers if, under a JAX transformation, a number of the scene turns out
+    to be one that its constructor would not take, such as a negative stiffness; the result itself if all numbers are known."""
+    allowed = allowed_unknowns(scene)
+    if allowed is None:
+        return found
+
+    def kept(value: Any) -> Any:
+        if not isinstance(value, Array):
+            return value
+        if jnp.issubdtype(value.dtype, jnp.inexact):
+            return jnp.where(allowed, value, jnp.nan)
+        return value & allowed if value.dtype == bool else value
+
+    status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), found.status, refused)
+    return eqx.tree_at(lambda result: result.status, jax.tree.map(kept, found), status)
