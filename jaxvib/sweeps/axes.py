@@ -176,7 +176,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
             raise InputError(f"axes.{name}.from", f"is {low:g}, and the scale 'log'; it must be greater than 0 there")
         values = None
         if "count" in spec:
-            size = count(spec["count"], f"axes.{name}.count", low=2)
+            size = count(spec["count"], f"axes.{name}.count", low=2, each=64.0)
             values = np.geomspace(low, high, size) if scale == "log" else np.linspace(low, high, size)
         axis = Axis(name, unit, values, low, high, scale == "log", spot)
     else:

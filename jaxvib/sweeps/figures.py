@@ -266,7 +266,7 @@ def _measure(store: Store, name: str | None) -> str:
 def _measure_label(store: Store, name: str) -> str:
     attributes = store.group[name].attrs
     words, unit = str(attributes.get("long_name", name)), attributes.get("units", "")
-    return f"{words}, {unit}" if unit else words
+    return (f"{words}, {unit}" if unit else words).replace("$", r"\$")  # no formula, whatever users call their quantities
 
 
 def _values(store: Store, name: str, region: slice | tuple[slice, ...]) -> np.ndarray:

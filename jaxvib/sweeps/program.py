@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
@@ -29,6 +30,9 @@ _PER_TURN = 8
 
 _SLOW_PERIODS = 20
 """Periods of the lowest natural frequency that the window is long, as that of `simulate`."""
+
+_MAX_STEPS = 1e9
+"""Steps of a run: an hour of computing and more."""
 
 _CODE = {name: k for k, name in enumerate(CASE_STATUSES)}
 
@@ -93,7 +97,10 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
     fastest, slowest, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
     window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
-    step = 1.0 / float(np.max(fastest)) if steps is None else until / steps
+    step = 1.0 / float(np.max(fastest)) if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
+    if until / step > _MAX_STEPS:
+        name = "until" if steps is None else "steps"
+        raise InputError(name, f"asks for {until / step:.3g} steps of every run; take a shorter run or fewer steps")
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
     # a number that is whole but for rounding stays what it is
     return Plan(until, window, _SAMPLES, *(int(np.ceil(x - 1e-9)) or 1 for x in (each, between)))

@@ -132,8 +132,10 @@ def _lock(file: int, *, exclusive: bool) -> bool:
 
 @contextlib.contextmanager
 def locked(store: Path) -> Iterator[bool]:
-    """Hold the lock of a store; gives False if another process or thread has it."""
-    file = os.open(store / FOLDER / _LOCK, os.O_RDWR if os.access(store / FOLDER / _LOCK, os.W_OK) else os.O_RDONLY)
+    """Hold the lock of a store; gives False if another process or thread has it. **Raises** `OSError` if there is nothing to
+    lock and no file can be made."""
+    path = store / FOLDER / _LOCK
+    file = os.open(path, os.O_RDONLY if path.exists() and not os.access(path, os.W_OK) else os.O_RDWR | os.O_CREAT, 0o666)
     try:
         yield _lock(file, exclusive=True)
     finally:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxvib.errors import InputError
+from jaxvib.imported import code_state, digest_of_sources
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
 from jaxvib.results.status import member, sentence
@@ -39,7 +40,7 @@ __all__ = ["ChunkState", "Store", "require_zarr", "versions"]
 _FORMAT = 2
 """Of the store; another number is another layout."""
 
-_PACKAGES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "numpy")
+_PACKAGES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
 """Whose versions may change the last digits of a result."""
 
 
@@ -61,8 +62,10 @@ def require_zarr() -> ModuleType:
 
 
 def versions() -> dict[str, str]:
-    """The versions of all that a result's last digits depend on."""
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
+    """Versions of all packages that a result depends on, and the sources of jaxvib: a digest, which also says if this process
+    has replaced a part of them."""
+    changed = "" if code_state(look=True).is_on_disk else " with changes in this process"
+    return {name: importlib.metadata.version(name) for name in _PACKAGES} | {"sources": digest_of_sources()[:16] + changed}
 
 
 class Store:
@@ -147,7 +150,11 @@ class Store:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Let nobody else write. **Raises** `InputError` if another process, or thread, writes already."""
-        with seals.locked(self.path) as is_mine:
+        with contextlib.ExitStack() as stack:
+            try:
+                is_mine = stack.enter_context(seals.locked(self.path))
+            except OSError as error:
+                raise cannot_write(self.path, error) from error
             if not is_mine:
                 problem = f"is {str(self.path)!r}, into which another sweep writes at this moment"
                 raise InputError("store", f"{problem}; wait until that has ended, or name another store")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import ComputationError, InputError, require_one_of, shown
 from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
@@ -31,6 +32,9 @@ _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Cases of a chunk: about a second's work, less than that is taken up by keeping books."""
 
 _RESERVED = ("status", "error")
+
+_MAX_CASES = 10**9
+"""Cases of a study: their numbers are kept, and a list of their chunks is held in memory."""
 
 
 def study(
@@ -57,7 +61,8 @@ def study(
     drawn = [axis.name for axis in found if axis.values is None]
     count(samples, "samples", low=0)
     require_one_of(sampling, SAMPLINGS, "sampling")
-    count(seed, "seed", low=0)
+    if count(seed, "seed", low=0) >= 2**64:
+        raise InputError("seed", "has more than 64 bits; give a smaller whole number")
     if drawn and not samples:
         raise InputError(f"axes.{drawn[0]}", "is a range without count, so that it is sampled; give samples, or a count")
     if samples and not drawn:
@@ -65,8 +70,11 @@ def study(
     names, measures = _named(measure)
     taken = [*_RESERVED, *(axis.name for axis in found), "sample"]
     for name in names:
-        if name in taken or "/" in name or not name:
-            raise InputError(f"measure.{name}", "is a name that something else has or that is none; give it another one")
+        if name in taken:
+            raise InputError(f"measure.{name}", "is a name that something else has; give it another one")
+        if not _is_name(name):
+            problem = "is no name of an array: up to 200 printable characters, no / \\ or $ among them, no . or __ in front"
+            raise InputError(f"measure.{name}", f"{problem}; give it another one")
     runs = [m for m in measures if isinstance(m, RunMeasure)]
     chosen = tier or ("time" if runs else "leading")
     require_one_of(chosen, TIERS, "tier")
@@ -83,17 +91,32 @@ def study(
         what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.place is None)
         raise InputError(what, "is about runs, and nothing is read off a run; measure for example run.regime")
     grid = Grid(found, samples, seed, sampling, ())
+    if math.prod(grid.shape) > _MAX_CASES:
+        problem = f"make {math.prod(grid.shape):.3g} cases; a study has {_MAX_CASES:.0e} at most"
+        raise InputError("axes", f"{problem}: take fewer values, or samples")
     most = count(_CHUNK["time" if runs else chosen] if chunk is None else chunk, "chunk")
     grid = grid._replace(tile=tile_of(grid.shape, most))
     specs = {name: _plain(spec) for name, spec in axes.items()}
     identities = {name: identify(m) for name, m in zip(names, measures, strict=True)}
     made = Study(scene, grid, names, measures, identities, plan, start, mode, chosen, specs)
-    forms = shapes(made)
+    try:
+        forms = shapes(made)
+    except (InputError, ComputationError):
+        raise
+    except Exception as error:  # of a function of the user
+        problem = f"cannot be computed ({type(error).__name__}: {error}); it gets a Scene and gives a number of JAX"
+        raise InputError("measure", problem) from error
     for name, m, form in zip(names, measures, forms, strict=True):
         wanted = 1 if isinstance(m, RunMeasure) and m.axis else 0
         if len(form.shape) != wanted:
             raise InputError(f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * wanted))
     return dataclasses.replace(made, forms=tuple(forms))
+
+
+def _is_name(name: str) -> bool:
+    """True for a name that a folder of the store may have on any file system, and that no figure takes for a formula."""
+    fits = name.isprintable() and 0 < len(name.encode()) <= 200 and name == name.strip()
+    return fits and not set(name) & set("/\\$") and not name.startswith((".", "__")) and name != "zarr.json"
 
 
 def _plain(spec: AxisSpec) -> Plain:
@@ -176,7 +199,10 @@ def load_study(path: str | Path) -> Study:
 def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]:
     if not isinstance(table, Mapping):
         raise InputError(field, f"is {table!r}; it must be a table with a quantity")
-    name, rest = str(table.get("name", "")), {key: value for key, value in table.items() if key != "name"}
+    name, rest = table.get("name", ""), {key: value for key, value in table.items() if key != "name"}
+    for key in ("name", "function", "unit", "quantity"):
+        if not isinstance(table.get(key, ""), str):
+            raise InputError(f"{field}.{key}", f"is {shown(table[key])}; write a text in quotes")
     if "function" in rest:
         return name, _function(rest, name, field)
     if str(rest.get("quantity", "")).startswith("run."):
@@ -190,11 +216,15 @@ def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]
 
 def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     """A quantity of the user's own: a function of a scene, in a module that Python finds."""
+    for key in table:
+        if key not in ("function", "unit"):
+            raise InputError(f"{field}.{key}", f"is no field here; {closest(key, ['function', 'unit', 'name'])}")
     module, _, function = str(table["function"]).partition(":")
     try:
         found = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        problem = f"is {table['function']!r}, which cannot be imported ({error}); write 'module:function'"
+    except Exception as error:  # whatever the module of the user raises
+        said = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
+        problem = f"is {shown(table['function'])}, which cannot be imported ({said}); write 'module:function'"
         raise InputError(f"{field}.function", problem) from error
     return Quantity(name or function, str(table.get("unit", "")), found)
 

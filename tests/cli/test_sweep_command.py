@@ -59,12 +59,15 @@ def test_a_commented_study_file_is_one(typed, tmp_path):
 
 
 def test_an_interrupt_says_what_is_kept(typed, monkeypatch):
-    def stop(self, now):
-        raise KeyboardInterrupt
+    reports = []
 
-    with monkeypatch.context() as patched:
-        patched.setattr(command._Lines, "__call__", stop)
-        code, _, err = typed("sweep", "study.toml")
+    def stop_once(self, now):
+        reports.append(now)
+        if len(reports) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(command._Lines, "__call__", stop_once)
+    code, _, err = typed("sweep", "study.toml")
     assert code == 1 and "what is finished is kept in study.zarr; the same command goes on from there" in err
     code, out, _ = typed("show", "study.zarr")
     assert code == 0 and "not every case was computed yet" in out and "6 missing" in out

@@ -1,0 +1,113 @@
+"""Mutated study files, stores and saved results: does each end in one sentence, or in the right answer?
+
+    python benchmarks/trials/mutated_files.py studies --count 400
+    python benchmarks/trials/mutated_files.py stores --count 400
+    python benchmarks/trials/mutated_files.py results --count 2000
+
+Each case is drawn by its seed, from `--first` on, and judged by `tests/helpers/mutations.py`. A study file is read; of a store
+one to three files are changed, then it is read, computed on and read again; a saved result is changed byte by byte, or prepared
+anew with odd parts and the right digest. Printed are the failures with their seeds and the counts; the exit code is 1 if there
+is a failure: a raw error, more than 60 s of the processor, a number that is not the right one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import os
+import pathlib
+import shutil
+import sys
+import tempfile
+import time
+
+import jax
+import numpy as np
+
+import jaxvib as jv
+
+sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / "helpers")]
+
+import mutations  # noqa: E402
+
+jv.prepare_cpu()
+jax.config.update("jax_enable_x64", True)
+
+
+def machine() -> jv.Scene:
+    return jv.Scene(
+        jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0), link_stiffness=2e5, link_damping=60.0),
+        jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5),
+        jv.ConstantSpeed(60.0),
+    )
+
+
+def studies(folder: pathlib.Path):
+    jv.save_scene(machine(), folder / "machine.toml")
+    (folder / "study.toml").write_text(mutations.STUDY)
+    original = mutations.load_study(folder / "study.toml")
+    return lambda rng: mutations.study_outcome(folder, mutations.mutated_text(mutations.STUDY, rng), original)
+
+
+def stores(folder: pathlib.Path):
+    jv.save_scene(machine(), folder / "machine.toml")
+    (folder / "study.toml").write_text(mutations.STUDY)
+    asked = mutations.load_study(folder / "study.toml")
+    whole = pathlib.Path(mutations.run_study(asked, folder / "whole.zarr").store)
+    truth = jv.open_sweep(whole).data.load()
+
+    def one(rng):
+        store = folder / "study.zarr"
+        shutil.rmtree(store, ignore_errors=True)
+        shutil.copytree(whole, store)
+        mutations.mutate_store(store, rng)
+        return mutations.store_outcome(store, asked, truth)
+
+    return one
+
+
+def results(folder: pathlib.Path):
+    scene = machine()
+    saved = [jv.jam_modes(scene), jv.branches(scene)]
+    saved += [jv.simulate(scene, 0.2, estimate=False, save="window"), jv.jam_orbit(scene, mode=3)]
+    os.chdir(folder)
+
+    def one(rng):
+        result = rng.choice(saved)
+        path = result.save(folder / "result.npz")
+        prepared = mutations.mutate_result(path, rng)
+
+        def alike(found):
+            for mine, its in zip(jax.tree.leaves(found), jax.tree.leaves(result), strict=True):
+                assert np.array_equal(np.asarray(mine), np.asarray(its), equal_nan=True), "another number"
+
+        return mutations.result_outcome(path, prepared, alike)
+
+    return one
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=["studies", "stores", "results"])
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=540.0, help="no further case is begun after so many")
+    given = parser.parse_args()
+    folder, begun, counts = pathlib.Path(tempfile.mkdtemp()), time.monotonic(), collections.Counter()
+    try:
+        one = {"studies": studies, "stores": stores, "results": results}[given.part](folder)
+        for seed in range(given.first, given.first + given.count):
+            if time.monotonic() - begun > given.seconds:
+                break
+            kind, said = one(mutations.seeded(seed))
+            counts[kind] += 1
+            if kind not in ("refused", "accepted"):
+                print(f"seed {seed}: {kind}: {said}", flush=True)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    print(f"{given.part}: {sum(counts.values())} cases in {time.monotonic() - begun:.0f} s: {dict(counts)}")
+    sys.exit(bool(set(counts) - {"refused", "accepted"}))
+
+
+if __name__ == "__main__":
+    main()
