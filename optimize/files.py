@@ -127,7 +127,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     if not isinstance(table, Mapping):
         raise InputError(section, f"is {table!r}; it must be a table with a quantity")
     name = table.get("quantity")
-    if name not in _QUANTITIES:
+    if not isinstance(name, str) or name not in _QUANTITIES:
         problem = "is missing" if name is None else f"is {name!r}"
         raise InputError(f"{section}.quantity", f"{problem}; {closest(str(name), list(_QUANTITIES))}")
     own = (*more, "tolerances", "statistic", "samples")
@@ -140,7 +140,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     quantity = called(_QUANTITIES[name], values, section)
     if "tolerances" in table:
         how = table.get("statistic", "expected")
-        if how not in _STATISTICS:
+        if not isinstance(how, str) or how not in _STATISTICS:
             raise InputError(f"{section}.statistic", f"is {how!r}; {closest(str(how), list(_STATISTICS))}")
         quantity = _STATISTICS[how](quantity, table["tolerances"], samples=table.get("samples", 64))
     return quantity, {k: table[k] for k in more if k in table}

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxvib.equations.collected import light_friction
 from jaxvib.equations.linear import jammed_loads, peak_force
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, shown
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
@@ -72,12 +72,12 @@ def _whose(of: Pair) -> str:
 
 
 def _pair(of: Pair | list[int]) -> Pair:
-    """A list, as design files give it, as a pair. **Raises** `InputError` for one that is none."""
-    if not isinstance(of, list):
-        return of
-    if len(of) != 2:
-        raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms")
-    return of[0], of[1]
+    """A platform or a pair of them, also as a list, as design files give it. **Raises** `InputError` for anything else."""
+    parts = of if isinstance(of, (list, tuple)) else (of,)
+    whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
+    if of is not None and not (whole and len(parts) == (2 if parts is of else 1)):
+        raise InputError("of", f"is {shown(of)}; give a platform or a pair of different platforms")
+    return tuple(of) if isinstance(of, list) else of  # pyright: ignore[reportReturnType]
 
 
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:

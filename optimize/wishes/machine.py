@@ -201,7 +201,7 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     if len(rows) < 2 or not all(isinstance(row, (list, tuple)) and len(row) == 2 for row in rows):
         raise InputError("prices", "is no list of at least two pairs (stiffness, price)")
     stiffness = tuple(number_in(k, "N/m", f"prices[{i}]") for i, (k, _) in enumerate(rows))
-    price = tuple(float(p) for _, p in rows)
+    price = tuple(number_in(p, "", f"prices[{i}]") for i, (_, p) in enumerate(rows))
     if not all(a < b for a, b in itertools.pairwise(stiffness)) or not stiffness[0] > 0.0:
         raise InputError("prices", "has stiffnesses that do not ascend from one greater than 0")
     for i, each in enumerate(price):

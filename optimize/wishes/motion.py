@@ -57,10 +57,10 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     's'
     """
     count(of, "of")
-    if not 0.0 < within < 1.0:
+    if not 0.0 < (share := number_in(within, "", "within")) < 1.0:
         raise InputError("within", f"is {within!r}; it must be greater than 0 and less than 1")
     text = f"time until platform {of} settles"
-    settings = (*_times(until, spin_up), float(within), of)
+    settings = (*_times(until, spin_up), share, of)
     return Asking("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)
 
 
