@@ -89,6 +89,16 @@ def test_quantities_of_a_jam_and_of_the_machine():
     np.testing.assert_allclose(found[there], np.asarray(awaited)[there], rtol=1e-8)
 
 
+@pytest.mark.parametrize("effects", [(), (jv.DryFriction(0.02, 0.01),)])
+def test_power_is_what_the_dampers_take_at_the_loads_speed(effects):
+    """The rotor's torque on the loads is that of the vibration: what the dampers take in a radian of the loads."""
+    s = scene("two_mass", "pendulums", speed=120.0, effects=effects)
+    jam = jv.jam_modes(s).select(3)
+    y, omega = np.asarray(jam.displacement), float(jam.omega)
+    taken = 0.5 * omega**2 * np.real(np.conj(y) @ np.asarray(s.machine.carrier().damping) @ y)
+    np.testing.assert_allclose(power(mode=3)(s), 120.0 * taken / omega, rtol=1e-8)
+
+
 def test_tiers_agree_with_the_functions_they_stand_for():
     orbit = jv.jam_orbit(SCENE, mode=3)
     np.testing.assert_allclose(amplitude(mode=3, of=2, tier="exact")(SCENE), orbit.amplitude[1], rtol=1e-12)
