@@ -100,3 +100,22 @@ def test_shortfalls_are_told_in_a_designers_units():
 def test_slopes_tell_small_changes_only(searched, gain, says):
     (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).said()
     assert line == f"  at its limit: a (1 m); {says}"
+
+
+def test_figures_show_what_was_found(searched, monkeypatch):
+    """Before against after, the best start among all, the second quantity across: in a designer's units."""
+    shown = {}
+    for name in ("before_after", "convergence", "front_chart"):
+        monkeypatch.setattr(f"jaxvib.draw.charts.{name}", lambda *what, name=name, **how: shown.update({name: (what, how)}))
+    dataclasses.replace(searched, table=(Row("a", "N/m", 500.0, 2e3, math.nan, math.nan),)).plot()
+    assert shown["before_after"] == (([("a, N/mm", 0.5, 2.0)],), {"title": "search for least off by", "ax": None})
+    history, values = np.array([[5e4, math.nan, 7e4], [3e4, 1e4, 2e4]]), np.array([3e4, 1e4, math.inf])
+    dataclasses.replace(searched, values=values, history=history, objective="peak_force").plot_convergence()
+    (drawn,), how = shown["convergence"]
+    np.testing.assert_allclose(drawn, history / 1e3)
+    assert how == {"best": 1, "label": "peak force, kN", "ax": None}
+    front = Front(values=np.array([[0.5, 2e4], [0.25, 3e4]]), names=("one", "two"), units=("m", "N"), machines=("", ""))
+    front.plot()
+    (across, up), how = shown["front_chart"]
+    np.testing.assert_allclose([across, up], [[20.0, 30.0], [500.0, 250.0]])
+    assert how == {"across": "two, kN", "up": "one, mm", "ax": None}

@@ -1,5 +1,6 @@
 """CMA-ES in place of the descent: the same answers where there is one valley, the deepest where there are many."""
 
+import cma
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -93,6 +94,26 @@ def test_populations_follow_jams_from_the_nearest_design(monkeypatch):
     for _ in range(40):
         followed.of(second)
     assert len(followed.seen[0]) == len(followed.seen[1]) <= 200
+    monkeypatch.setattr(evolve_module, "_REMEMBERED", 4)  # the last ones
+    followed.of(first)
+    np.testing.assert_array_equal(followed.seen[0], [second[2], *first])
+
+
+def test_evolutions_begin_anew_with_twice_the_population(monkeypatch):
+    begun = []
+    strategy = cma.CMAEvolutionStrategy
+
+    def begin(where, step, options):
+        begun.append((options["popsize"], options["seed"], tuple(where)))
+        return strategy(where, step, options)
+
+    monkeypatch.setattr(cma, "CMAEvolutionStrategy", begin)
+    problem = problem_of(DesignSpace(SCENE, FREE), plain("bowl", lambda x, y: (x - 6.0) ** 2 + (y - 5.0) ** 2 + 2.0), [])
+    found = evolve(problem, 1200, 5, lambda share, least: None)
+    sizes, seeds, starts = zip(*begun, strict=True)
+    assert len(begun) >= 2 and sizes == tuple(6 * 2**k for k in range(len(begun))) and seeds == tuple(range(6, 6 + len(begun)))
+    np.testing.assert_array_equal(starts, np.random.default_rng(5).uniform(size=(len(begun), 2)))
+    assert 1200 <= found.drawn < 1200 + sizes[-1]
 
 
 def test_an_evolution_counts_and_tells_what_it_tries():
