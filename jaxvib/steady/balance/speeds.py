@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import checked
+from jaxvib.machine.checked import allowed_unknowns, checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.numerics.roots import bracketed_root
@@ -33,10 +33,11 @@ _POINTS = 24
 
 
 class CriterionStatus(eqx.Enumeration):
-    """What is known of a machine that was judged; the members are the sentences a user reads."""
+    """Outcome of the criterion for a machine; the members are the sentences a user reads."""
 
     judged = "every rotor speed is judged"
     free = "no support holds the machine against one of its motions: its lowest resonance is 0, and it can drift"
+    not_finite = "the speeds could not be computed: a number of the scene is not allowed, or beyond the precision"
 
 
 class CharacteristicSpeeds(Result):
@@ -62,8 +63,13 @@ class CharacteristicSpeeds(Result):
 
     @property
     def status(self) -> CriterionStatus:
-        """Whether supports hold the machine, a `CriterionStatus`."""
-        return CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged)
+        """A `CriterionStatus`: whether supports hold the machine, and whether the speeds could be computed at all.
+
+        Every machine has a first resonance, with damping and without, and finite shapes: other speeds may be missing.
+        """
+        there = jnp.isfinite(self.resonances[0]) & jnp.isfinite(self.damped_resonances[0]) & jnp.all(jnp.isfinite(self.shapes))
+        status = CriterionStatus.where(self.resonances[0] == 0.0, CriterionStatus.free, CriterionStatus.judged)
+        return CriterionStatus.where(there, status, CriterionStatus.not_finite)
 
     def labelled(self, *, damped: bool = False) -> list[tuple[str, float]]:
         """Every speed with its label ("resonance 1", "additional 1", ...), ascending."""
@@ -164,7 +170,8 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     found, *parts = _characteristic_speeds(scene)
     if not any(map(traced, parts)):
         _require_port_that_moves(scene, *map(np.asarray, parts))
-    return found
+    allowed = allowed_unknowns(scene)
+    return found if allowed is None else jax.tree.map(lambda x: jnp.where(allowed, x, jnp.nan), found)
 
 
 @cached

@@ -24,6 +24,7 @@ from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
 from jaxvib.steady.balance.stability import BalancedStability
+from jaxvib.units import count
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -242,6 +243,7 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
     """
+    count(steps, "steps", low=2)
     angles, neutral = _arrangement(scene, angles)
     matrix = _monodromies(scene, angles, steps)
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
@@ -267,6 +269,7 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     >>> balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
+    count(steps, "steps", low=2)
     angles, neutral = _arrangement(scene, angles)
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.

@@ -167,7 +167,7 @@ def audit(
         status=member(AuditStatus, status),
         accuracy=float(accuracy),
         question=words,
-        kind=own.kind,
+        kind=own.words,
         omega=own.omega,
         amplitude=np.asarray(own.amplitude),
         foundation_force=own.foundation_force,

@@ -44,9 +44,9 @@ _GRID = 100
 
 
 class Values(NamedTuple):
-    """What a motion is judged by.
+    """Numbers and words by which a motion is judged.
 
-    **Attributes**: `kind` of motion, in words; `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad;
+    **Attributes**: `kind` of motion, in words, which differ if the motions do; `remark` on the computation; `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad;
     `foundation_force` N; `fold`, the rotor speed (rad/s) at which the jam ends, NaN where there is none or none is asked for;
     `uncertainty`, relative, below which nothing of this can be told; `closest`: the least distance of two loads in units of
     their diameter, NaN where they have none or the tier takes them as collected; `magnified`: changes are relative to so many
@@ -61,6 +61,12 @@ class Values(NamedTuple):
     uncertainty: float
     closest: float = math.nan
     magnified: float = 1.0
+    remark: str = ""
+
+    @property
+    def words(self) -> str:
+        """The kind with the remark."""
+        return f"{self.kind} ({self.remark})" if self.remark else self.kind
 
 
 class JamQuestion(NamedTuple):
@@ -77,18 +83,22 @@ class JamQuestion(NamedTuple):
         return True
 
     def exact(self, scene: Scene) -> Values:
-        """By the exact orbit; NaN, and a kind that says so, where there is no such jam."""
+        """Values of the exact orbit; NaN, and a kind that says so, if there is no such jam."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         there = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {'stable' if orbit.stable else 'unstable'}" if there else f"no jam mode {self.mode}"
-        accurate = bool(orbit.status == OrbitStatus.found)
+        # Loads that nothing holds together move in another way; other statuses tell of the computation alone.
+        if there and bool(orbit.status == OrbitStatus.held):
+            kind = f"{kind}, but the loads part"
+        computed = not there or bool(orbit.status == OrbitStatus.held) or bool(orbit.status == OrbitStatus.found)
         return Values(
-            kind if accurate or not there else f"{kind} ({status_name(orbit.status)})",
+            kind,
             float(orbit.omega),
             tuple(np.abs(np.asarray(orbit.amplitude)).tolist()),
             float(orbit.foundation_force),
             fold_speed(admitted(scene), float(orbit.omega)),
             max(float(orbit.error), _ROUNDING) if there else math.nan,
+            remark="" if computed else status_name(orbit.status),
         )
 
     def state(self, scene: Scene) -> State:

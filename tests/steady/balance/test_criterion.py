@@ -9,12 +9,14 @@ import scipy.linalg
 import scipy.optimize
 from closed_forms import one_mass_speeds, three_mass_speeds, two_mass_functional, two_mass_speeds
 from gyroscopic_rotor import rotor
-from scenes import machines, scene
+from scenes import BALLS, machines, scene
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.results.status import status_name
 from jaxvib.steady.balance.criterion import criterion_functional, criterion_table
 from jaxvib.steady.balance.speeds import CriterionStatus, characteristic_speeds
+from jaxvib.steady.balance.states import balanced_growth, balanced_stability
 
 LINKS = {1: (), 2: ((1, 2),), 3: ((1, 2), (1, 3), (2, 3))}
 
@@ -343,3 +345,32 @@ def test_the_criterion_is_for_several_loads_that_nothing_pulls():
     ):
         asked(2, jv.Gravity())
     assert asked(2, jv.LoadContact(1e5)).status_name == "judged"
+
+
+@pytest.mark.parametrize("place", [lambda s: s.machine.mass, lambda s: s.machine.stiffness])
+def test_numbers_that_are_not_finite_are_not_judged(place):
+    """Numbers that come to be known in the program only: negative ones and infinite ones have a status of their own."""
+    scene = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), jv.balls(**{**BALLS, "count": 2}), jv.ConstantSpeed(9.0)
+    )
+
+    def judged(x):
+        return jv.criterion(eqx.tree_at(place, scene, x)).status
+
+    good = place(scene)
+    statuses = [status_name(jax.jit(judged)(x)) for x in (good, -good, good * jnp.inf)]
+    assert statuses == ["judged", "not_finite", "not_finite"]
+
+
+@pytest.mark.parametrize("steps", [-1, 0, 1, 2.5])
+def test_steps_of_a_criterion_map_are_checked(steps):
+    scene = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0), jv.balls(**{**BALLS, "count": 2}), jv.ConstantSpeed(9.0)
+    )
+    for ask in (
+        lambda: jv.criterion_map(scene, speeds=[20.0, 30.0], mass=[1.0], drag=[1.0], steps=steps),
+        lambda: balanced_growth(scene, [20.0], steps=steps),
+        lambda: balanced_stability(scene, steps=steps),
+    ):
+        with pytest.raises(jv.InputError, match="steps is .* it must be a whole number, at least 2"):
+            ask()

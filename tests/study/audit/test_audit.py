@@ -15,6 +15,7 @@ from stored_jit import stored_jit
 import jaxvib as jv
 from jaxvib.cli.app import run as command
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
+from jaxvib.results.status import member
 from jaxvib.study.audit.audit import _as_computed
 from jaxvib.study.audit.compared import Asked, EffectRow, effect_row
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
@@ -212,6 +213,8 @@ class Answers:
         (Values("no jam", math.nan, (math.nan,), math.nan, math.nan, math.nan), True, "needed"),
         (Values("balanced", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "needed"),
         (Values("unsettled", 10.0, (1.0,), 5.0, 20.0, 1e-9), True, "cannot tell"),
+        (Values("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="coarse"), True, "negligible"),
+        (Values("jam", 10.0, (1.0003,), 5.0, 20.0, 1e-9, remark="at_fold"), False, "negligible"),
         (Values("unsettled", 10.0, (1.2,), 5.0, 20.0, 0.05), True, "needed"),
     ],
 )
@@ -335,3 +338,21 @@ def test_every_variant_starts_from_a_state_that_it_takes(kind):
         for each in (scene, *(variant.scene for variant in variants)):
             state = RunQuestion(1.0, start).state(each)
             jax.eval_shape(jv.vector_field(each), jnp.zeros(()), state)
+
+
+@pytest.mark.parametrize(
+    ("status", "kind", "words"),
+    [
+        ("found", "jam mode 1, stable", "jam mode 1, stable"),
+        ("coarse", "jam mode 1, stable", "jam mode 1, stable (coarse)"),
+        ("held", "jam mode 1, stable, but the loads part", "jam mode 1, stable, but the loads part"),
+    ],
+)
+def test_a_status_of_the_computation_is_no_kind_of_motion(status, kind, words, monkeypatch):
+    def orbit(scene, **_):
+        changed = member(jv.OrbitStatus, status)
+        return eqx.tree_at(lambda o: o.status, jv.jam_orbit(scene, mode=1), changed)
+
+    monkeypatch.setattr("jaxvib.study.audit.questions.jam_orbit", orbit)
+    found = JamQuestion(1).exact(BARE)
+    assert (found.kind, found.words) == (kind, words)
