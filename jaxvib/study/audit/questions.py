@@ -46,11 +46,15 @@ _GRID = 100
 class Values(NamedTuple):
     """Numbers and words by which a motion is judged.
 
-    **Attributes**: `kind` of motion, in words, which differ if the motions do; `remark` on the computation; `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad;
-    `foundation_force` N; `fold`, the rotor speed (rad/s) at which the jam ends, NaN where there is none or none is asked for;
-    `uncertainty`, relative, below which nothing of this can be told; `closest`: the least distance of two loads in units of
-    their diameter, NaN where they have none or the tier takes them as collected; `magnified`: changes are relative to so many
-    times these amplitudes and this force, more than 1 where the machine hardly moves, see `LEAST`.
+    **Attributes**
+
+    - `kind`: words that differ if the motions do; `remark`: on the computation alone
+    - `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad; `foundation_force` N
+    - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or none is asked for
+    - `uncertainty`: relative, below which nothing of this can be told
+    - `closest`: the least distance of two loads in units of their diameter, NaN if they have none or are taken as collected
+    - `magnified`: changes are relative to so many times these amplitudes and this force, more than 1 if the machine hardly
+      moves, see `LEAST`
     """
 
     kind: str
