@@ -22,8 +22,8 @@ from parts.common import best, first, published, say
 import jaxvib as jv
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model, steady_displacement
+from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.balance.monodromy import magnus
 from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
 from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
 from jaxvib.steady.orbits.floquet import floquet, steps_for
@@ -244,7 +244,7 @@ def orbits(quick: bool = False) -> None:
 
 def by_differentiation(scene: jv.Scene, quick: bool) -> None:
     """Multipliers alone, of 100 motions: `floquet`, whose linearised equations are written by hand, and the full equations
-    differentiated along the same motions, both by a Magnus method of order 6 over half a period."""
+    differentiated along the same motions by Radau's method of order 11, both over half a period."""
     group, omega = "multipliers of an exact orbit", jnp.linspace(0.6, 0.9, 100)
     model, grid = collected_model(jammed_model(scene)), grid_of(16, True)
     print(f"{group}; error: of the largest modulus, to many steps")
@@ -260,22 +260,23 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
     motion, harmonics = motions(omega)
     k, j = np.asarray(grid.orders), np.asarray(grid.deviation_orders)
 
-    def along(theta: jax.Array, w: jax.Array, q: jax.Array, psi: jax.Array) -> jax.Array:
+    def along(theta: jax.Array, q: jax.Array, psi: jax.Array) -> jax.Array:
         wave, lag = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
-        angle, rate = theta + (psi @ lag).real, w * (1.0 + (psi @ (1j * j * lag)).real)
-        return jnp.concatenate([(q @ wave).real, w * (q @ (1j * k * wave)).real, angle, rate])
+        angle, rate = theta + (psi @ lag).real, 1.0 + (psi @ (1j * j * lag)).real
+        return jnp.concatenate([(q @ wave).real, angle, (q @ (1j * k * wave)).real, rate])
 
     def differentiated(steps: int) -> Callable[[], Any]:
         def one(w: jax.Array, n: jax.Array, q: jax.Array, psi: jax.Array) -> jax.Array:
             field = jv.vector_field(eqx.tree_at(lambda s: s.drive.speed, scene, n))
 
-            def rates(y: jax.Array) -> jax.Array:
-                change = field(0.0, jv.State(y[:2], y[2:4], (y[4:5],), (y[5:6],)))
-                return ravel_pytree(change)[0] / w
+            def acceleration(y: jax.Array) -> jax.Array:
+                change = field(0.0, jv.State(y[:2], w * y[3:5], (y[2:3],), (w * y[5:6],)))
+                return jnp.concatenate([change.velocity, change.rate[0]]) / w**2
 
             def step(flow: jax.Array, at: jax.Array) -> tuple[jax.Array, None]:
-                points = (at + 0.5 + np.sqrt(0.15) * np.asarray([-1.0, 0.0, 1.0])) * h
-                return magnus(*jax.vmap(lambda t: jax.jacfwd(rates)(along(t, w, q, psi)))(points), h) @ flow, None
+                points = (at + radau.NODES) * h
+                slopes = jax.vmap(lambda t: jax.jacfwd(acceleration)(along(t, q, psi)))(points)
+                return radau.transition(slopes, h) @ flow, None
 
             h = np.pi / steps
             return jax.lax.scan(step, jnp.eye(6), jnp.arange(steps) * 1.0)[0]
@@ -285,7 +286,7 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
 
     def largest(flow: Any) -> np.ndarray:
         """Half a period turns the directions of the carrier: an orbit comes back to its mirror image."""
-        mirrored = np.asarray(flow) * np.asarray([-1.0] * 4 + [1.0] * 2)[None, :, None]
+        mirrored = np.asarray(flow) * np.asarray([-1.0, -1.0, 1.0] * 2)[None, :, None]
         values = np.sort(np.abs(np.linalg.eigvals(mirrored)), axis=1)
         return values[:, -2]  # the one before the trivial 1, where the motion is stable
 

@@ -2,16 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.equations.linear import circular_loads
+from jaxvib.equations.linear import circular_loads, linear_model
+from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene
+from jaxvib.numerics import radau
+from jaxvib.runtime.programs import cached
+from jaxvib.units import count
 
-__all__ = ["at_constant_speed", "balanced_motion", "magnus", "monodromy"]
+__all__ = ["BATCH", "at_constant_speed", "balanced_motion", "checked_steps", "fine_and_coarse", "monodromies", "monodromy"]
+
+BATCH = 16
+"""Rotor speeds whose monodromies are computed side by side."""
+
+_FORGOTTEN = 40.0
+"""Vibration that decays by exp(-40) in a turn is below the rounding of multipliers."""
+
+_FEWEST, _MOST = 16, 2**17
+"""Steps of a turn; a rotor that asks for more is so slow that only carriers which come to rest within a turn are resolved."""
 
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
@@ -25,56 +43,95 @@ def at_constant_speed(scene: Scene) -> Scene:
     return Scene(scene.machine, scene.loads, ConstantSpeed(scene.drive.speed), scene.effects)
 
 
-def monodromy(scene: Scene, angles: Array, steps: int) -> Array:
+def _steps_for(scene: Scene) -> Array:
+    """Number of steps in which `monodromy` resolves a turn: the carrier's oscillation, and the turn itself."""
+    linear, speed = linear_model(scene), scene.drive.speed
+    fastest = jnp.max(linear.modes()[0])
+    if linear.carrier.gyroscopic is not None:
+        half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
+        fastest = fastest + speed * jnp.linalg.norm(half @ linear.carrier.gyroscopic @ half.T)
+    return jnp.clip(radau.steps_for(2.0 * jnp.pi * (fastest / speed + 2.0)), _FEWEST, _MOST)
+
+
+def monodromy(scene: Scene, angles: Array, steps: int | Array) -> Array:
     """The monodromy matrix of the balanced motion over one turn of the rotor, (2 (nd + N), 2 (nd + N)).
 
-        x' = A(n t) x,  x = (q / R, q' / (R n), dphi, dphi' / n),     monodromy = x(turn) for x(0) = 1
+        x'' = P(n t) x + R(n t) x',  x = (q / R, dphi),     (x, x' / n)(turn) = monodromy (x, x' / n)(0)
 
-    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of the Magnus method, static. `jit`, `vmap`
-    and `grad` go through it; whoever calls it makes sure that the loads cancel each other and the rotor's imbalance.
+    **Arguments**: `angles` (N,) rad of the loads in the rotor's frame; `steps` of `radau.transition`, a Python number (then
+    reverse derivatives exist) or a scalar array. `jit`, `vmap` and `grad` go through it. The caller makes sure that the loads
+    cancel each other and the rotor's imbalance.
     """
     scene = at_constant_speed(scene)
     field = vector_field(scene)
     speed = scene.drive.speed
     radius = jnp.mean(circular_loads(scene).radius)
-    scale = (radius, radius * speed, jnp.ones_like(speed), speed)
     nd, n = field.stiffness.shape[0], angles.shape[0]
-    sizes = jnp.concatenate([jnp.full((k,), 1.0) * v for k, v in zip((nd, nd, n, n), scale, strict=True)])
+    sizes = jnp.concatenate([jnp.full((nd,), 1.0) * radius, jnp.ones(n)])
 
-    def rate(turn: Array, x: Array) -> Array:
+    def acceleration(turn: Array, x: Array) -> Array:
         base = balanced_motion(scene, angles, turn)
-        e = x * sizes
-        state = State(e[:nd], e[nd : 2 * nd], (base.azimuth + e[2 * nd : 2 * nd + n],), (base.azimuth_rate + e[2 * nd + n :],))
-        change = field(turn / speed, state)
-        return jnp.concatenate([change.displacement, change.velocity, change.azimuth, change.azimuth_rate]) / (sizes * speed)
+        (q, dphi), (v, drate) = ((part[:nd], part[nd:]) for part in (x[: nd + n] * sizes, x[nd + n :] * sizes * speed))
+        change = field(turn / speed, State(q, v, (base.azimuth + dphi,), (base.azimuth_rate + drate,)))
+        return jnp.concatenate([change.velocity, change.azimuth_rate]) / (sizes * speed**2)
 
-    def generator(turn: Array) -> Array:
-        return jax.jacfwd(lambda x: rate(turn, x))(jnp.zeros_like(sizes))
+    still = jnp.zeros(2 * (nd + n), sizes.dtype)
+    h = jnp.asarray(2.0 * jnp.pi / steps, sizes.dtype)
 
-    h = 2.0 * jnp.pi / steps
+    def step(k: Array, flow: Array) -> Array:
+        points = (k + jnp.asarray(radau.NODES, sizes.dtype)) * h
+        slopes = jax.vmap(lambda turn: jax.jacfwd(lambda x: acceleration(turn, x))(still))(points)
+        return radau.transition(slopes, h) @ flow
 
-    def step(flow: Array, k: Array) -> tuple[Array, None]:
-        points = (k + 0.5 + jnp.sqrt(0.15) * jnp.asarray([-1.0, 0.0, 1.0])) * h
-        a, b, c = jax.vmap(generator)(points)
-        return magnus(a, b, c, h) @ flow, None
-
-    return jax.lax.scan(step, jnp.eye(sizes.shape[0], dtype=sizes.dtype), jnp.arange(steps) * 1.0)[0]
+    return jax.lax.fori_loop(0, steps, step, jnp.eye(still.size, dtype=sizes.dtype))
 
 
-def magnus(a: Array, b: Array, c: Array, h: float | Array) -> Array:
-    """The flow of x' = A x over a step `h`, from A at its three Gauss points, by a Magnus method of order 6."""
-    a1, a2, a3 = h * b, jnp.sqrt(15.0) / 3.0 * h * (c - a), 10.0 / 3.0 * h * (c - 2.0 * b + a)
-    c1 = _commutator(a1, a2)
-    c2 = -_commutator(a1, 2.0 * a3 + c1) / 60.0
-    return _exponential(a1 + a3 / 12.0 + _commutator(-20.0 * a1 - a3 + c1, a2 + c2) / 240.0)
+@cached
+def monodromies(scene: Scene, angles: Any, speeds: Any, steps: int | None) -> Array:
+    """Monodromy matrices at rotor speeds (S,), S a multiple of `BATCH`: (S, 2 (nd + N), 2 (nd + N))."""
+
+    def flow(speed: Array) -> Array:
+        this = eqx.tree_at(lambda s: s.drive.speed, scene, speed)
+        return monodromy(this, angles, _steps_for(this) if steps is None else steps)
+
+    return jax.lax.map(flow, speeds, batch_size=BATCH)
 
 
-def _exponential(a: Array) -> Array:
-    """exp(a) by Taylor's series of a/16 to the twelfth power, squared four times; written out, so that it batches."""
-    eye = jnp.eye(a.shape[0], dtype=a.dtype)
-    series = jax.lax.fori_loop(0, 12, lambda k, x: eye + (a / 16.0) @ x / (12.0 - k), eye)
-    return jax.lax.fori_loop(0, 4, lambda _, x: x @ x, series)
+@cached
+def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array, Array]:
+    """The monodromy matrix at the scene's rotor speed, and that by half as many steps."""
+    fine = _steps_for(scene) if steps is None else steps
+    return monodromy(scene, angles, fine), monodromy(scene, angles, fine // 2)
 
 
-def _commutator(x: Array, y: Array) -> Array:
-    return x @ y - y @ x
+def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
+    """Return `steps` if they are a count, or None if they are to be chosen for each speed.
+
+    **Raises** `InputError` for other steps, and for a rotor so slow that steps would have to be longer than the carrier's
+    vibration although that outlasts the turn: in the method it decays.
+    """
+    if steps is not None:
+        return count(steps, "steps", low=2, each=64.0)
+    slowest = float(np.min(np.asarray(speeds), initial=np.inf))
+    if not slowest > 0.0:
+        raise InputError("speeds", f"contain {slowest:g} rad/s; they must be greater than 0")
+    decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
+    if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _FORGOTTEN:
+        problem = (
+            f"is {slowest:g} rad/s, so slow that a turn takes more than {_MOST} steps, and the carrier still vibrates at its "
+            f"end (it decays at {max(decay, 0.0):.2g} 1/s); turn faster, or give machine.damping"
+        )
+        raise InputError("drive.speed", problem)
+    return None
+
+
+@cached
+def _slowest_decay(scene: Scene) -> tuple[Array, Array]:
+    """The slowest decay of the carrier's vibrations, 1/s, at the scene's speed, and the steps of a turn."""
+    model = linear_model(scene)
+    nd = model.mass.shape[0]
+    solved = jnp.linalg.solve(
+        model.mass, jnp.concatenate([-model.carrier.stiffness, -model.damping(scene.drive.speed)], axis=1)
+    )
+    first = jnp.concatenate([jnp.zeros((nd, nd)), jnp.eye(nd)], axis=1)
+    return -jnp.max(jnp.linalg.eigvals(jnp.concatenate([first, solved])).real), _steps_for(scene)

@@ -23,18 +23,20 @@ class StabilityStatus(eqx.Enumeration):
 
     stable = "errors of the balanced motion die out"
     unstable = "errors of the balanced motion grow"
+    undecided = "errors of the balanced motion change less in a turn than the computation can tell"
 
 
 class BalancedStability(Result):
     """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
 
-    **Attributes**: `stable`; `growth` 1/s, the largest rate at which an error grows (negative: the slowest decay),
-    neutral directions left out; `multipliers` (2 (nd + N),) complex, the largest first; `neutral` the number of those
-    that are 1 because the arrangements form a family (the common turn at least); `error` of the multipliers,
-    estimated from half the number of steps.
+    **Attributes**: `stable`; `is_decided`, true if the growth over a turn is larger than its error; `growth` 1/s, the largest
+    rate at which an error grows (negative: the slowest decay), neutral directions left out; `multipliers` (2 (nd + N),)
+    complex, the largest first; `neutral` the number of those that are 1 because the arrangements form a family (the common
+    turn at least); `error` of the multipliers, estimated from half the number of steps.
     """
 
     stable: bool = eqx.field(metadata=in_unit(""))
+    is_decided: bool = eqx.field(metadata=in_unit(""))
     growth: float = eqx.field(metadata=in_unit("1/s"))
     multipliers: np.ndarray = eqx.field(metadata=in_unit("", "floquet"))
     neutral: int = eqx.field(metadata=in_unit(""))
@@ -43,6 +45,8 @@ class BalancedStability(Result):
     @property
     def status(self) -> StabilityStatus:
         """Whether it is stable, a `StabilityStatus`."""
+        if not self.is_decided:
+            return StabilityStatus.undecided
         return StabilityStatus.stable if self.stable else StabilityStatus.unstable
 
     def summary(self) -> str:

@@ -22,7 +22,14 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.balance.monodromy import at_constant_speed, balanced_motion, monodromy
+from jaxvib.steady.balance.monodromy import (
+    BATCH,
+    at_constant_speed,
+    balanced_motion,
+    checked_steps,
+    fine_and_coarse,
+    monodromies,
+)
 from jaxvib.steady.balance.stability import BalancedStability
 from jaxvib.units import count
 
@@ -30,9 +37,6 @@ if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["BalanceStatus", "BalancedStates", "balanced_growth", "balanced_intervals", "balanced_stability", "balanced_states"]
-
-_BATCH = 16
-"""Rotor speeds whose monodromies are computed side by side."""
 
 
 class BalanceStatus(eqx.Enumeration):
@@ -63,16 +67,16 @@ class BalancedStates(Result):
     names: tuple[str, ...] = eqx.field(metadata=in_unit("", "neutral_direction", name="neutral_direction"))
     scene: Scene = eqx.field(metadata=SCENE)
 
-    def stability(self, arrangement: int = 0, *, steps: int = 48) -> BalancedStability:
+    def stability(self, arrangement: int = 0, *, steps: int | None = None) -> BalancedStability:
         """Whether that arrangement, counted from 0, is stable at the scene's rotor speed, see `balanced_stability`."""
         return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
 
-    def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int = 48) -> np.ndarray:
+    def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
         """Growth rate of its errors at rotor speeds, 1/s: stable where it is negative, see `balanced_growth`."""
         return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)
 
     def intervals(
-        self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int = 48
+        self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> list[list[float]]:
         """Intervals of rotor speed, rad/s, in which it is stable, see `balanced_intervals`."""
         return balanced_intervals(self.scene, low, high, self._arranged(arrangement), points=points, steps=steps)
@@ -222,18 +226,19 @@ def _neutral(sides: np.ndarray, angles: np.ndarray, *, turns: bool = True) -> np
     return np.concatenate([common, basis[:, size > 0.5]], axis=1)
 
 
-def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int = 48) -> BalancedStability:
+def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: int | None = None) -> BalancedStability:
     """Exact stability of the motion in which the loads turn with the rotor and cancel each other and its imbalance.
 
     The full equations are linearised about it; along one turn of the rotor they are periodic. No approximation is made
     for heavy loads or weak drag, as the criterion does.
 
     **Arguments**: `angles` (N,) rad in the rotor's frame, at which the loads cancel each other and the scene's
-    `StaticImbalance`; left out, the first of `balanced_states`. `steps` of a sixth-order Magnus method over one turn.
+    `StaticImbalance`; left out, the first of `balanced_states`. `steps` of Radau's method of order 11 over one turn; the
+    default resolves the carrier's natural frequencies. The method holds for loads with any drag and carriers with any damping.
 
     **Returns** `BalancedStability`. **Raises** `InputError` for angles at which the loads do not cancel, for a machine
-    that can drift, for effects that disturb the balanced motion (gravity), and as `balanced_states`; `ComputationError`
-    with its status if nothing cancels.
+    that can drift, for effects that disturb the balanced motion (gravity), for a rotor that turns too slowly beside an
+    undamped carrier, and as `balanced_states`; `ComputationError` with its status if nothing cancels.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -241,21 +246,26 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
     >>> [balanced_stability(jv.Scene(machine, loads, jv.ConstantSpeed(n))).stable for n in (20.0, 40.0)]
     [False, True]
 
-    Source: Floquet's theorem; Magnus method of Blanes, Casas, Oteo, Ros 2009, sixth order.
+    Source: Floquet's theorem; Radau's method of Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
     count(steps, "steps", low=2)
     angles, neutral = _arrangement(scene, angles)
-    matrix = _monodromies(scene, angles, steps)
+    matrix = fine_and_coarse(scene, angles, checked_steps(scene, scene.drive.speed, steps))
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
     coarse = np.linalg.eigvals(np.asarray(matrix[1]))
     growth = float(_growth_rate(fine, float(scene.drive.speed), neutral))
-    # A sixth-order method: half the steps have 64 times the error.
+    # Half the steps have 64 times the error at least: of order 11 where everything is resolved, of 6 where loads decay at once.
     error = float(np.max(np.min(np.abs(fine[:, None] - coarse[None, :]), axis=1))) / 63.0
+    # Neutral multipliers are 1: what they differ from it is rounding, which grows with the number of steps.
+    rounding = float(np.max(np.sort(np.abs(fine - 1.0))[:neutral], initial=fine.size * np.finfo(fine.real.dtype).eps))
+    is_decided = abs(growth) * 2.0 * np.pi / float(scene.drive.speed) > error + 2.0 * rounding
     order = np.argsort(-np.abs(fine))
-    return BalancedStability(bool(growth < 0.0), growth, fine[order], neutral, error)
+    return BalancedStability(is_decided and growth < 0.0, is_decided, growth, fine[order], neutral, error)
 
 
-def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int = 48) -> np.ndarray:
+def balanced_growth(
+    scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = None, *, steps: int | None = None
+) -> np.ndarray:
     """Growth rate of errors of the balanced motion at many rotor speeds, 1/s: stable where it is negative.
 
     **Arguments**: `speeds` rad/s, any shape; `angles`, `steps` as `balanced_stability`. The scene's own
@@ -273,21 +283,13 @@ def balanced_growth(scene: Scene, speeds: ArrayLike, angles: ArrayLike | None = 
     angles, neutral = _arrangement(scene, angles)
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.
-    padded = np.pad(flat, (0, -flat.size % _BATCH), mode="edge")
-    flows = _flows(at_constant_speed(scene), angles, padded, steps)[: flat.size]
+    padded = np.pad(flat, (0, -flat.size % BATCH), mode="edge")
+    flows = monodromies(at_constant_speed(scene), angles, padded, checked_steps(scene, flat, steps))[: flat.size]
     return _growth_rate(np.linalg.eigvals(np.asarray(flows)), flat, neutral).reshape(np.shape(speeds))
 
 
-@cached
-def _flows(scene: Scene, angles: Any, speeds: Any, steps: int) -> Array:
-    def flow(speed: Array) -> Array:
-        return monodromy(eqx.tree_at(lambda s: s.drive.speed, scene, speed), angles, steps)
-
-    return jax.lax.map(flow, speeds, batch_size=_BATCH)
-
-
 def balanced_intervals(
-    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int = 48
+    scene: Scene, low: float, high: float, angles: ArrayLike | None = None, *, points: int = 200, steps: int | None = None
 ) -> list[list[float]]:
     """Intervals [from, to] of rotor speed between `low` and `high` (rad/s) where the balanced motion is exactly stable.
 
@@ -318,7 +320,7 @@ def stability_changes(
     angles: ArrayLike | None = None,
     *,
     close: float = 1e-7,
-    steps: int = 48,
+    steps: int | None = None,
 ) -> np.ndarray:
     """Speeds at which the balanced motion changes its stability, ascending, by halving to `close` of the speed.
 
@@ -374,8 +376,3 @@ def _disturbance(scene: Scene, angles: Any) -> Array:
         return jnp.max(jnp.abs(field(turn / speed, balanced_motion(scene, angles, turn)).azimuth_rate))
 
     return jnp.max(jax.vmap(acceleration)(jnp.arange(3.0)))
-
-
-@cached
-def _monodromies(scene: Scene, angles: Any, steps: int) -> tuple[Array, Array]:
-    return monodromy(scene, angles, steps), monodromy(scene, angles, steps // 2)

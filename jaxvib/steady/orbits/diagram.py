@@ -26,7 +26,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.folds import fold_points
 from jaxvib.steady.jams.picture import branch_summary, picture
-from jaxvib.steady.orbits.floquet import Floquet, steps_for
+from jaxvib.steady.orbits.floquet import Floquet, is_stiff, steps_for
 from jaxvib.steady.orbits.orbit import OrbitStatus, light_rotor_speed, orbits
 from jaxvib.units import Number, count, number
 
@@ -133,9 +133,10 @@ def exact_branches(
         raise InputError("most", f"is {high:.6g} rad/s; it must be above the least, {low:.6g} rad/s")
     inside = np.concatenate([[low], inside[(inside > low) & (inside < high)], [high]])
     omega = np.interp(np.linspace(0.0, 1.0, points), np.linspace(0.0, 1.0, inside.size), inside)
-    values = _Solver(scene, accuracy)(omega)
+    solve = _Solver(scene, accuracy, low)
+    values = solve(omega)
     fields = {name: getattr(values, name) for name in ExactBranches.__dataclass_fields__ if name not in ("special", "scene")}
-    return ExactBranches(**fields, scene=scene, special=_special_points(scene, accuracy, values))
+    return ExactBranches(**fields, scene=scene, special=_special_points(solve, values))
 
 
 class _Values(NamedTuple):
@@ -159,8 +160,10 @@ class _Values(NamedTuple):
 class _Solver:
     """Exact jams at given load speeds, in batches, with as many harmonics as each asks for."""
 
-    def __init__(self, scene: Scene, accuracy: float):
+    def __init__(self, scene: Scene, accuracy: float, slowest: float):
         self.scene, self.accuracy = scene, accuracy
+        # Decay is fastest beside the slowest loads; one method for all, so that no test changes its sign between two.
+        self.implicit = bool(_is_stiff(scene, jnp.asarray(slowest, scene.drive.speed.dtype)))
 
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
@@ -175,7 +178,7 @@ class _Solver:
         return found
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
-        return in_chunks(_LANES, lambda w: _values(self.scene, w, many, self.accuracy), omega)
+        return in_chunks(_LANES, lambda w: _values(self.scene, w, many, self.accuracy, self.implicit), omega)
 
 
 def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -190,11 +193,17 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
 
 
 @cached
-def _values(scene: Scene, omega: Array, many: int, accuracy: float) -> _Values:
+def _is_stiff(scene: Scene, omega: Array) -> Array:
+    model = collected_model(jammed_model(scene))
+    return is_stiff(model, omega, light_rotor_speed(model.linear, omega))
+
+
+@cached
+def _values(scene: Scene, omega: Array, many: int, accuracy: float, implicit: bool) -> _Values:
     model = collected_model(jammed_model(scene))
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
-    steps = jnp.max(steps_for(model.linear, omega, start))
-    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy)
+    steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
+    orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy, implicit=implicit)
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 
@@ -213,10 +222,10 @@ def _tests(growth: Floquet) -> Array:
     return jnp.stack([test.real for test in tests], axis=-1)
 
 
-def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[SpecialPoint, ...]:
+def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     """Every sign change between neighbours that are both known, followed to its root."""
     kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS)]
-    if not has_half_turn(scene.effects):
+    if not has_half_turn(solve.scene.effects):
         kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS)]
 
     def read(values: _Values) -> np.ndarray:
@@ -226,7 +235,6 @@ def _special_points(scene: Scene, accuracy: float, grid: _Values) -> tuple[Speci
     row, which = np.nonzero(tests[:-1] * tests[1:] < 0.0)
     if row.size == 0:
         return ()
-    solve = _Solver(scene, accuracy)
     pick = np.arange(row.size)
     a, b = grid.omega[row], grid.omega[row + 1]
     fa, fb = tests[row, which], tests[row + 1, which]

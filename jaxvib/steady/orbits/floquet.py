@@ -10,18 +10,21 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
-from jaxvib.equations.linear import AbstractLinearModel
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.ode.dopri8 import NODES, ROWS
 from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution
 
-__all__ = ["Floquet", "floquet", "steps_for"]
+__all__ = ["Floquet", "floquet", "is_stiff", "steps_for"]
 
 _PHASE = 0.7
-"""Phase of the carrier's fastest motion in a step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast as the
-carrier, 1e-10 where it is three times as fast and 1e-8 where it is fifteen times as fast."""
+"""Phase of the carrier's fastest motion in an explicit step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast
+as the carrier, and 1e-10 if they are three times as fast."""
+
+_STIFF = 3.0
+"""Decay so many times as fast as the fastest oscillation is left to the implicit method: explicit steps would have to resolve
+it, and from about 15 times on they diverge."""
 
 # The method's last stage is the end of the step, there to be evaluated for the next one.
 _NODES = np.concatenate([[0.0], NODES[:-1]])
@@ -43,16 +46,56 @@ class Floquet(NamedTuple):
     trivial: Array
 
 
-def steps_for(model: AbstractLinearModel, omega: Array, speed: Array) -> Array:
-    """How many integration steps a turn of the grid asks for at load speeds `omega` and the rotor's `speed` (rad/s)."""
-    carrier = model.carrier
-    half = jnp.linalg.inv(jnp.linalg.cholesky(model.mass))
-    decay = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
-    fastest = jnp.maximum(jnp.max(model.modes()[0]), decay)
+class _Rates(NamedTuple):
+    """The fastest of the carrier's `oscillation` and of the linear equations' `decay`, of carrier and loads, rad/s and 1/s."""
+
+    oscillation: Array
+    damping: Array
+    drag: Array
+
+
+def _rates(model: CollectedModel, omega: Array, speed: Array) -> _Rates:
+    """Rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
+
+    A body of loads decays by drag and friction with an inertia that the carrier lessens:
+
+        max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
+    """
+    linear, carrier = model.linear, model.linear.carrier
+    half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
+    oscillation = jnp.max(linear.modes()[0])
+    damping = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
     if carrier.gyroscopic is not None:
-        fastest = fastest + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
-    turn = np.pi if has_half_turn(model.scene.effects) else 2.0 * np.pi
-    return jnp.ceil(turn * (fastest / omega + 2.0) / _PHASE).astype(int)
+        oscillation = oscillation + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
+    still = jnp.zeros((carrier.port.shape[0], 1), linear.mass.dtype)
+
+    def fastest(omega: Array, speed: Array) -> Array:
+        one = jnp.ones((model.inertia.shape[0], 1), linear.mass.dtype)
+        by_rate = model.torque_slopes(0.0 * one, omega * one, speed, still)[1]
+        return jnp.max(-by_rate[:, 0] / model.inertia)
+
+    mobility = jnp.max(jnp.linalg.eigvalsh(carrier.port @ half.T @ half @ carrier.port.T))
+    left = 1.0 - mobility * jnp.sum(model.unbalance**2 / model.inertia)
+    return _Rates(oscillation, damping, jnp.vectorize(fastest)(omega, speed) / left)
+
+
+def is_stiff(model: CollectedModel, omega: Array, speed: Array) -> Array:
+    """True if loads or carrier decay so fast, at load speeds `omega` and the rotor's `speed` (rad/s), that multipliers need the
+    implicit method."""
+    rates = _rates(model, omega, speed)
+    return jnp.maximum(rates.damping, rates.drag) > _STIFF * (rates.oscillation + 2.0 * omega)
+
+
+def steps_for(model: CollectedModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
+    """Number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
+
+    Of an `implicit` method only what oscillates counts: it is stable at any rate of decay.
+    """
+    rates = _rates(model, omega, speed)
+    turn = np.pi if model.half_turn else 2.0 * np.pi
+    if implicit:
+        return radau.steps_for(turn * (rates.oscillation / omega + 2.0))
+    return jnp.ceil(turn * (jnp.maximum(rates.oscillation, rates.damping) / omega + 2.0) / _PHASE).astype(int)
 
 
 class _Coefficients(NamedTuple):
@@ -67,7 +110,15 @@ class _Coefficients(NamedTuple):
     by_rate: Array
 
 
-def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, steps: int | Array) -> Floquet:
+def floquet(
+    model: CollectedModel,
+    grid: Grid,
+    motion: PeriodicSolution,
+    harmonics: Harmonics,
+    steps: int | Array,
+    *,
+    implicit: bool = False,
+) -> Floquet:
     """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
 
     With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
@@ -78,10 +129,11 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     T the torque on the body, which dry friction lets depend on the port's acceleration a = Omega^2 B q'' too;
     and for loads of one body that part from each other, sum d_j = 0, the carrier at rest: the second equation without its last
     term. Loads that lie side by side are pressed together, and do not part.
-    Fixed steps of Dormand and Prince's order 8, of the same length for all orbits.
+    Equal steps of the same length for all orbits, of Dormand and Prince's order 8, or `implicit` ones by `radau.transition`,
+    which hold for loads with any drag and carriers with any damping.
 
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
-    derivatives exist) or a scalar array.
+    derivatives exist) or a scalar array, see `steps_for`.
     """
     carrier, mass = model.linear.carrier, model.linear.mass
     nd, count = mass.shape[0], model.inertia.shape[0]
@@ -122,8 +174,8 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
         answer = _times(damping, q1) / w
         return answer + n * _times(gyroscopic[0], q1) / w if gyroscopic else answer
 
-    def full(c: _Coefficients, x: Array) -> Array:
-        q, q1, d, d1 = x[:nd], x[nd : 2 * nd], x[2 * nd : 2 * nd + count], x[2 * nd + count :]
+    def full(c: _Coefficients, x: Array, x1: Array) -> Array:
+        (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
         t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
         below = q - _times(shift, jnp.sum(t * d[None], axis=1))
         below1 = q1 - _times(shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
@@ -134,45 +186,67 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
         answers = lever * c.giving[:, :, None]
         weight = jnp.sum(t[:, None] * answers[None], axis=2)
         acceleration = _small_solve(_times(mobility, weight), pushed - _times(mobility, jnp.sum(t * torque[None], axis=1)))
-        return jnp.concatenate([q1, q2, d1, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
+        return jnp.concatenate([q2, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
 
-    def apart(c: _Coefficients, x: Array) -> Array:
-        return jnp.stack([x[1], c.by_rate * x[1] + c.by_angle * x[0]])
+    def apart(c: _Coefficients, x: Array, x1: Array) -> Array:
+        return c.by_rate[:, None] * x1 + c.by_angle[:, None] * x
 
-    def start(n: int) -> Array:
-        return jnp.broadcast_to(jnp.eye(n, dtype=omega.dtype)[:, :, None], (n, n, lanes))
+    def start(size: int) -> Array:
+        return jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype)[:, :, None], (size, size, lanes))
 
     loads = model.loads
     parting = loads.alike and loads.count > 1 and loads.own_radius is None
-    sizes = (2 * nd + 2 * count, 2) if parting else (2 * nd + 2 * count,)
-    fields = (full, apart)[: len(sizes)]
-    nodes, rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_NODES, _ROWS, _WEIGHTS))
-    # exp(i k theta) goes from step to step as a product: sines and cosines at every node took a quarter of the time.
-    gap = 2 if grid.symmetric else 1
-    of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
-    every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
-    at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, nodes * h), _wave(every, h[None])
-    begin = jnp.ones_like(turning), tuple(start(n) for n in sizes)
+    fields, sizes = ((full, apart), (nd + count, 1)) if parting else ((full,), (nd + count,))
 
-    def step(k: Array, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
-        turned, state = carry
-        found = coefficients((k + nodes) * h, at_nodes * turned)
-        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
+    def explicit_step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        rows, weights = (jnp.asarray(x, dtype=omega.dtype) for x in (_ROWS, _WEIGHTS))
 
         # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
         def stage(rates: tuple[Array, ...], now: tuple[Array, Array, _Coefficients]) -> tuple[tuple[Array, ...], None]:
             i, row, c = now
-            changes = (field(c, x + h * jnp.tensordot(row, y, 1)) for field, x, y in zip(fields, state, rates, strict=True))
+            moved = (x + h * jnp.tensordot(row, y, 1) for x, y in zip(state, rates, strict=True))
+            changes = (
+                jnp.concatenate([x[size:], field(c, x[:size], x[size:])])
+                for field, size, x in zip(fields, sizes, moved, strict=True)
+            )
             put = jax.lax.dynamic_update_index_in_dim
             return tuple(put(rate, change, i, 0) for rate, change in zip(rates, changes, strict=True)), None
 
         rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
         rates, _ = jax.lax.scan(stage, rates, (jnp.arange(len(_NODES)), rows, at))
-        moved = tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
-        return turned * turning, moved
+        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+
+    def implicit_step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        # One solve for all equations: its program is as large as the rest of the step.
+        slopes = jnp.zeros((len(radau.NODES), sum(sizes), 2, sum(sizes), lanes), omega.dtype)
+        for field, size, begin in zip(fields, sizes, np.cumsum((0, *sizes)), strict=False):
+            unit, here = start(2 * size), slice(begin, begin + size)
+            own = jax.vmap(lambda c, field=field, unit=unit, k=size: field(c, unit[:k], unit[k:]))(at)
+            slopes = slopes.at[:, here, :, here].set(own.reshape(-1, size, 2, size, lanes))
+        each = slopes.reshape(len(radau.NODES), sum(sizes), -1, lanes)
+        over = jax.vmap(lambda a: radau.transition(a, h), in_axes=-1, out_axes=-1)(each)
+        return (jnp.einsum("abp,bcp->acp", over, state[0]),)
+
+    nodes = jnp.asarray(radau.NODES if implicit else _NODES, dtype=omega.dtype)
+    # exp(i k theta) goes from step to step as a product: sines and cosines at every node took a quarter of the time.
+    gap = 2 if grid.symmetric else 1
+    of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
+    every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
+    at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, nodes * h), _wave(every, h[None])
+    begin = jnp.ones_like(turning), tuple(start(2 * size) for size in ((sum(sizes),) if implicit else sizes))
+
+    def step(k: Array, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        turned, state = carry
+        found = coefficients((k + nodes) * h, at_nodes * turned)
+        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
+        return turned * turning, (implicit_step if implicit else explicit_step)(at, state)
 
     _, end = jax.lax.fori_loop(0, steps, step, begin)
-    flip = np.concatenate([np.full(2 * nd, -1.0 if model.half_turn else 1.0), np.ones(2 * count)])
+    if implicit:
+        both = end[0].reshape(2, sum(sizes), 2, sum(sizes), lanes)
+        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        end = tuple(both[:, k][:, :, :, k].reshape(2 * k.size, 2 * k.size, lanes) for k in parts)
+    flip = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
     monodromy = flip[:, None, None] * end[0]
 
     # A shift in time: q' and phi' along the orbit itself.
@@ -183,8 +257,8 @@ def floquet(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmoni
     _, moving = model.circle(deviation)
     along = jnp.concatenate([
         at1 + _times(shift, jnp.sum(share[None, :, None, None] * moving * (1.0 + deviation1)[None], axis=1)),
-        -damped(at1, w, n) - _times(stiffness, at) / w**2,
         1.0 + deviation1,
+        -damped(at1, w, n) - _times(stiffness, at) / w**2,
         deviation2,
     ])[:, 0]  # fmt: skip
     trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, along)

@@ -25,7 +25,7 @@ from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
-from jaxvib.steady.orbits.floquet import steps_for
+from jaxvib.steady.orbits.floquet import is_stiff, steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, numbers_of, orbits
 from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, number, traced
@@ -144,13 +144,16 @@ def jam_orbit(
     still = jax.lax.stop_gradient(value)
     differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
     many, found, settle = tried[0], None, False
+    speeds = (still, start) if which == "omega" else (start, still)
+    # Unknown numbers may be those of loads with much drag.
+    implicit = bool(_is_stiff(frozen, *speeds)) if concrete else True
 
     def attempt() -> Orbit:
         """The first that is accurate enough, or the best: beside a fold more points add rounding, and no accuracy."""
         nonlocal many
         best, least = None, math.inf
         for each in tried:
-            orbit = _orbit(frozen, still, start, exists, direction, which, each, None, accuracy, settle)
+            orbit = _orbit(frozen, still, start, exists, direction, which, each, None, accuracy, implicit, settle)
             error = float(orbit.error)
             if best is None or error < least:
                 best, least, many = orbit, error, each
@@ -172,9 +175,9 @@ def jam_orbit(
         # Reverse-mode derivatives ask for a number of steps that is part of the program.
         steps = 64
         if concrete:
-            wanted = _steps_for(frozen, *((still, start) if which == "omega" else (start, still)))
+            wanted = _steps_for(frozen, *speeds, implicit)
             steps = 2 ** int(np.ceil(np.log2(float(wanted))))
-        found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, settle)
+        found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, implicit, settle)
     elif throw and status_name(found.status) in ("absent", "not_converged"):
         raise failure(found.status)
     return refuse_unknowns(scene, found, OrbitStatus.refused)
@@ -186,8 +189,13 @@ def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
 
 
 @cached
-def _steps_for(scene: Scene, omega: Array, speed: Array) -> Array:
-    return steps_for(jammed_model(scene), omega, speed)
+def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
+    return is_stiff(collected_model(jammed_model(scene)), omega, speed)
+
+
+@cached
+def _steps_for(scene: Scene, omega: Array, speed: Array, implicit: bool) -> Array:
+    return steps_for(collected_model(jammed_model(scene)), omega, speed, implicit=implicit)
 
 
 @cached
@@ -222,16 +230,22 @@ def _orbit(
     points: int,
     steps: int | None,
     accuracy: float,
+    implicit: bool,
     settle: bool = False,
 ) -> Orbit:
-    """One exact jam; its multipliers by so many `steps`, or by those that the speeds ask for (no reverse derivatives then); to
-    `settle` is to start from the motion at the load speed `start`, where that is near the answer."""
+    """One exact jam.
+
+    Its multipliers take so many `steps` of the `implicit` or the explicit method, or those that the speeds ask for (no reverse
+    derivatives then); to `settle` is to start from the motion at the load speed `start`, where that is near the answer.
+    """
     model, deviation = collected_model(jammed_model(scene)), None
     if settle:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]
-    enough = steps_for(model.linear, *((value, start) if given == "omega" else (start, value))) if steps is None else steps
-    lanes, _ = orbits(model, jnp.reshape(value, (1,)), jnp.reshape(start, (1,)), given, points, enough, accuracy, deviation)
+    speeds = (value, start) if given == "omega" else (start, value)
+    enough = steps_for(model, *speeds, implicit=implicit) if steps is None else steps
+    many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
+    lanes, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit)
     orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
     # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
     there = exists

@@ -214,11 +214,13 @@ def orbits(
     steps: int | Array,
     accuracy: float,
     deviation: Array | None = None,
+    *,
+    implicit: bool,
 ) -> tuple[Orbit, Floquet]:
     """Many exact jams of one machine: `value` (P,) what is given of each, `start` (P,) where the other speed starts from,
     `deviation` (P, G, M) where psi does.
 
-    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps` as there.
+    **Returns** `Orbit` with a leading axis P on each of its arrays, and their `Floquet`. `steps`, `implicit` as there.
     """
     grid = grid_of(points, model.half_turn)
 
@@ -231,7 +233,7 @@ def orbits(
         motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
     else:
         motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
-    growth = floquet(model, grid, motion, harmonics, steps)
+    growth = floquet(model, grid, motion, harmonics, steps, implicit=implicit)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial

@@ -77,7 +77,7 @@ class CriterionMap(Result):
 
 
 def criterion_map(
-    scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int = 48
+    scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int | None = None
 ) -> CriterionMap:
     """Compares `criterion` with `balanced_growth` over rotor speed, load mass and drag.
 

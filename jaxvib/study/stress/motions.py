@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from jaxvib.study.stress.plain import Plain, figure, root
 
-__all__ = ["Event", "Outcome", "by_events", "natural_sizes", "orbit_rotor_speed", "orbit_speed", "run_out"]
+__all__ = ["Event", "Outcome", "by_events", "multipliers", "natural_sizes", "orbit_rotor_speed", "orbit_speed", "run_out"]
 
 Mode = TypeVar("Mode")
 
@@ -53,6 +53,26 @@ def natural_sizes(p: Plain) -> np.ndarray:
     speed = figure(p.drive, "speed")
     motor = [1.0, speed] if getattr(p.drive, "kind", "") == "dc_motor" else []
     return np.array([length] * nd + [length * speed] * nd + [1.0] * n + [speed] * n + motor)
+
+
+def multipliers(p: Plain, motion: Callable[[float], np.ndarray], period: float, *, rtol: float = 1e-10) -> np.ndarray:
+    """Floquet multipliers of a known periodic motion y(t), by SciPy's implicit Radau method: for any drag and damping."""
+    size = natural_sizes(p)
+    n = size.size
+
+    def slopes(t: float) -> np.ndarray:
+        return p.slopes(t, motion(t)) * size[None, :] / size[:, None]
+
+    def field(t: float, x: np.ndarray) -> np.ndarray:
+        return (slopes(t) @ x.reshape(n, n)).ravel()
+
+    def jacobian(t: float, _: np.ndarray) -> np.ndarray:
+        return np.kron(slopes(t), np.eye(n))
+
+    run = solve_ivp(field, (0.0, period), np.eye(n).ravel(), "Radau", [period], jac=jacobian, rtol=rtol, atol=1e-2 * rtol)
+    if not run.success:
+        raise ArithmeticError(run.message)
+    return np.linalg.eigvals(run.y[:, -1].reshape(n, n))
 
 
 class Event(NamedTuple, Generic[Mode]):

@@ -116,6 +116,24 @@ class Plain:
             moved.append(np.array([y[-1], change[-1]]))
         return np.concatenate(moved)
 
+    def slopes(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Derivatives of `field` by y, (2 (nd + N), 2 (nd + N)), of a scene without effects at constant speed."""
+        nd, n = self.mass.shape[0], self.m.size
+        _, _, phi, rate = np.split(y, [nd, 2 * nd, 2 * nd + n])
+        matrix, right = self.forces(t, y)
+        change, own = np.linalg.solve(matrix, right), self.m * self.radius
+        by_place, by_rate, each = np.zeros((nd + n, nd + n)), np.zeros((nd + n, nd + n)), np.arange(nd, nd + n)
+        by_place[:nd, :nd], by_rate[:nd, :nd] = -self.stiffness, -self.damping
+        by_place[self.at, each] = own * (np.cos(phi) * rate**2 + np.sin(phi) * change[nd:])
+        by_place[each, each] = own * np.sin(phi) * change[self.at]
+        by_rate[self.at, each] = 2.0 * own * np.sin(phi) * rate
+        by_rate[each, each] = -self.drag * self.radius**2
+        places, rates = (np.r_[begin : begin + nd, 2 * nd + k : 2 * nd + k + n] for begin, k in ((0, 0), (nd, n)))
+        found = np.zeros((2 * (nd + n), 2 * (nd + n)))
+        found[places, rates] = 1.0
+        found[np.ix_(rates, places)], found[np.ix_(rates, rates)] = np.linalg.solve(matrix, np.stack([by_place, by_rate]))
+        return found
+
 
 def plain(scene: Scene) -> Plain:
     """The scene's numbers in float64, as they are in its dtype."""

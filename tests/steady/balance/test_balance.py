@@ -17,6 +17,8 @@ import jaxvib as jv
 from jaxvib.steady.balance import states
 from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
+from jaxvib.study.stress.motions import multipliers
+from jaxvib.study.stress.plain import plain
 
 POINTS = 112
 """Rotor speeds of one scan; the same in all tests, so that each machine is compiled once."""
@@ -296,7 +298,7 @@ def test_imbalance_is_a_load_that_cannot_leave_the_rotor(machines, speed, weak):
         three = jv.Scene(machine, held, jv.ConstantSpeed(speed))
         angles = jv.balanced_states(three).angles[0]
         found = balanced_stability(two(angles[0] + 0.3), angles[1:] + 0.3)
-        whole = balanced_stability(three, angles, steps=3072).multipliers
+        whole = balanced_stability(three, angles).multipliers
         moving = found.multipliers[np.abs(found.multipliers) > 1e-3]
         off.append(max(np.min(np.abs(whole - multiplier)) for multiplier in moving))
         assert found.neutral == 0
@@ -339,3 +341,46 @@ def test_a_motion_without_a_spring_is_refused_whatever_holds_the_others():
     with pytest.raises(jv.InputError, match="leaves a motion of the rotor without a spring"):
         characteristic_speeds(gyroscopic)
     characteristic_speeds(rotor(0.1))
+
+
+def plain_multipliers(s):
+    """By SciPy's implicit method, from the dense equations; loads at the first arrangement."""
+    angles, n, nd = jv.balanced_states(s).angles[0], float(s.drive.speed), s.machine.structure().mass.shape[0]
+    motion = lambda t: np.concatenate([np.zeros(2 * nd), angles + n * t, np.full(angles.size, n)])  # noqa: E731
+    return multipliers(plain(s), motion, 2.0 * np.pi / n)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "mass", "drag", "speed"),
+    [
+        ((50.0, 4e4, 100.0), 0.5, 1.0, 0.4),
+        ((50.0, 4e4, 1e6), 0.5, 1.0, 40.0),
+        ((50.0, 4e4, 100.0), 1e-6, 1.0, 40.0),
+        ((50.0, 4e4, 100.0), 0.5, 1e5, 40.0),
+        ((50.0, 4e4, 0.0), 0.5, 1.0, 20.0),
+    ],
+    ids=["slow rotor", "damped carrier", "light loads", "strong drag", "no damping"],
+)
+def test_stiff_balanced_motions_are_those_of_scipys_radau(numbers, mass, drag, speed):
+    machine = jv.one_mass(**dict(zip(("mass", "stiffness", "damping"), numbers, strict=True)))
+    s = jv.Scene(machine, jv.balls(count=2, mass=mass, radius=0.1, drag=drag), jv.ConstantSpeed(speed))
+    result = balanced_stability(s)
+    np.testing.assert_allclose(np.abs(result.multipliers), np.sort(np.abs(plain_multipliers(s)))[::-1], atol=1e-7)
+    np.testing.assert_allclose(balanced_growth(s, [speed])[0], result.growth, rtol=1e-9)
+    assert result.status_name == ("stable" if speed == 40.0 else "unstable")
+
+
+def test_growth_of_a_slow_rotor_is_that_of_light_loads():
+    """It falls with the fourth power of the speed: the vibration's torque, a share m n^2/k of the loads' own, per drag."""
+    s = loaded("one_mass", 2)
+    growth = balanced_growth(s, np.array([0.4, 0.2, 0.1]))
+    np.testing.assert_allclose(growth[:-1] / growth[1:], 16.0, rtol=2e-2)
+    assert np.all(growth > 0.0)
+
+
+def test_what_is_below_rounding_is_not_called_stable():
+    found = balanced_stability(loaded("one_mass", 2, speed=1e-4))
+    assert found.status_name == "undecided" and not found.stable
+    undamped = eqx.tree_at(lambda x: x.machine.damping, loaded("one_mass", 2, speed=1e-5), jnp.zeros(1))
+    with pytest.raises(jv.InputError, match="drive.speed is 1e-05 rad/s, so slow that"):
+        balanced_stability(undamped)

@@ -15,7 +15,10 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.orbits.floquet import _deflated, _small_solve
+from jaxvib.steady.orbits.jam_orbit import _is_stiff
 from jaxvib.study.maps.stability_onset import stability_onset
+from jaxvib.study.stress.motions import multipliers
+from jaxvib.study.stress.plain import plain
 
 
 def gravity():
@@ -160,3 +163,59 @@ def test_a_known_eigenvalue_is_taken_out(sign):
     known, left = _deflated(jnp.asarray(matrix), jnp.asarray(vectors[:, 0]))
     np.testing.assert_allclose(known, 1.0, rtol=1e-12)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(left).real), [-2.0, 0.5, 3.0], rtol=1e-9)
+
+
+def stiff(drag, damping=100.0, count=1, machine=None):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=damping) if machine is None else machine
+    loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=drag)
+    return jv.Scene(machine, loads, jv.ConstantSpeed(60.0))
+
+
+def test_loads_with_much_drag_are_stable():
+    """A load that nearly turns with the rotor: the slowest decay is that of the carrier, exp(-pi c / (M Omega))."""
+    scene = stiff(1000.0)
+    orbit = jv.jam_orbit(scene, mode=3)
+    assert bool(orbit.stable)
+    np.testing.assert_allclose(orbit.multiplier, 0.9015, atol=5e-5)
+    assert jv.branches(scene, exact=True, points=200).special == ()
+    for drag in (1e6, 1e9, 1e12):
+        locked = jv.jam_orbit(stiff(drag), mode=3)
+        np.testing.assert_allclose(locked.multiplier, 0.901511, atol=1e-6)
+        np.testing.assert_allclose(locked.trivial, 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [stiff(1000.0), stiff(1e6, damping=1e6), stiff(3000.0, count=2, machine=machines()["two_mass"])],
+    ids=["drag", "drag and damping", "two platforms"],
+)
+def test_stiff_multipliers_are_those_of_scipys_radau(scene):
+    orbit = jv.jam_orbit(scene, omega=45.0)
+    assert bool(_is_stiff(scene, orbit.omega, orbit.rotor_speed))
+    scene = eqx.tree_at(lambda s: s.drive.speed, scene, orbit.rotor_speed)
+    harmonics, orders = np.asarray(orbit.displacement_harmonics), np.asarray(orbit.orders)
+    deviation, of_deviation = np.asarray(orbit.deviation_harmonics[0]), np.asarray(orbit.deviation_orders)
+    w, n = float(orbit.omega), scene.loads.count
+
+    def motion(t):
+        wave, lag = np.exp(1j * orders * w * t), np.exp(1j * of_deviation * w * t)
+        phi, rate = w * t + (deviation @ lag).real, w * (1.0 + (deviation @ (1j * of_deviation * lag)).real)
+        q, v = (harmonics @ wave).real, (harmonics @ (1j * orders * w * wave)).real
+        return np.concatenate([q, v, np.full(n, phi), np.full(n, rate)])
+
+    right = multipliers(plain(scene), motion, 2.0 * np.pi / w)
+    found = [*orbit.multipliers, 1.0] if n == 1 else [*orbit.multipliers[:-2], *orbit.multipliers[-2:], 1.0]
+    np.testing.assert_allclose(np.sort(np.abs(found)), np.sort(np.abs(right)), atol=1e-7)
+
+
+def test_multipliers_of_unknown_scenes_hold_for_much_drag():
+    """Under `jit`, where no number tells how many steps are enough."""
+    value = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
+    for drag in (1.0, 1000.0, 1e6):
+        np.testing.assert_allclose(value(drag), jv.jam_orbit(stiff(drag), omega=45.0).multiplier, rtol=1e-9)
+
+
+def test_derivatives_of_stiff_multipliers_are_those_of_differences():
+    f = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
+    reverse, h = jax.grad(f)(1000.0), 0.1
+    np.testing.assert_allclose(reverse, (f(1000.0 + h) - f(1000.0 - h)) / (2.0 * h), rtol=1e-5)

@@ -1,0 +1,71 @@
+"""Transition matrices of linear equations of second order by implicit collocation, stable at any rate of decay."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.polynomial import legendre
+
+from jaxvib.numerics.linalg import small_solve
+
+__all__ = ["NODES", "steps_for", "transition"]
+
+_STAGES = 6
+
+_PHASE = 1.0
+"""Phase of the fastest oscillation in a step, rad: order 11 then leaves 5e-12 of it in a step."""
+
+
+def _radau(stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes c of Radau's right quadrature on [0, 1] and the matrix a, integrals of the Lagrange polynomials up to each node.
+
+    Both come from Legendre polynomials, whose matrices are well conditioned; those of powers would cost five digits.
+    """
+    ends = np.zeros(stages + 1)
+    ends[-2:] = -1.0, 1.0  # P_s - P_(s-1) has the nodes for roots, 1 among them
+    nodes = (1.0 + np.sort(legendre.legroots(ends))) / 2.0
+    nodes[-1] = 1.0
+    values = legendre.legvander(2.0 * nodes - 1.0, stages - 1)
+    sums = [legendre.legval(2.0 * nodes - 1.0, legendre.legint(row, lbnd=-1.0)) / 2.0 for row in np.eye(stages)]
+    return nodes, np.linalg.solve(values.T, np.stack(sums)).T
+
+
+NODES, _WEIGHTS = _radau(_STAGES)
+"""Parts of a step at which the equations are evaluated; the last one is its end."""
+
+
+def _forms() -> np.ndarray:
+    """Coefficients (power of h, 2, stages, stages + 2) of x_i and x'_i in the stages' k_j, the start's x and its x'."""
+    found, one, place = np.zeros((3, 2, _STAGES, _STAGES + 2)), np.ones(_STAGES), slice(0, _STAGES)
+    found[2, 0, :, place], found[0, 0, :, -2], found[1, 0, :, -1] = _WEIGHTS @ _WEIGHTS, one, NODES
+    found[1, 1, :, place], found[0, 1, :, -1] = _WEIGHTS, one
+    return found
+
+
+_FORMS = _forms()
+
+
+def steps_for(radians: Array) -> Array:
+    """Number of steps for so many radians of the fastest oscillation; decay, however fast, asks for none."""
+    return jnp.ceil(radians / _PHASE).astype(int)
+
+
+def transition(slopes: Array, h: float | Array) -> Array:
+    """The matrix (2 m, 2 m) that carries (x, x') over a step `h` of x'' = P x + R x', by Radau's collocation of order 11.
+
+        x_i = x + h c_i x' + h^2 sum_j (a a)_ij k_j,   x'_i = x' + h sum_j a_ij k_j,   k_i = P_i x_i + R_i x'_i
+
+    It is L-stable: what decays within a step, such as the slip of a load with much drag, is gone at its end and does not
+    disturb what follows; an explicit method would have to resolve the decay.
+
+    **Arguments**: `slopes` [P, R] (6, m, 2 m) at `NODES`. **Returns** the matrix; derivatives go through it.
+    """
+    stages, m, _ = slopes.shape
+    constant, linear, square = jnp.asarray(_FORMS, slopes.dtype)
+    forms = constant + h * (linear + h * square)
+    rows = jnp.einsum("kil,iakb->ialb", forms, slopes.reshape(stages, m, 2, m)).reshape(stages * m, -1)
+    matrix, right = jnp.split(rows, [stages * m], axis=1)
+    found = small_solve(jnp.eye(stages * m, dtype=slopes.dtype) - matrix, right)
+    whole = jnp.concatenate([found, jnp.eye(2 * m, dtype=slopes.dtype)]).reshape(stages + 2, m, 2 * m)
+    return jnp.tensordot(forms[:, -1], whole, 1).reshape(2 * m, 2 * m)
