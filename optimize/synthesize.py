@@ -123,8 +123,7 @@ def synthesize(
     else:
         status = SynthesisStatus.done if done[best] else SynthesisStatus.not_converged
 
-    # A lightest or cheapest machine belongs to no jam mode, and what is demanded of it does.
-    mode = next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
+    mode = _mode_of(objective, demands)
     named = _named(space, scene, objective, demands, mode)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
@@ -230,7 +229,7 @@ def _searched(
             f"of the random designs in the bounds ({options.starts} starts) none has {missing}; widen the bounds or ask for "
             "another mode",
         )
-    return best
+    return best[0], best[1], best[2]._replace(existing=existing, drawn=drawn)
 
 
 def _missing(space: DesignSpace, objective: Quantity, demands: tuple[Demand, ...], options: Options) -> str:
@@ -255,6 +254,11 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
         raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
     scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(now, count=loads))
     return eqx.tree_at(lambda s: s.scene, space, checked(scene))
+
+
+def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:
+    """The jam mode of a search: that of its objective or, for a lightest machine, of the first demand that has one."""
+    return next((q.mode for q in (objective, *(d.quantity for d in demands)) if q.mode is not None), None)
 
 
 def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]:

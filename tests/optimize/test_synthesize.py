@@ -15,7 +15,18 @@ from optimize import DesignSpace, Quantity, amplitude, expected, foundation_forc
 from optimize.search.find import Found
 from optimize.search.polish import Optimality
 from optimize.search.problem import Point
-from optimize.synthesize import _named, _options, _other_tiers, _rank, _run, _standard, _table, _with_loads, synthesize
+from optimize.synthesize import (
+    _mode_of,
+    _named,
+    _options,
+    _other_tiers,
+    _rank,
+    _run,
+    _standard,
+    _table,
+    _with_loads,
+    synthesize,
+)
 
 SCENE = scene("two_mass")
 SPACE = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4), "loads.drag": (1.0, 2.0)}, [hold(total("machine.stiffness"), 8e4)])
@@ -177,3 +188,31 @@ def test_added_springs_are_marked_new():
         ("stiffness of support 2 (new)", 0.0, 5e3),
         ("stiffness of support 3", 0.0, 0.0),
     ]
+
+
+def test_the_mode_of_a_search_is_that_of_its_objective():
+    force, whose, mass = foundation_force(mode=3), amplitude(mode=4), total_mass()
+    assert _mode_of(force, [whose < 1.0]) == 3 and _mode_of(-force / mass, []) == 3
+    assert _mode_of(mass, [mass < 9.0, whose < 1.0, force < 1.0]) == 4 and _mode_of(mass, [mass < 9.0]) is None
+
+
+def test_searches_of_all_numbers_of_loads_count(monkeypatch):
+    """Of two, three and four loads: the least is of three, the last has no design; what all of them drew is told."""
+    none = Optimality(np.zeros((1, 0)), np.zeros((1, 0)), np.zeros((1, 1)), np.zeros(1))
+
+    def choose(problem, options, tell):
+        loads = problem.space.scene.loads.count
+        point = Point(
+            np.zeros((1, 1)), np.array([[9.0 - loads]]), np.zeros((1, 1, 1)), (), (), np.zeros((1, 0)), np.zeros((1, 0, 1))
+        )
+        bounds = np.zeros(1), np.ones(1)
+        found = Found(point, np.zeros((1, 1)), np.zeros(1), np.zeros(1), none, 10 * loads, loads, False, bounds)
+        return None if loads == 4 else found
+
+    module = sys.modules[synthesize.__module__]
+    monkeypatch.setattr(module, "choose", choose)
+    space = DesignSpace(SCENE, {"loads.drag": (1.0, 2.0)}, choices={"loads.count": [2, 3, 4]})
+    options = _options(starts=4, seed=0, iterations=1, polishing=0, rate=0.5, searcher="gradients")
+    here, problem, found = module._searched(space, total_mass(), (), options, lambda *_: None)
+    assert here.scene.loads.count == problem.space.scene.loads.count == 3
+    assert (found.drawn, found.existing) == (50, 5) and found.point.values[0, 0] == 6.0
