@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import click
+
 import jaxvib as jv
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
-__all__ = ["chosen_steps", "measured_document", "run_document"]
+__all__ = ["APART", "chosen_steps", "measured_document", "run_document"]
+
+APART = click.option(
+    "--apart", help="Angle between neighbouring loads at the start, such as '3 deg'; 0: all at one [side by side, or 1 deg]."
+)
 
 
 def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:

@@ -46,6 +46,7 @@ class RunStatus(eqx.Enumeration):
     not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
     no_start = "the state to start from does not exist or is not finite"
     beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
+    would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
 
 
 class Run(AbstractMeasured, Result):
@@ -54,8 +55,9 @@ class Run(AbstractMeasured, Result):
     **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
     was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
     were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran;
-    `together`: whether several loads started at one angle and stayed there, as equal ones do until rounding parts them: such a
-    motion may look settled where loads a little apart would leave it (start them `apart` to see). What it cost, the runs with
+    `together`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even where
+    that is unstable. If such a motion repeats itself, the linearized equations are asked whether loads a little apart leave it;
+    its status is then `would_separate`, and it is not `settled`. What it cost, the runs with
     larger steps that were made for its error included: `evaluations` of the vector field (0 where the method does not say) and
     `seconds`, compiling included where the program was new, NaN under a JAX transformation.
 
@@ -76,23 +78,38 @@ class Run(AbstractMeasured, Result):
     scene: Scene = eqx.field(metadata=SCENE)
     together: Array | bool = eqx.field(default=False, metadata=in_unit(""))
 
+    @property
+    def settled(self) -> Array:
+        """True if the motion repeats itself, as far as amplitudes and speed tell, and loads a little apart do not leave it."""
+        return (self.drift < 1e-3) & (self.status != RunStatus.would_separate)
+
+    @property
+    def finished(self) -> Array:
+        """True if the run reached its end, settled or not."""
+        return (self.status == RunStatus.done) | (self.status == RunStatus.beating) | (self.status == RunStatus.would_separate)
+
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
-        glued = "  all loads ran at one angle, as they started: whether they would stay so was not tested; give apart='3 deg'"
+        unstable, first = bool(self.status == RunStatus.would_separate), []
+        if unstable:
+            first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"
+        end = RunStatus[RunStatus.done] if unstable else self.message
+        one_angle = "  all loads ran at one angle, as they started: the motion of loads a little apart may be another one"
         return "\n".join(
             [
-                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                *first,
+                f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  {error}; {int(self.evaluations)} evaluations, {float(self.seconds):.3g} s",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
                 f"  {self.extent(self.scene)}",
                 f"  {self.regime.summary()}",
-                *([glued] if self.together else []),
+                *([one_angle] if self.together and not (unstable or self.settled) else []),
                 *self._detachment(),
             ]
         )

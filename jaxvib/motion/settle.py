@@ -16,20 +16,17 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.run import Run, RunStatus
-from jaxvib.motion.simulate import last_state, simulate, whole_turns
-from jaxvib.motion.start import Start, initial_state, whole_state
+from jaxvib.motion.simulate import judged_by_separation, last_state, simulate, whole_turns
+from jaxvib.motion.start import APART, Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import count, number
+from jaxvib.units import Number, count, number
 
 __all__ = ["settle"]
-
-_APART = 0.05
-"""How far from their middle the outermost loads start in a jam, rad."""
 
 _REMEMBERED = 32
 """Stretches, of 100 slow periods, by which a motion that does not repeat itself is judged."""
@@ -51,13 +48,14 @@ def settle(
     *,
     start: Start | State | None = None,
     mode: int | None = None,
+    apart: Number | None = None,
     drift: float | None = None,
     periods: int = 100,
     stretches: int = 200,
     stepsize_controller: StepChoice | None = None,
     throw: bool = True,
 ) -> Run:
-    """Simulates a stretch after a stretch until amplitudes and speed no longer change, or change without a trend.
+    """Simulate one stretch after another until amplitudes and speed no longer change, or change without a trend.
 
     Jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged by its last
     32 stretches (of 100 slow periods; more where they are shorter): it is steady in the mean where the means of amplitudes,
@@ -67,6 +65,7 @@ def settle(
     **Arguments**
 
     - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
+    - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
     - `drift`: the change that counts as none, see `Measured`; if it is given the motion must come to less. The default is 1e-6,
       in single precision 1e-3, and a motion that is steady in the mean has settled too. What the motion is still away from
       its end, estimated from the slowest decay of the carrier or from how the drift falls, must be below ten times as much:
@@ -76,7 +75,8 @@ def settle(
     - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
       where it failed
 
-    In a jam the loads start up to 0.05 rad apart: a motion that only loads glued together would keep does not pass for settled.
+    A motion that only loads at exactly one angle keep does not pass for settled: if they start at one angle (`apart=0`), its
+    status is `would_separate`, see `Run`.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
@@ -100,9 +100,10 @@ def settle(
     chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
     start = ("rest" if mode is None else "jam") if start is None else start
     if isinstance(start, State):
-        state = whole_state(scene, start, mode)
+        state = whole_state(scene, start, mode, apart)
     else:
-        state = initial_state(scene, start, mode=mode, apart=_APART if start == "jam" else 0.0, throw=throw)
+        apart = APART if apart is None and start == "jam" else apart
+        state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     _, slowest = fastest_and_slowest(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     slow = float(slowest) or float(scene.drive.speed)  # 0 where programs are compiled only, see `compiled_together`
@@ -116,16 +117,18 @@ def settle(
         together = together and bool(run.together)
         drifts = [*(each[0] for each in seen), float(run.drift)]
         ended = drifts[-1] < drift and _distance(drifts, run, decay, stretch) < _AWAY * drift
-        if ended or status_name(run.status) != "done":
+        # Loads that are not at exactly one angle leave an unstable motion by themselves.
+        leaves = status_name(run.status) == "would_separate" and not bool(run.together)
+        if not bool(run.finished) or (ended and not leaves):
             break
         seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
         if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
-            run = dataclasses.replace(run, status=member(RunStatus, "beating"))
+            run = judged_by_separation(dataclasses.replace(run, status=member(RunStatus, "beating")))
             break
         state = last_state(scene, run)
     assert run is not None
     run = dataclasses.replace(run, together=on_device(np.asarray(together)))
-    if throw and not (ended or status_name(run.status) == "beating"):
+    if throw and not (ended or status_name(run.status) in ("beating", "would_separate")):
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "

@@ -22,16 +22,17 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
+from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, wrap_angles
 from jaxvib.motion.run import Run, RunStatus
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.results.status import failure, status_name
+from jaxvib.results.status import failure, member, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
 from jaxvib.units import Number, count, known_number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -60,7 +61,7 @@ def simulate(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
-    apart: Number = 0.0,
+    apart: Number | None = None,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
@@ -79,8 +80,10 @@ def simulate(
 
     - `until`: end time, s or text such as "20 s"
     - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
-      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`. Loads start together
-      unless said how far `apart`, rad: where they share every number they then stay together (`Run.together`), stable or not
+      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
+    - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads that
+      start at exactly one angle (`apart=0`) stay at one angle (`Run.together`); if that motion repeats itself but is unstable
+      against their separation, the status is `would_separate`
     - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16384, for runs of more than 1024 turns of the
       rotor 262144, and 2000 under a JAX transformation); "window" keeps no trajectory, only what is measured
     - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
@@ -126,10 +129,10 @@ def simulate(
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
-    given = isinstance(start, State)
-    if given and (traced(apart) or apart != 0.0):
-        raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
-    state = whole_state(scene, start, mode) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+    if isinstance(start, State):
+        state = whole_state(scene, start, mode, apart)
+    else:
+        state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     fastest = functools.cache(lambda: fastest_and_slowest(scene)[0])
     if max_steps is None:
         max_steps = enough_steps(fastest(), end)
@@ -174,7 +177,16 @@ def simulate(
     found = _with(found, seconds=time.perf_counter() - begun, **estimated)
     if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
+    if concrete and not is_rehearsing() and bool(found.settled):
+        return judged_by_separation(found)
     return found
+
+
+def judged_by_separation(run: Run) -> Run:
+    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    if not (bool(run.finished) and would_separate(run.scene, run.window)):
+        return run
+    return dataclasses.replace(run, status=member(RunStatus, "would_separate"))
 
 
 def _limited(chosen: _Control, most: int) -> tuple[_Control, int]:

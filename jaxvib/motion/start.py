@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -21,10 +22,14 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, known_number, numbers, traced
 
-__all__ = ["Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
+__all__ = ["APART", "Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
+
+APART = math.radians(1.0)
+"""Angle between neighbouring loads at the start, rad, unless they lie side by side: loads at exactly one angle would stay at
+one angle, stable or not."""
 
 Turning = Literal["rolling", "still"]
 """How loads turn by themselves at the start: they roll on their track, or not at all in space."""
@@ -36,21 +41,22 @@ def initial_state(
     *,
     mode: int | None = None,
     angles: Numbers | None = None,
-    apart: Number = 0.0,
+    apart: Number | None = None,
     throw: bool = True,
 ) -> State:
-    """A state to start from.
+    """Return an initial state.
 
     **Arguments**
 
-    - `start`: "rest" (platforms in equilibrium, loads at rest, together at the bottom of their track), "spin_up" (the same
+    - `start`: "rest" (platforms in equilibrium, loads at rest about the bottom of their track), "spin_up" (the same
       state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
     - `mode`: number of the jam mode, for "jam"
-    - `angles`: the loads' angles about the rotor's axis, one number or (count,), rad, in place of the named ones (those of
-      `Loads.rest` at rest, 0 in a jam, where the platforms go with the mean angle; loads that touch each other lie side by side
-      there)
-    - `apart`: how far the outermost loads start from the middle, rad, the others evenly between them: what only loads that are
-      exactly together would keep up, does not last then
+    - `angles`: the loads' angles about the rotor's axis, rad, (count,); or one number for the middle of all loads, in place of
+      the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle
+    - `apart`: angle between neighbouring loads, rad; loads that touch (`LoadContact`) start so much further apart than side by
+      side. Default: at rest side by side if the loads' `own_radius` is known, otherwise 1 degree; 0 in a jam, whose theory is
+      about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at exactly one angle
+      (`apart=0`) stay at one angle, even where the motion is unstable against their separation
     - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
@@ -73,15 +79,10 @@ def initial_state(
     mass = scene.machine.structure().mass
     zero = np.zeros(mass.shape[:1], mass.dtype)
 
-    half = known_number(apart, "rad", "apart", low=0.0)
-    spread = half * (np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1)).astype(zero.dtype)
-
-    def phases(value: float | Array) -> Array:
-        if angles is not None:
-            return known(numbers(angles, "rad", "angles", n)) + spread
-        if any(effect.couples_loads for effect in scene.effects):
-            return known(value) + known(scene.loads.offsets()) + spread
-        return known(value) + spread
+    def phases(rest: float | Array) -> Array:
+        middle = known(rest if angles is None else numbers(angles, "rad", "angles", n))
+        one_each = angles is not None and not isinstance(angles, str) and np.ndim(angles) > 0  # pyright: ignore[reportArgumentType]
+        return middle + _places(scene, start, apart, one_each=one_each)
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])
@@ -107,6 +108,21 @@ def initial_state(
     row, angle = np.asarray(modes.row(mode, throw=throw), np.uint32), phases(0.0)
     require_start(scene, (angle,))
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
+
+
+def _places(scene: Scene, start: Start, apart: Number | None, *, one_each: bool) -> Array | np.ndarray:
+    """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
+    n = scene.loads.count
+    touching = any(effect.couples_loads for effect in scene.effects)
+    wide = getattr(scene.loads, "own_radius", None) is not None
+    usual = apart is None and start != "jam"
+    side_by_side = not one_each and (touching or (usual and wide))
+    if apart is not None:
+        gap = known_number(apart, "rad", "apart", low=0.0)
+    else:
+        gap = min(APART, math.pi / n) if usual and not (wide or one_each) else 0.0
+    evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(scene.drive.speed.dtype)
+    return evenly + known(scene.loads.offsets()) if side_by_side else evenly
 
 
 @cached
@@ -187,11 +203,13 @@ def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number |
     return eqx.tree_at(lambda s: s.drive, scene, drive)
 
 
-def whole_state(scene: Scene, state: State, mode: int | None) -> State:
-    """A state that was given to start from, if it has the scene's numbers of coordinates and loads.
+def whole_state(scene: Scene, state: State, mode: int | None, apart: Number | None = None) -> State:
+    """Return a user's initial state, completed by the loads' own rotation.
 
-    **Raises** `InputError` where it has not, or a `mode` is named beside it.
+    **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `apart` is given beside it.
     """
+    if apart is not None:
+        raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
     if mode is not None:
         raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
     nd, n = scene.machine.structure().mass.shape[0], scene.loads.count

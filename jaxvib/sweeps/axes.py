@@ -231,12 +231,17 @@ def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
 
 
 def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
-    """The state with a case's numbers (axes,)."""
+    """Return the state with a case's numbers (axes,); one number for all angles moves the middle of the loads."""
     for k, (place, field, entry) in enumerate(spots):
         if place is None:
             old = getattr(state, field)
             leaf = old[0] if isinstance(old, tuple) else old
-            new = jnp.full_like(leaf, values[k]) if entry is None else leaf.at[entry].set(values[k])
+            if entry is not None:
+                new = leaf.at[entry].set(values[k])
+            elif field == "angle":
+                new = leaf - jnp.mean(leaf) + values[k]
+            else:
+                new = jnp.full_like(leaf, values[k])
             state = eqx.tree_at(lambda s, f=field: getattr(s, f), state, (new, *old[1:]) if isinstance(old, tuple) else new)
     return state
 

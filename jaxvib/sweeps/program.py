@@ -13,7 +13,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
-from jaxvib.motion.start import Start, initial_state
+from jaxvib.motion.start import APART, Start, initial_state
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
 from jaxvib.sweeps.definition import CASE_STATUSES, Study
@@ -63,7 +63,8 @@ def _each(
         this = put(scene, spots, value)
         answers, run = Answers(this), None
         if plan is not None:
-            state = put_start(initial_state(this, start, mode=mode, throw=False), spots, value)
+            apart = APART if start == "jam" else None  # at one angle, no run would show that a jam is unstable
+            state = put_start(initial_state(this, start, mode=mode, apart=apart, throw=False), spots, value)
             run = watched_run(this, state, plan)
 
         def read(measure: Measure) -> Array:

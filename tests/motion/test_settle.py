@@ -165,11 +165,11 @@ def begins_at(monkeypatch, s, **given):
     return starts[0]
 
 
-def test_loads_start_apart_in_a_jam_and_together_at_rest(monkeypatch):
+@pytest.mark.parametrize("given", [{"mode": 3}, {}, {"start": "rest"}, {"apart": "1 deg"}])
+def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
     s = scene("two_mass", "balls", speed=150.0)
-    np.testing.assert_allclose(np.diff(begins_at(monkeypatch, s, mode=3).azimuth), [0.05, 0.05], rtol=1e-12)
-    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s).azimuth), [0.0, 0.0])
-    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, start="rest").azimuth), [0.0, 0.0])
+    np.testing.assert_allclose(np.diff(begins_at(monkeypatch, s, **given).azimuth), np.deg2rad([1.0, 1.0]), rtol=1e-12)
+    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, apart=0.0).azimuth), [0.0, 0.0])
 
 
 @pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])

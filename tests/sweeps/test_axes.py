@@ -72,7 +72,7 @@ def test_numbers_go_where_their_names_say():
     values = np.array([7e4, 2.5, 30.0, 0.4, -0.1])
     put_in, state = put(given, spots, values), put_start(jv.initial_state(given), spots, values)
     assert put_in.machine.stiffness.tolist() == [5e4, 7e4] and float(put_in.loads.drag) == 2.5
-    assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and state.angle[0].tolist() == [0.4] * 3
+    assert state.rate[0].tolist() == [0.0, 0.0, 30.0] and np.allclose(state.angle[0], 0.4 + np.deg2rad([-1.0, 0.0, 1.0]))
     assert state.velocity.tolist() == [-0.1, -0.1] and state.displacement.tolist() == [0.0, 0.0]
 
 

@@ -14,7 +14,7 @@ from jaxvib.cli.app import Output, app, shared, table
 @click.argument("scene", type=click.Path(path_type=Path))
 @click.option("--until", required=True, help="End time of each, such as 6s.")
 @click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [the scene's].")
-@click.option("--starts", type=int, help="So many random sets of angles [one, all loads together at the bottom].")
+@click.option("--starts", type=int, help="So many random sets of angles [one, loads beside each other at the bottom].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the random angles.")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-7].")
 @click.option("--batch", type=int, default=16, show_default=True, help="So many go side by side.")

@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
-from jaxvib.cli.document import chosen_steps, measured_document, run_document
+from jaxvib.cli.document import APART, chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
@@ -26,6 +26,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @click.argument("scene", type=click.Path(path_type=Path))
 @_START
 @_MODE
+@APART
 @click.option("--drift", type=float, help="Relative change that counts as none [1e-6, or steady in the mean].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
@@ -35,6 +36,7 @@ def settle(
     scene: Path,
     start: Start | None,
     mode: int | None,
+    apart: str | None,
     drift: float | None,
     tolerance: float | None,
     stretches: int,
@@ -47,7 +49,7 @@ def settle(
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     steps = chosen_steps(tolerance, None)
-    run = jv.settle(loaded, start=start, mode=mode, drift=drift, stretches=stretches, stepsize_controller=steps)
+    run = jv.settle(loaded, start=start, mode=mode, apart=apart, drift=drift, stretches=stretches, stepsize_controller=steps)
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)
     output.done(run_document(run), run.summary, "settle", run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_loads
+from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_growth, averaged_loads
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
@@ -21,6 +22,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
 from jaxvib.motion.analysis.scaled_error import natural_units
+from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
@@ -31,10 +33,11 @@ from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
-from jaxvib.results.status import failure, status_name
+from jaxvib.results.status import failure, member, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
+from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
+from jaxvib.steady.balance.monodromy import at_constant_speed
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -141,7 +144,8 @@ def envelope(
 
     **Arguments**
 
-    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`
+    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: from rest
+      loads start as far apart as in `simulate`, and separate if the averaged motion at one angle is unstable
     - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
     - `stepsize_controller`: `Tolerance`, the error a step may make, relative to the largest amplitude, and absolute in natural
       units, for rates the rotor's speed, for phases 1 rad (1e-4 by default); or a step size controller of diffrax
@@ -189,7 +193,25 @@ def envelope(
     )
     if throw and not traced(run.steps):
         _raise_if_failed(run, max_steps)
+    if not traced(run.steps) and not is_rehearsing() and bool(run.settled) and status_name(run.status) == "done":
+        return _judged_by_separation(run)
     return run
+
+
+def _judged_by_separation(run: Envelope) -> Envelope:
+    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    phase, time = np.asarray(run.window.phase), np.asarray(run.window.time)
+    if not is_nearly_one_angle(phase):
+        return run
+    growth = float(_growth_at_end(at_constant_speed(run.scene), run.window))
+    if not growth * float(time[-1] - time[0]) > GROWTH:
+        return run
+    return dataclasses.replace(run, status=member(EnvelopeStatus, "would_separate"))
+
+
+@cached
+def _growth_at_end(scene: Scene, window: Envelopes) -> Array:
+    return averaged_growth(averaged_field(scene), window.omega[-1], window.phase[-1], window.displacement[-1])
 
 
 @cached

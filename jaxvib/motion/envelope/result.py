@@ -29,6 +29,7 @@ class EnvelopeStatus(eqx.Enumeration):
     not_finite = "the motion grew beyond all bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the state to start from does not exist or is not finite"
+    would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
     not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
 
 
@@ -70,13 +71,23 @@ class Envelope(AbstractMeasured, Result):
     rejected: Array = eqx.field(metadata=in_unit(""))
     scene: Scene = eqx.field(metadata=SCENE)
 
+    @property
+    def settled(self) -> Array:
+        """True if amplitudes and speed no longer change, and loads a little apart do not leave the motion."""
+        return (self.drift < 1e-3) & (self.status != EnvelopeStatus.would_separate)
+
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
+        unstable, first = bool(self.status == EnvelopeStatus.would_separate), []
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
+        end = EnvelopeStatus[EnvelopeStatus.done] if unstable else self.message
+        if unstable:
+            first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"
         return "\n".join(
             [
-                f"{self.message}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
+                *first,
+                f"{end}: {float(self.window.time[-1]):.6g} s, {int(self.steps)} steps "
                 f"({int(self.rejected)} rejected), {state} (drift {float(self.drift):.1e})",
                 f"  loads turn at {float(self.omega):.6g} rad/s (each: {speeds}), "
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",

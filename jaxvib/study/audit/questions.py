@@ -16,10 +16,10 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis import measure
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import initial_state, with_spin
+from jaxvib.motion.start import APART, initial_state, with_spin
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
@@ -27,9 +27,6 @@ from jaxvib.steady.orbits.orbit import OrbitStatus
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
 __all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]
-
-_APART = 0.05
-"""How far from their middle the outermost loads start, rad: none stay together only because nothing parts them."""
 
 _ROUNDING = 1e-9
 
@@ -110,7 +107,7 @@ class JamQuestion(NamedTuple):
         n = scene.loads.count
         orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
-        spread = _APART * jnp.asarray(np.linspace(-1.0, 1.0, n) if n > 1 else np.zeros(1))
+        spread = APART * jnp.asarray(np.arange(n) - 0.5 * (n - 1))
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> Values:
@@ -134,7 +131,7 @@ class RunQuestion(NamedTuple):
             return with_spin(scene, replace(self.start, spin=None))
         if self.start == "turning":
             return turning_state(scene)
-        return initial_state(scene, "rest", apart=_APART if scene.loads.count > 1 else 0.0)
+        return initial_state(scene, "rest")
 
     def can(self, scene: Scene) -> bool:
         """No: there is no exact orbit to ask for."""
@@ -216,7 +213,7 @@ def fold_speed(scene: Scene, omega: float) -> float:
 
 
 def _read(scene: Scene, run: Run, fold: float) -> Values:
-    ended = bool(run.status == RunStatus.done) or bool(run.status == RunStatus.beating)
+    ended = bool(run.finished)
     kind = status_name(run.regime.name) if ended else f"failed: {status_name(run.status)}"
     drift, amplitude = float(run.drift), np.asarray(run.amplitude)
     moved = max(a for a, unit in zip(amplitude, scene.machine.structure().units, strict=True) if unit == "m")

@@ -116,8 +116,12 @@ def rotor_regimes(
     Source: Artyunin 2013, section V.
     """
     values = np.asarray(mu, dtype=float)
+    # The paper's pendulums hang at exactly one angle.
+    angles = [[-0.5 * np.pi] * 4] if starts is None else None
     computed = {
-        name: run_ups(published_rotor(variant=name), until, drag=list(values / _LENGTH**2), starts=starts, batch=8)
+        name: run_ups(
+            published_rotor(variant=name), until, drag=list(values / _LENGTH**2), starts=starts, angles=angles, batch=8
+        )
         for name in variants
     }
     paper = [next((words for low, high, words in _PAPER if low <= m < high), "not said") for m in values]

@@ -17,7 +17,6 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
 from jaxvib.motion.integrate import fastest_and_slowest
-from jaxvib.motion.run import RunStatus
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
@@ -118,7 +117,7 @@ def run_ups(
     - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`)
     - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
     - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
-      rad. Without either all loads start together at the bottom
+      rad. Default: one set, at the bottom and as far apart as `initial_state` places them
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
     - `batch`: so many runs go side by side on each core
     - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
@@ -208,7 +207,7 @@ def _together(
         this = eqx.tree_at(lambda s: s.loads.drag, scene, drag)
         start = eqx.tree_at(lambda s: s.angle, initial_state(this), (angle,))
         run = simulate(this, until, start=start, save="window", stepsize_controller=chosen, max_steps=max_steps, throw=False)
-        finished = run.status == RunStatus.done
+        finished = run.finished
         return run.regime, jnp.where(finished, run.omega, jnp.nan), finished
 
     return jax.vmap(one)(drags, angles)

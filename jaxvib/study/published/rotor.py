@@ -53,7 +53,7 @@ def rotor_paper() -> PaperAnswer:
 
 
 def _figure_4() -> Figure:
-    return simulate(published_rotor(_FIRST, "uncoupled"), 6.0).plot()
+    return simulate(published_rotor(_FIRST, "uncoupled"), 6.0, apart=0.0).plot()
 
 
 def _critical_speeds() -> list[PublishedRow]:

@@ -110,8 +110,8 @@ def test_capture_and_passage_are_those_of_the_full_equations(make, passing):
             np.testing.assert_allclose(jam_rotor_speed(s, slow.omega), speed, rtol=1e-4)
 
 
-def small(drag=0.5, speed=60.0, effects=()):
-    loads = jv.balls(count=2, mass=0.05, radius=0.1, drag=drag)
+def small(drag=0.5, speed=60.0, effects=(), count=1):
+    loads = jv.balls(count=count, mass=0.05, radius=0.1, drag=drag)
     return jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), loads, jv.ConstantSpeed(speed), effects)
 
 
@@ -148,6 +148,21 @@ def test_gradients_by_three_routes():
 @pytest.fixture(scope="module")
 def caught():
     return jv.envelope(small(effects=(jv.Gravity(),)), "60 s", start="spin_up")
+
+
+def test_averaged_loads_separate_as_in_the_full_equations():
+    """Two balls at one angle turn with the rotor at 10 N; a little apart they balance it."""
+    s = small(count=2)
+    for run in (jv.envelope(s, 60.0, start="spin_up"), jv.simulate(s, 60.0, start="spin_up", save="window", estimate=False)):
+        assert float(run.foundation_force) < 1e-3 and abs(float(run.omega) / 60.0 - 1.0) < 1e-6
+        assert abs(abs(np.diff(run.window.phase[-1] if hasattr(run.window, "phase") else run.regime.phase)[0]) - np.pi) < 1e-3
+
+
+def test_envelope_of_an_unstable_common_angle_says_so_first():
+    s = small(count=2)
+    run = jv.envelope(s, 60.0, start=jv.initial_state(s, apart=0.0))
+    assert run.status_name == "would_separate" and not bool(run.settled) and float(run.drift) < 1e-3
+    assert run.summary().startswith("not settled: all loads are at nearly one angle") and float(run.foundation_force) > 10.0
 
 
 def test_a_run_reads_like_a_simulation(caught):

@@ -1,0 +1,115 @@
+"""Stability of a motion with all loads at nearly one angle against their separation.
+
+Loads that share every number and start at one angle stay at one angle in exact arithmetic, whether or not the motion is stable.
+A run alone therefore does not show that they would separate. The linearized equations along the run do:
+
+    x' = A(t) x,    growth = ln(spectral radius of the transition matrix over whole turns of the loads) / duration
+
+For loads that share every number on one track, x is the difference of two loads: it does not move the carrier, and all such
+differences obey the same equations. Otherwise x is the whole state. The transition matrix is a product of exponentials (a
+Magnus method of order 4 on the samples of the run): strong drag needs no smaller steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from jax.scipy.linalg import expm
+
+from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.runtime.programs import cached
+
+__all__ = ["GROWTH", "NEARLY_ONE_ANGLE", "is_nearly_one_angle", "separation_rate", "would_separate"]
+
+NEARLY_ONE_ANGLE = 0.2
+"""Loads within so many rad of each other count as loads at one angle."""
+
+GROWTH = 1e-2
+"""Growth over the stretch, in e-folds, above which loads separate: less is below the error of the samples' interpolation."""
+
+
+def is_nearly_one_angle(angle: np.ndarray) -> bool:
+    """True if several loads with the angles (nt, count) stay within `NEARLY_ONE_ANGLE` of each other."""
+    return angle.shape[1] > 1 and bool(np.max(np.ptp(angle, axis=1)) < NEARLY_ONE_ANGLE)
+
+
+def would_separate(scene: Scene, stretch: Trajectory) -> bool:
+    """True if several loads have nearly one angle, and small differences of their angles grow."""
+    if not is_nearly_one_angle(np.asarray(stretch.state.azimuth)):
+        return False
+    time = np.asarray(stretch.time)
+    return separation_rate(scene, stretch) * float(time[-1] - time[0]) > GROWTH
+
+
+def separation_rate(scene: Scene, stretch: Trajectory) -> float:
+    """Growth rate of small differences between the angles of loads at nearly one angle, 1/s; negative if they decay.
+
+    **Arguments**: `stretch` an evenly sampled stretch of a run of `scene`, such as `run.window`.
+    """
+    phi = np.mean(np.asarray(stretch.state.azimuth), axis=1)
+    turns = np.floor(abs(phi[-1] - phi[0]) / (2.0 * np.pi))
+    covered = np.abs(phi[-1] - phi) <= 2.0 * np.pi * turns if turns else np.ones(phi.size, bool)
+    first = phi.size - 1 - 2 * (np.count_nonzero(covered[:-1]) // 2)
+    transition, log_scale, duration = _transition(scene, stretch, jnp.asarray(first))
+    radius = float(np.max(np.abs(np.linalg.eigvals(np.asarray(transition)))))
+    return float((np.log(max(radius, 1e-300)) + float(log_scale)) / float(duration))
+
+
+@cached
+def _transition(scene: Scene, stretch: Trajectory, first: Array) -> tuple[Array, Array, Array]:
+    """The transition matrix from sample `first` to the last one, the logarithm of its factor, and the time between them."""
+    field, times = vector_field(scene), stretch.time
+    step = (times[-1] - times[0]) / (times.shape[0] - 1)
+    begin = jax.tree.map(lambda leaf: leaf[0], stretch.state)
+    inserted, extracted, size = _basis(scene, begin)
+
+    def matrix(k: Array) -> Array:
+        state = jax.tree.map(lambda leaf: leaf[k], stretch.state)
+
+        def rates(x: Array) -> Array:
+            return extracted(jax.jvp(lambda s: field(times[k], s), (state,), (inserted(x),))[1])
+
+        return jax.vmap(rates, out_axes=1)(jnp.eye(size, dtype=times.dtype))
+
+    def moved(carry: tuple[Array, Array], pair: Array) -> tuple[tuple[Array, Array], None]:
+        transition, log_scale = carry
+        # Pairs of steps are counted from the end, where the last sample is.
+        end = times.shape[0] - 1 - 2 * pair
+        a, b, c = (matrix(jnp.maximum(end - 2 + k, 0)) for k in range(3))
+        span = jnp.where(end - 2 >= first, 2.0 * step, 0.0)
+        transition = transition @ expm(span / 6.0 * (a + 4.0 * b + c) + span**2 / 12.0 * (c @ a - a @ c))
+        largest = jnp.max(jnp.abs(transition))
+        return (transition / largest, log_scale + jnp.log(largest)), None
+
+    start = (jnp.eye(size, dtype=times.dtype), jnp.zeros((), times.dtype))
+    (transition, log_scale), _ = jax.lax.scan(moved, start, jnp.arange((times.shape[0] - 1) // 2))
+    return transition, log_scale, times[-1] - times[first]
+
+
+def _basis(scene: Scene, state: State) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
+    """Tangents of the state from numbers x, the numbers of such a tangent, and how many there are."""
+    touching = any(effect.couples_loads for effect in scene.effects)
+    shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(scene.loads))
+    if touching or not shared or scene.machine.structure().stations is not None:
+        flat, restored = ravel_pytree(state)
+        return restored, lambda tangent: ravel_pytree(tangent)[0], flat.size
+    zero = jax.tree.map(jnp.zeros_like, state)
+    own = (state.angle, state.rate, state.spin)
+    treedef, size = jax.tree.structure(own), len(jax.tree.leaves(own))
+    difference = jnp.zeros_like(state.azimuth).at[0].set(1.0).at[1].set(-1.0)
+
+    def inserted(x: Array) -> State:
+        angle, rate, spin = jax.tree.unflatten(treedef, [x[k] * difference for k in range(size)])
+        return State(zero.displacement, zero.velocity, angle, rate, zero.rotor, spin)
+
+    def extracted(tangent: State) -> Array:
+        return jnp.stack([leaf[0] for leaf in jax.tree.leaves((tangent.angle, tangent.rate, tangent.spin))])
+
+    return inserted, extracted, size

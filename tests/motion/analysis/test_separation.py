@@ -1,0 +1,108 @@
+"""Loads that start apart, and motions that only loads at exactly one angle keep."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import scene
+
+import jaxvib as jv
+from jaxvib.motion.analysis.separation import separation_rate, would_separate
+from optimize.wishes.answers import Answers
+
+
+def three_balls(**given):
+    """A ball balancer: 25 kg on 500 N/mm, an imbalance of 6 g m, three balls of 4 g m each."""
+    machine = jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0)
+    loads = jv.balls(count=3, mass=0.04, radius=0.1, drag=2.0, **given)
+    return jv.Scene(machine, loads, jv.RunUp(100.0 * np.pi, 100.0), (jv.Gravity(), jv.StaticImbalance(moment=6e-3)))
+
+
+def two_balls(drag, speed, mass=0.5):
+    """By slope the upper jam is stable; two balls in it separate, and balance the rotor."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
+    return jv.Scene(machine, jv.balls(count=2, mass=mass, radius=0.1, drag=drag), jv.ConstantSpeed(speed))
+
+
+def test_three_balls_balance_a_rotor_unless_at_one_angle():
+    s = three_balls(own_radius=0.011)
+    apart, one_angle = (jv.simulate(s, 10.0, apart=a, save="window", estimate=False) for a in (None, 0.0))
+    assert apart.regime.label == "balanced" and float(apart.foundation_force) < 1.0
+    assert one_angle.status_name == "would_separate" and not bool(one_angle.settled) and bool(one_angle.finished)
+    assert one_angle.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
+    np.testing.assert_allclose(one_angle.foundation_force, 215.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (dict(), np.deg2rad([-1.0, 0.0, 1.0])),
+        (dict(apart="3 deg"), np.deg2rad([-3.0, 0.0, 3.0])),
+        (dict(apart=0.0), [0.0, 0.0, 0.0]),
+        (dict(angles=0.5 - np.pi / 2), 0.5 + np.deg2rad([-1.0, 0.0, 1.0])),
+        (dict(angles=[0.0, 0.0, 0.0]), [np.pi / 2] * 3),
+    ],
+)
+def test_loads_start_one_degree_apart_at_rest(given, expected):
+    for start in ("rest", "spin_up"):
+        np.testing.assert_allclose(jv.initial_state(scene(), start, **given).azimuth + np.pi / 2, expected, atol=1e-12)
+
+
+def test_loads_of_known_size_start_side_by_side():
+    angle = np.asarray(jv.initial_state(three_balls(own_radius=0.011)).azimuth)
+    np.testing.assert_allclose(np.diff(angle), 2.0 * np.arcsin(0.11), rtol=1e-12)
+    np.testing.assert_allclose(np.mean(angle), -np.pi / 2, rtol=1e-12)
+
+
+def test_no_two_of_many_loads_start_at_one_angle():
+    loads = jv.balls(count=720, mass=0.001, radius=0.1, drag=0.1)
+    s = jv.Scene(jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0), loads, jv.ConstantSpeed(60.0))
+    turned = np.sort(np.mod(np.asarray(jv.initial_state(s).azimuth), 2.0 * np.pi))
+    assert np.min(np.diff(turned)) > 1e-3
+
+
+def test_a_jam_starts_at_one_angle():
+    assert np.ptp(jv.initial_state(two_balls(0.5, 60.0), "jam", mode=1).azimuth) == 0.0
+
+
+@pytest.mark.parametrize(("drag", "speed", "mode", "separates"), [(5.0, 100.0, 3, True), (0.5, 60.0, 1, False)])
+def test_separation_grows_as_the_exact_multipliers_say(drag, speed, mode, separates):
+    s = two_balls(drag, speed)
+    orbit = jv.jam_orbit(s, mode=mode)
+    rates = np.log(np.abs(np.asarray(orbit.multipliers))) * float(orbit.omega) / (2.0 * np.pi)
+    run = jv.simulate(s, 20.0, start="jam", mode=mode, save="window", estimate=False)
+    assert bool(run.together) and float(run.drift) < 1e-3 and bool(orbit.stable) != separates
+    assert run.status_name == ("would_separate" if separates else "done") and bool(run.settled) != separates
+    np.testing.assert_allclose(
+        separation_rate(s, run.window), np.max(rates) if separates else -0.5 / (2 * 1.4 * 0.5), rtol=1e-3
+    )
+
+
+def test_unequal_loads_are_judged_by_the_whole_state():
+    """Loads of unequal mass that obey the same equation, so that they stay at one angle."""
+    s, mass = two_balls(5.0, 100.0), jnp.asarray([0.4, 0.6])
+    unequal = eqx.tree_at(lambda x: (x.loads.mass, x.loads.drag), s, (mass, 10.0 * mass))
+    run = jv.simulate(unequal, 20.0, start="jam", mode=3, save="window", estimate=False)
+    assert bool(run.together) and would_separate(unequal, run.window)
+    equal = jv.simulate(s, 20.0, start="jam", mode=3, save="window", estimate=False)
+    np.testing.assert_allclose(separation_rate(unequal, run.window), separation_rate(s, equal.window), rtol=1e-3)
+
+
+def test_settle_never_calls_an_unstable_common_angle_settled():
+    s = two_balls(5.0, 100.0)
+    one_angle = jv.settle(s, apart=0.0)
+    assert one_angle.status_name == "would_separate" and not bool(one_angle.settled)
+    assert one_angle.summary().startswith("not settled: ")
+    free = jv.settle(s, drift=1e-3)
+    assert free.regime.label == "balanced" and float(free.foundation_force) < 0.1 * float(one_angle.foundation_force)
+
+
+def test_every_start_from_rest_is_apart(monkeypatch):
+    """Ensembles, run-ups and quantities of run-ups begin as `initial_state` places the loads."""
+    s = scene("two_mass", "balls", speed=150.0)
+    expected = np.deg2rad([1.0, 1.0])
+    found = jv.ensemble(lambda speed: eqx.tree_at(lambda x: x.drive.speed, s, speed), jnp.asarray([50.0, 60.0]), 1e-6)
+    np.testing.assert_allclose(np.diff(found.state.azimuth), [expected, expected], rtol=1e-6)
+    np.testing.assert_allclose(np.diff(jv.run_ups(s, 0.1).angle), [expected], rtol=1e-12)
+    run = Answers(s).start_up(0.1, 0.05)
+    np.testing.assert_allclose(np.diff(run.trajectory.state.azimuth[0]), expected, rtol=1e-12)
