@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_points"]
 
 
+_LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
+"""Beyond this amplitude, rad, the averaged formula and the fitted arcs are off by so much, relative."""
+
+
 class Estimate(NamedTuple):
     """A number from measurements: its `value`, its standard `error` from the record's noise, and the interval from
     `low` to `high` that holds it with a probability of 95 %, the instruments' share counted."""
@@ -70,7 +74,13 @@ class Decrement(Result):
         return (
             f"by {self.periods} periods: mu1 {self.viscous.value:.5g} N m s, from {self.viscous.low:.5g} to "
             f"{self.viscous.high:.5g}; {len(self.estimates)} pairs scatter by {self.scatter:.2g}"
+            + (f", and drift by {self.drift:.2g} standard errors: not by viscous friction alone" if self.is_drifting else "")
         )
+
+    @property
+    def is_drifting(self) -> bool:
+        """True if the first and the last pair differ by more than noise: the interval then holds no mu1."""
+        return abs(self.drift) > 4.0
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """mu1 of each pair of swings, first to last.
@@ -83,10 +93,11 @@ class Decrement(Result):
 
 
 def turning_points(record: Record) -> TurningPoints:
-    """The turning points of a recorded swing, each from all samples within a sixth of a period about it.
+    """Return the turning points of a recorded swing, each from all samples within a sixth of a period about it.
 
-    There the angle is fitted by c + a cos + b sin of the swing's own frequency, whose extremum is the turning point; the
-    spread of the samples about all these arcs gives the noise.
+    The angle there is fitted by c + a cos(v t) + b sin(v t), whose extremum is the turning point; v = w sqrt(cos A), w the
+    frequency of small swings and A the amplitude, gives the fourth derivative of a large swing there, too. The spread of the
+    samples about all these arcs gives the noise.
 
     **Returns** `TurningPoints`. **Raises** `InputError` for a record with fewer than three turning points, or too few samples
     in a period.
@@ -108,23 +119,35 @@ def turning_points(record: Record) -> TurningPoints:
             record.name, f"turns {len(peaks)} times; at least 3 turning points are needed, record more of the swing"
         )
     frequency = np.pi / float(np.median(np.diff(t[peaks])))
+    ends = f[peaks]
+    middle = float(np.mean((ends[:-2] + 2.0 * ends[1:-1] + ends[2:]) / 4.0))
+    small = np.pi * (len(peaks) - 1) / float(np.sum(np.diff(t[peaks]) / period_stretch(np.abs(np.diff(ends)) / 2.0)))
     times, angles, gains, squares, spare = [], [], [], 0.0, 0
     for k in peaks:
-        near = np.abs(frequency * (t - t[k])) <= np.pi / 3.0
         if t[k] - t[0] < 0.5 / frequency or t[-1] - t[k] < 0.5 / frequency:
             continue
-        x = frequency * (t[near] - t[k])
-        basis = np.stack([np.ones_like(x), np.cos(x), np.sin(x)], axis=1)
+        size = min(abs(f[k] - middle), np.pi)
+        away = np.abs(frequency * (t - t[k]))
+        # Of a large swing only the nearer part is such an arc; a coarse record needs all of it.
+        near = away <= np.pi / 3.0 / (1.0 + size**2 / 3.0)
+        near = near if np.count_nonzero(near) >= 9 else away <= np.pi / 3.0
+        # In units of 1/w; below 0 beyond 90 deg, where the arc is a hyperbolic cosine.
+        square = float(np.cos(size))
+        x = small * (t[near] - t[k])
+        basis = _arcs(x, square)
         if len(x) < 5:
             raise InputError(
                 record.name, f"has {len(x)} samples about the turning point at {t[k]:.4g} s; 5 are needed, about 15 in a period"
             )
         inverse = np.linalg.inv(basis.T @ basis)
         c, a, b = inverse @ (basis.T @ f[near])
-        size = np.hypot(a, b)
-        gradient = np.array([1.0, a / size, b / size]) * np.array([1.0, np.sign(a), np.sign(a)])
-        times.append(t[k] + np.arctan2(np.sign(a) * b, abs(a)) / frequency)
-        angles.append(c + np.sign(a) * size)
+        place = 0.0
+        for _ in range(3):  # Newton's method: the middle sample is next to the turning point
+            ((_, even, odd),) = _arcs(np.array([place]), square)
+            place -= (a * odd + b * (1.0 - square * even)) / (a * (1.0 - square * even) - square * b * odd)
+        (gradient,) = _arcs(np.array([place]), square)
+        times.append(t[k] + place / small)
+        angles.append(float(gradient @ np.array([c, a, b])))
         gains.append(gradient @ inverse @ gradient)
         squares += float(np.sum((f[near] - basis @ np.array([c, a, b])) ** 2))
         spare += len(x) - 3
@@ -134,6 +157,17 @@ def turning_points(record: Record) -> TurningPoints:
         )
     noise = np.sqrt(squares / spare)
     return TurningPoints(np.array(times), np.array(angles), noise * np.sqrt(gains), float(noise))
+
+
+def _arcs(x: np.ndarray, square: float) -> np.ndarray:
+    """Return 1, (1 - cos(v x))/v^2 and sin(v x)/v, (n, 3), for v^2 = `square`, positive or negative."""
+    turned = np.sqrt(complex(square)) * x / np.pi
+    return np.stack([np.ones_like(x), 0.5 * x**2 * (np.sinc(0.5 * turned) ** 2).real, x * np.sinc(turned).real], axis=1)
+
+
+def period_stretch(amplitude: np.ndarray) -> np.ndarray:
+    """Return the period of a swing of that amplitude, rad, relative to that of small swings."""
+    return 1.0 + amplitude**2 / 16.0 + 11.0 * amplitude**4 / 3072.0
 
 
 def _alternating(f: np.ndarray, least: float) -> list[int]:
@@ -167,11 +201,14 @@ def ten_periods(
 ) -> Decrement:
     """mu1 from how much a swing shrinks over ten periods.
 
-        mu1 = J ln(phi_1/phi_11) / (5 T)
+        mu1 = J ln(phi_1/phi_11) / (5 T)                                          (small swings)
+        mu1 = J [G(phi_1) - G(phi_11)] / (10 T),     G' = sin A / (4 [E/K - cos^2(A/2)]) = 2/A - 5 A/48 - ...
 
-    Small swings with viscous friction shrink by exp(-mu1 t/(2 J)), hence 2 J ln(ratio)/(10 T). It is exact for neither large
-    swings nor dry friction: dry friction adds 4 T_f/(pi w A) to mu1 (torque T_f, amplitude A, frequency w), more the smaller
-    the swing; `drift` shows it. `identify` has neither limit.
+    Small swings with viscous friction shrink by exp(-mu1 t/(2 J)), hence 2 J ln(ratio)/(10 T). A large swing of amplitude A
+    loses mu1 times its action in a period; with the complete elliptic integrals K and E of modulus sin(A/2) this is
+    A' = -(mu1/J)/G'(A), which the second line integrates and which is used here. Beyond 60 deg an error of 0.1 % is left;
+    the interval counts it. Dry friction is left out: it adds 4 T_f/(pi w A) to mu1 (torque T_f, amplitude A, frequency w), more
+    the smaller the swing; `drift` shows it, and the interval does not hold mu1 then. `identify` finds both.
 
     **Arguments**: `periods` between the two amplitudes; `instrument`: relative uncertainty of J, from ruler and scales, added
     to the interval in squares; `turns` of the record, if known already.
@@ -189,28 +226,29 @@ def ten_periods(
     """
     n = 2 * count(periods, "periods")
     turns = turning_points(record) if turns is None else turns
-    a, when = turns.amplitude, turns.time
+    a, when = turns.amplitude, (turns.time[1:] + turns.time[:-1]) / 2.0
     pairs = a.size - n
     if pairs < 1:
         there = f"has {a.size / 2.0:g} periods between turning points"
         raise InputError(record.name, f"{there}; {periods + 0.5:g} are needed, record longer or ask for fewer periods")
     span = when[n : n + pairs] - when[:pairs]
     factor = 2.0 * float(pendulum.total_inertia) / span
-    estimates = factor * np.log(a[:pairs] / a[n:])
+    estimates = factor * _shrinkage(a[:pairs], a[n:])
 
-    # Errors of the angles go into every pair they are part of; the derivative of ln a by the two angles is +-1/(2 a).
+    # Errors of the angles go into every pair they are part of; the derivative of G(a)/2 by the two angles is
+    # +-G'(a)/4.
     slopes = np.zeros((pairs, turns.angle.size))
     signs = np.sign(np.diff(turns.angle))
     for k in range(pairs):
         for where, sign in ((k, 1.0), (k + n, -1.0)):
-            change = sign * factor[k] * signs[where] / (2.0 * a[where])
+            change = sign * factor[k] * signs[where] * float(_slope(a[where])) / 4.0
             slopes[k, where + 1] += change
             slopes[k, where] -= change
     covariance = (slopes * turns.error**2) @ slopes.T
     value, error = float(np.mean(estimates)), float(np.sqrt(np.mean(covariance)))
     apart = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]
     return Decrement(
-        viscous=interval(value, error, 1.959964, instrument),
+        viscous=interval(value, error, 1.959964, float(np.hypot(instrument, _LARGE_ERROR * (a[0] > _LARGE)))),
         estimates=estimates,
         amplitude=a[:pairs],
         scatter=float(np.max(np.abs(estimates / value - 1.0))),
@@ -218,6 +256,23 @@ def ten_periods(
         period=float(np.mean(span)) / periods,
         periods=periods,
     )
+
+
+def _shrinkage(large: np.ndarray, small: np.ndarray) -> np.ndarray:
+    """Return [G(large) - G(small)]/2 of two amplitudes, rad: ln(large/small) of small swings."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    at = 0.5 * (large + small)[:, None] + 0.5 * (large - small)[:, None] * nodes
+    return np.log(large / small) + 0.25 * (large - small) * np.sum(weights * (_slope(at) - 2.0 / at), axis=1)
+
+
+def _slope(amplitude: np.ndarray) -> np.ndarray:
+    """Return G'(A), 1/rad, see `ten_periods`."""
+    from scipy.special import ellipe, ellipk  # slow to import
+
+    m = np.sin(0.5 * amplitude) ** 2
+    safe = np.maximum(m, 1e-6)
+    exact = np.sin(amplitude) / (4.0 * (ellipe(safe) / ellipk(safe) - 1.0 + safe))
+    return np.where(m < 1e-6, 2.0 / amplitude - 5.0 * amplitude / 48.0, exact)
 
 
 def interval(value: float, error: float, quantile: float, instrument: float) -> Estimate:

@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-import diffrax
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.runtime.programs import cached
-from jaxvib.study.bearing.decrement import Decrement, Estimate, TurningPoints, interval, ten_periods, turning_points
+from jaxvib.study.bearing.decrement import (
+    Decrement,
+    Estimate,
+    TurningPoints,
+    interval,
+    ten_periods,
+    turning_points,
+)
+from jaxvib.study.bearing.fit import TOLERANCE, Fit, first_guess, fit_swing, steps_for
 from jaxvib.study.bearing.record import Record
-from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
+from jaxvib.study.bearing.swing import BearingPendulum
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
 __all__ = ["Identified", "IdentifyStatus", "identify"]
 
-_MOST_ITERATIONS = 64
-_TOLERANCE = 1e-9
+_AT_REST = 1.3
+"""Half periods without a turning point before the first or after the last one, of which a swinging pendulum has 1.2 at most."""
+
+_STRUCTURE = 1e-5
+"""Share of records with nothing but noise about the fit that are called patterned."""
 
 _CONTRADICTS = 0.05
 """Relative difference of frequencies, besides what instruments leave open, that no ruler and no scales explain."""
@@ -38,35 +44,11 @@ class IdentifyStatus(eqx.Enumeration):
     """What a fit is worth; the members are the sentences a user reads."""
 
     found = "the fit explains the record up to noise"
-    patterned = "what the fit leaves of the record is no noise: the law of friction misses something, and errors are larger"
+    patterned = "what the fit leaves of the record is no noise: the law of friction misses something, intervals are false"
     negative = "a coefficient of friction comes out below 0: the swing grows, or its decay is not that of this law"
     contradicted = "the period contradicts the pendulum's length and inertia, and mu1 is in proportion to them"
     undetermined = "the record cannot tell friction from none: too short, too noisy, or swings of one size only"
     not_converged = "no fit was found: the record does not look like this pendulum's swing"
-
-
-class Unknowns(NamedTuple):
-    """What a fit finds: `angle` rad and `rate` rad/s at the first sample, counted from hanging; `offset` rad of the record's
-    zero; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None."""
-
-    angle: Array
-    rate: Array
-    offset: Array
-    frequency: Array
-    viscous: Array
-    dry: Array | None
-
-
-class Fit(NamedTuple):
-    """A fit: the `unknowns`; `covariance` (p, p) of them in their order, from the Fisher information with the noise found;
-    `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
-
-    unknowns: Unknowns
-    covariance: Array
-    residual: Array
-    noise: Array
-    stopped_at: Array
-    converged: Array
 
 
 class Identified(Result):
@@ -80,7 +62,9 @@ class Identified(Result):
     - `frequency` rad/s of small swings, `offset` rad of the record's zero, `angle` rad and `rate` rad/s at the first sample: an
       `Estimate` each; `inertia` kg m^2: J that the frequency asks for with the pendulum's mass and length
     - `noise` rad, standard deviation of a sample; `pattern`: correlation of neighbouring residuals, 0 for noise
-    - `fitted` (n,) rad, the record as the model has it; `stopped_at` s, NaN where the pendulum swings to the end
+    - `structure`: F statistic of the residuals at the swing's frequency, its multiples and its slow changes, about 1 for noise
+    - `fitted` (n,) rad, the record as the model has it; `until` s, after which the record was left out: at rest;
+      `stopped_at` s, NaN where the pendulum swings to the end
     - `width` rad/s that dry friction was smoothed with (NaN without mu2)
     - `decrement`: the formula of ten periods on the same record, None where the record is too short for it
     - `record`, `pendulum`: what was asked about
@@ -98,6 +82,8 @@ class Identified(Result):
     inertia: float = eqx.field(metadata=in_unit("kg m^2"))
     noise: float = eqx.field(metadata=in_unit("rad"))
     pattern: float = eqx.field(metadata=in_unit(""))
+    structure: float = eqx.field(metadata=in_unit(""))
+    until: float = eqx.field(metadata=in_unit("s"))
     fitted: np.ndarray = eqx.field(metadata=in_unit("rad", "time"))
     stopped_at: float = eqx.field(metadata=in_unit("s"))
     width: float = eqx.field(metadata=in_unit("rad/s"))
@@ -137,7 +123,9 @@ def identify(
     Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
     Levenberg and Marquardt's method with forward-mode derivatives through the integration. The frequency is free, because a
     pendulum's size is never known well enough for its phase; it is the factor g that gives way, and J is taken from
-    `pendulum`, so that mu1 is in proportion to it. `width` is 0.005 of the smallest swing's speed: dry friction on it is
+    `pendulum`, so that mu1 is in proportion to it. Samples before the release and after the last clear turning point, where the
+    pendulum rests or its swing is below the noise, are left out: on which side of the dead zone it comes to rest is no smooth
+    function of the friction. `width` is 0.005 of the smallest swing's speed: dry friction on it is
     0.001 % too small, on larger ones less.
 
     **Arguments**: `dry`: find mu2 as well (the pendulum needs `bearing`); `instrument`: relative uncertainty of J, from ruler
@@ -165,17 +153,23 @@ def identify(
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
         raise InputError("instrument", f"is {instrument!r}; the relative uncertainty of J is at least 0 and less than 1")
     turns = turning_points(record)
-    start, width = first_guess(pendulum, record, turns, dry)
-    time = record.time - record.time[0]
-    given = (pendulum, jnp.asarray(time), jnp.asarray(record.angle))
-    steps, everything = steps_for(start, time), np.ones(time.size)
-    large = np.where(record.time <= _still_large(turns), 1.0, 0.0)
-    if dry and np.sum(large) < time.size:
+    half = float(np.median(np.diff(turns.time)))
+    released = turns.time[0] - record.time[0] <= _AT_REST * half
+    swing = record if released else record.between(float(turns.time[0]), math.inf)
+    until = float(turns.time[-1]) if record.time[-1] - turns.time[-1] > _AT_REST * half else float(record.time[-1])
+    start, width = first_guess(pendulum, swing, turns, dry)
+    time = swing.time - swing.time[0]
+    given = (pendulum, jnp.asarray(time), jnp.asarray(swing.angle))
+    steps, swinging = steps_for(start, time), np.where(swing.time <= until, 1.0, 0.0)
+    if np.sum(swinging) < len(jax.tree.leaves(start)) + 2:
+        raise InputError(record.name, f"swings for {until - swing.time[0]:.3g} s before it rests; record more of the swing")
+    large = np.where(swing.time <= min(_still_large(turns), until), 1.0, 0.0)
+    if dry and np.sum(large) < np.sum(swinging):
         # Where the pendulum comes to rest, between the ends of the dead zone, hangs on the last digits of the friction: a fit
         # to the rest from far off ends in the wrong half swing.
         start = fit_swing(*given, jnp.asarray(large), start, width, steps).unknowns
-    fit = fit_swing(*given, jnp.asarray(everything), start, width, steps)
-    found = _judged(pendulum, record, turns, fit, float(width), instrument)
+    fit = fit_swing(*given, jnp.asarray(swinging), start, width, steps)
+    found = _judged(pendulum, swing, turns, fit, float(width), instrument, until)
     if throw and bool(found.status == IdentifyStatus.not_converged):
         raise ComputationError("not_converged", f"{record.name}: {found.message}")
     return found
@@ -187,151 +181,23 @@ def _still_large(turns: TurningPoints) -> float:
     return float(turns.time[max(small[0], 4)]) if small.size else math.inf
 
 
-def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool) -> tuple[Unknowns, Array]:
-    """Where a fit begins, from the turning points, and the width that dry friction is smoothed with.
-
-    A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
-    """
-    a = turns.amplitude
-    stretch = 1.0 + a**2 / 16.0 + 11.0 * a**4 / 3072.0  # of the period, by the size of the swing
-    w = math.pi * a.size / float(np.sum(np.diff(turns.time) / stretch))
-    inertia, length = float(pendulum.total_inertia), float(pendulum.length)
-    if dry and a.size > 3:
-        (share, loss), *_ = np.linalg.lstsq(np.stack([a[:-1], np.ones(a.size - 1)], axis=1), a[:-1] - a[1:], rcond=None)
-        share, loss = max(share, 0.0), max(loss, 0.0)
-    else:
-        weight = a**2 / np.sum(a**2)
-        k = np.arange(a.size) - np.sum(weight * np.arange(a.size))
-        share, loss = max(-float(np.sum(weight * k * np.log(a)) / np.sum(weight * k**2)), 0.0), 0.0
-    offset = float(np.mean((turns.angle[:-2] + 2.0 * turns.angle[1:-1] + turns.angle[2:]) / 4.0))
-    first = turns.angle[0] - offset
-    phase = w / stretch[0] * (record.time[0] - turns.time[0])
-    guess = Unknowns(
-        angle=jnp.asarray(first * math.cos(phase)),
-        rate=jnp.asarray(-first * w * math.sin(phase)),
-        offset=jnp.asarray(offset),
-        frequency=jnp.asarray(w),
-        viscous=jnp.asarray(2.0 * inertia * w * share / math.pi),
-        dry=jnp.asarray(loss * length / float(pendulum.bearing)) if dry and pendulum.bearing is not None else None,
-    )
-    return guess, jnp.asarray(0.005 * w * float(np.min(a)))
-
-
-def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
-    """More steps than the integration takes; a power of 2, so that few lengths of a record need few compilations."""
-    return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
-
-
-@cached
-def fit_swing(
-    pendulum: BearingPendulum, time: Array, angle: Array, weight: Array, start: Unknowns, width: Array, max_steps: int
-) -> Fit:
-    """The least-squares fit behind `identify`, for `vmap` over records: `time` (n,) s from 0, `angle` (n,) rad, and which of
-    them count, `weight` (n,) 1 or 0."""
-    size = jnp.std(angle) * jnp.sqrt(2.0)
-    duration = time[-1] - time[0]
-    inertia, length = pendulum.total_inertia, pendulum.length
-    scale = Unknowns(
-        angle=size,
-        rate=size * start.frequency,
-        offset=size,
-        frequency=1.0 / duration,
-        viscous=inertia / duration,
-        dry=None if start.dry is None else 2.0 * length * size / (_bearing(pendulum) * start.frequency * duration),
-    )
-
-    def states(at: Unknowns) -> tuple[Array, Array]:
-        pull = at.frequency**2 * inertia / (pendulum.mass * length)
-        freed = eqx.tree_at(lambda p: p.g, pendulum, pull)
-        solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
-        smooth = None if at.dry is None else width
-        run = swing_states(
-            freed, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(_TOLERANCE), solver, adjoint, max_steps
-        )
-        return at.offset + run.angle, run.stopped_at
-
-    first, shape = jax.flatten_util.ravel_pytree(start)
-    unit, _ = jax.flatten_util.ravel_pytree(scale)
-
-    def residual(x: Array) -> tuple[Array, tuple[Array, Array]]:
-        fitted, stopped_at = states(shape(first + unit * x))
-        left = weight * (fitted - angle) / size
-        return left, (left, stopped_at)
-
-    x, left, slopes, stopped_at, converged = _least_squares(residual, jnp.zeros_like(first))
-    left = size * left
-    variance = jnp.sum(left**2) / (jnp.sum(weight) - first.shape[0])
-    _, triangle = jnp.linalg.qr(size * slopes)
-    root = unit[:, None] * jnp.linalg.inv(triangle)
-    covariance = variance * root @ root.T
-    return Fit(
-        unknowns=shape(first + unit * x),
-        covariance=covariance,
-        residual=left,
-        noise=jnp.sqrt(variance),
-        stopped_at=stopped_at,
-        converged=converged & jnp.all(jnp.isfinite(covariance)),
-    )
-
-
-def _least_squares(
-    residual: Callable[[Array], tuple[Array, tuple[Array, Array]]], start: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """x (p,) of the least sum of squares of `residual` (n,), with residual, slopes (n, p), what comes with it, and success.
-
-    Levenberg and Marquardt's method, written so that the program holds the integration once: it is what takes long to compile.
-    It is done where the next full step is less than 0.01 standard errors, and good where it is less than 0.1: below, the
-    steps of the integration blur the sum.
-    """
-    slopes_of = jax.jacfwd(residual, has_aux=True)
-    n, p = jax.eval_shape(residual, start)[0].shape[0], start.shape[0]
-    floor = n * (0.01 * _TOLERANCE) ** 2
-
-    def goes_on(carry: tuple[Array, ...]) -> Array:
-        return (carry[0] < _MOST_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
-
-    def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-        count, trial, damping, *best, _ = carry
-        slopes, (left, stopped_at) = slopes_of(trial)
-        cost = jnp.sum(left**2)
-        better = cost < best[0]  # and not NaN
-        best = [jnp.where(better, new, old) for new, old in zip((cost, trial, left, slopes, stopped_at), best, strict=True)]
-        damping = jnp.where(better, 0.1 * damping, 10.0 * damping)
-        cost, x, left, slopes, _ = best
-        basis, triangle = jnp.linalg.qr(slopes)
-        reached = basis.T @ left
-        normal = triangle.T @ triangle
-        damped = normal + damping * jnp.diag(jnp.diagonal(normal))
-        trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
-        # The full next step in standard errors: of the best point so far, for at a kink the sum may not fall any more.
-        left_to_go = jnp.sum(reached**2) / (cost / (n - p) + floor)
-        return count + 1, trial, damping, *best, left_to_go
-
-    none = (jnp.asarray(jnp.inf), start, jnp.zeros(n), jnp.zeros((n, p)), jnp.asarray(jnp.nan))
-    end = jax.lax.while_loop(goes_on, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
-    return end[4], end[5], end[6], end[7], end[-1] < 1e-2
-
-
-def _bearing(pendulum: BearingPendulum) -> Array:
-    assert pendulum.bearing is not None
-    return pendulum.bearing
-
-
 def _judged(
-    pendulum: BearingPendulum, record: Record, turns: TurningPoints, fit: Fit, width: float, instrument: float
+    pendulum: BearingPendulum, record: Record, turns: TurningPoints, fit: Fit, width: float, instrument: float, until: float
 ) -> Identified:
-    """The fit in words: intervals, a status, and what a reader should know besides."""
+    """Return the fit with intervals, a status, and what a reader should know besides."""
     values = [float(v) for v in jax.tree.leaves(fit.unknowns)]
     covariance = np.asarray(fit.covariance)
     errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    free = record.samples - len(values)
-    quantile = student_quantile(free)
+    used = record.time <= until
+    samples = int(np.count_nonzero(used))
+    quantile = student_quantile(samples - len(values))
     plain = [interval(v, float(e), quantile, 0.0) for v, e in zip(values, errors, strict=True)]
     angle, rate, offset, frequency = plain[:4]
     viscous, *more = (interval(v, float(e), quantile, instrument) for v, e in zip(values[4:], errors[4:], strict=True))
     dry = more[0] if more else None
-    left = np.asarray(fit.residual)
+    left = np.asarray(fit.residual)[used]
     pattern = float(np.sum(left[1:] * left[:-1]) / np.sum(left**2)) if np.any(left) else 0.0
+    structure, chance = _structure(record.time[used], left, turns, len(values))
     correlation = float(covariance[4, 5] / (errors[4] * errors[5])) if dry is not None else math.nan
 
     decrement, notes = None, []
@@ -339,6 +205,8 @@ def _judged(
         decrement = ten_periods(pendulum, record, instrument=instrument, turns=turns)
         if dry is None and decrement.drift > 4.0:
             notes.append("the swing decays faster the smaller it is, as by dry friction: ask for mu2 as well")
+        elif decrement.drift < -4.0:
+            notes.append("the swing decays slower the smaller it is, as by the drag of air: mu1 is too large")
     small = float(pendulum.frequency)
     if abs(frequency.value / small - 1.0) > 0.02:
         wanted = f"the swing's frequency is {frequency.value:.4g} rad/s, the pendulum's length and inertia give {small:.4g}"
@@ -352,8 +220,11 @@ def _judged(
     if math.isfinite(stop := float(fit.stopped_at)):
         notes.append(f"dry friction holds the pendulum from {stop + record.time[0]:.4g} s on")
 
+    if samples < record.samples:
+        notes.append(f"the record after {until:.4g} s is left out: the pendulum rests, or its swing is below the noise")
+
     status = IdentifyStatus.found
-    if not bool(fit.converged) or float(fit.noise) > 0.5 * float(np.std(record.angle)):
+    if not bool(fit.converged) or float(fit.noise) > 0.5 * float(np.std(record.angle[used])):
         status = IdentifyStatus.not_converged
     elif viscous.high < 0.0 or (dry is not None and dry.high < 0.0):
         status = IdentifyStatus.negative
@@ -361,7 +232,7 @@ def _judged(
         status = IdentifyStatus.undetermined
     elif abs(frequency.value / small - 1.0) > _CONTRADICTS + instrument:
         status = IdentifyStatus.contradicted
-    elif abs(pattern) > 4.0 / math.sqrt(record.samples) and float(fit.noise) > 10.0 * _TOLERANCE:
+    elif float(fit.noise) > 10.0 * TOLERANCE and (abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE):
         status = IdentifyStatus.patterned
     return Identified(
         status=status,
@@ -376,13 +247,39 @@ def _judged(
         inertia=float(pendulum.mass * pendulum.g * pendulum.length) / frequency.value**2,
         noise=float(fit.noise),
         pattern=pattern,
-        fitted=record.angle + left,
+        structure=structure,
+        until=until,
+        fitted=record.angle + np.asarray(fit.residual),
         stopped_at=stop + float(record.time[0]),
         width=width if dry is not None else math.nan,
         decrement=decrement,
         record=record,
         pendulum=pendulum,
     )
+
+
+def _structure(time: np.ndarray, left: np.ndarray, turns: TurningPoints, found: int) -> tuple[float, float]:
+    """Return the F statistic of residuals, n of them after a fit of `found` numbers, and its chance if they are noise.
+
+    They are compared with slow changes of the zero, and with slowly changing vibrations of the swing's frequency and twice and
+    three times that: what another law of friction, a torque or another restoring force leaves.
+    """
+    from scipy.special import fdtrc  # slow to import
+
+    half = float(np.median(np.diff(turns.time)))
+    times = np.concatenate([[turns.time[0] - 2.0 * half], turns.time, [turns.time[-1] + 2.0 * half]])
+    phase = np.pi * np.interp(time, times, np.concatenate([[-2.0], np.arange(turns.time.size), [turns.time.size + 1.0]]))
+    slow = np.polynomial.legendre.legvander(2.0 * (time - time[0]) / (time[-1] - time[0]) - 1.0, 4)
+    columns = [slow[:, :3]]
+    for k, order in ((1, 5), (2, 3), (3, 3)):
+        columns += [slow[:, :order] * np.cos(k * phase)[:, None], slow[:, :order] * np.sin(k * phase)[:, None]]
+    basis, _ = np.linalg.qr(np.concatenate(columns, axis=1))
+    known, free = basis.shape[1] - found, time.size - basis.shape[1]
+    if free < 8 or not np.any(left):
+        return 1.0, 1.0
+    explained = float(np.sum((basis.T @ left) ** 2))
+    statistic = explained / known / ((float(np.sum(left**2)) - explained) / free)
+    return statistic, float(fdtrc(known, free, statistic))
 
 
 def student_quantile(freedom: int) -> float:

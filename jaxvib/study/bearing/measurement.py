@@ -66,7 +66,7 @@ def _record(
     if not isinstance(file, str):
         raise InputError("record.file", f"is {file!r}; write the path of a CSV file")
     if angle_unit is not None and not isinstance(angle_unit, str):
-        raise InputError("record.angle_unit", f"is {angle_unit!r}; write 'deg', 'rad' or another unit of an angle")
+        raise InputError("record.angle_unit", f"is {angle_unit!r}; write 'rad', 'mrad', 'deg', 'gon' or 'turn'")
     if columns is not None and (
         not isinstance(columns, (list, tuple)) or len(columns) != 2 or not all(isinstance(name, str) for name in columns)
     ):

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from jaxvib.errors import InputError
 from jaxvib.results.fields import in_unit
-from jaxvib.units import to_float
 
 __all__ = ["Record", "read_record"]
 
@@ -20,7 +19,27 @@ _LEAST = 16
 """Samples a record needs: fewer hold no swing."""
 
 _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi", "theta", "f", "winkel", "угол")}
-_HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[]\s*(?P<unit>[^)\]]*?)\s*[)\]]|/\s*(?P<per>\S+)|_(?P<tail>s|ms|rad|mrad|deg))?$")
+
+_UNITS = {
+    "time": {
+        **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "с"), 1.0),
+        **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds", "мс"), 1e-3),
+        **dict.fromkeys(("us", "µs", "μs", "usec", "microsecond", "microseconds"), 1e-6),
+        **dict.fromkeys(("min", "minute", "minutes"), 60.0),
+    },
+    "angle": {
+        **dict.fromkeys(("rad", "rads", "radian", "radians", "рад"), 1.0),
+        **dict.fromkeys(("mrad", "milliradian", "milliradians"), 1e-3),
+        **dict.fromkeys(("deg", "degs", "degree", "degrees", "°", "град"), np.pi / 180.0),
+        **dict.fromkeys(("mdeg", "millidegree", "millidegrees"), np.pi / 180e3),
+        **dict.fromkeys(("gon", "gradian", "gradians"), np.pi / 200.0),
+        **dict.fromkeys(("turn", "turns", "rev", "revs", "revolution", "revolutions"), 2.0 * np.pi),
+    },
+}
+"""Units of columns in SI, in small letters: a header's letters may have any size."""
+
+_HEAD = re.compile(r"^(?P<name>.*?)\s*(?:[(\[{]\s*(?P<unit>[^)\]}]*?)\s*[)\]}]|/\s*(?P<per>\S+))$")
+_TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 
 class Record(eqx.Module):
@@ -86,14 +105,15 @@ class Record(eqx.Module):
 def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle_unit: str | None = None) -> Record:
     """Reads a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
 
-    Lines that begin with # and empty lines are passed over. A first line of names may carry units, `time (s), angle (deg)`,
-    `t [ms]`, `angle_deg`, or the line below it may; without units times are s and angles rad. Between semicolons, tabs or
-    blanks numbers may have a decimal comma.
+    Lines that begin with # and empty lines are skipped. A first line of names may carry units, `time (s), angle (deg)`,
+    `t [ms]`, `ANGLE_DEG`, or the line below it may; letters of any size. Columns called time and angle (t, phi, theta, ...)
+    without a unit are s and rad; any other column needs a unit. Between semicolons, tabs or blanks numbers may have a decimal
+    comma.
 
-    **Arguments**: `columns`: names of the columns of time and angle, where they are not called time and angle; `angle_unit`:
-    "deg" or any unit of an angle, in place of the header's.
+    **Arguments**: `columns`: names of the columns of time and angle, with or without their units, if they are not called time
+    and angle; `angle_unit`: "rad", "mrad", "deg", "gon" or "turn", in place of the header's.
 
-    **Returns** `Record`. **Raises** `InputError` that says which line is wrong.
+    **Returns** `Record`. **Raises** `InputError` that says which line is wrong, or which column has no unit that is known.
 
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "swing.csv"
@@ -119,10 +139,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
         heads.append(cells.pop(0)[1])
     if not cells:
         raise InputError(str(path), "holds no lines of numbers below its header")
-    places, units = _columns(heads, len(cells[0][1]), columns, path)
-    if angle_unit is not None:
-        units[1] = angle_unit
-    factors = [_factor(unit, si, f"{path}: unit of {what}") for unit, si, what in zip(units, ("s", "rad"), _NAMES, strict=True)]
+    places, factors = _columns(heads, len(cells[0][1]), columns, angle_unit, path)
 
     width = len(heads[0]) if heads else len(cells[0][1])
     values = np.empty((len(cells), 2))
@@ -147,36 +164,64 @@ def _is_number(cell: str, mark: str | None) -> bool:
 
 
 def _columns(
-    heads: list[list[str]], width: int, wanted: Sequence[str] | None, path: Path
-) -> tuple[list[int], list[str | None]]:
-    """Which columns hold time and angle, and their units."""
+    heads: list[list[str]], width: int, wanted: Sequence[str] | None, angle_unit: str | None, path: Path
+) -> tuple[list[int], list[float]]:
+    """Return the columns of time and angle, and the factors that make them SI."""
     if width < 2:
         raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")
+    given = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
     if not heads:
         if wanted is not None or width > 2:
             raise InputError(
                 str(path), f"has {width} columns and no line of names; write one, for example time (s), angle (deg)"
             )
-        return [0, 1], [None, None]
-    parts = [_HEAD.match(head) for head in heads[0]]
-    names = [part["name"].strip() if part else head for part, head in zip(parts, heads[0], strict=True)]
-    units = [part and (part["unit"] or part["per"] or part["tail"]) for part in parts]
-    if len(heads) == 2:
-        if len(heads[1]) != len(names):
-            raise InputError(str(path), f"has {len(names)} names but {len(heads[1])} units below them")
-        units = [below.strip("()[] ") or unit for below, unit in zip(heads[1], units, strict=True)]
-    places = []
+        return [0, 1], [1.0, 1.0 if given is None else given]
+    if len(heads) == 2 and len(heads[1]) != len(heads[0]):
+        raise InputError(str(path), f"has {len(heads[0])} names but {len(heads[1])} units below them")
+    below = [unit.strip("()[]{} ") for unit in heads[1]] if len(heads) == 2 else [""] * len(heads[0])
+    places, factors = [], []
     for k, (what, known) in enumerate(_NAMES.items()):
-        choice = (wanted[k],) if wanted is not None else known
-        found = [i for i, name in enumerate(names) if name.lower() in [c.lower() for c in choice]]
-        if not found and wanted is None and len(names) == 2:
+        parts = [_parted(head, what) for head in heads[0]]
+        choice = tuple(name.strip().lower() for name in ((wanted[k],) if wanted is not None else known))
+        found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[0][i].lower()} & set(choice)]
+        if not found and wanted is None and width == 2:
             found = [k]
         if len(found) != 1:
-            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {choice[0]!r} for the {what}"
-            raise InputError(str(path), f"{problem}; its columns are {', '.join(names)}: name those of time and angle")
-        places.append(found[0])
-    return places, [units[i] for i in places]
+            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {(wanted[k] if wanted else choice[0])!r}"
+            names = ", ".join(heads[0])
+            raise InputError(str(path), f"{problem} for the {what}; its columns are {names}: name those of time and angle")
+        place = found[0]
+        name, unit = parts[place]
+        unit = below[place] or unit
+        places.append(place)
+        if what == "angle" and given is not None:
+            factors.append(given)
+        elif unit:
+            factors.append(_factor(unit, what, f"{path}: unit of {what}"))
+        elif name.lower() in known:
+            factors.append(1.0)
+        else:
+            advice = f"write {what} ({'s' if what == 'time' else 'deg'})" + (" or give angle_unit" if what == "angle" else "")
+            raise InputError(str(path), f"has the column {heads[0][place]!r} for the {what}, whose unit is not known; {advice}")
+    return places, factors
 
 
-def _factor(unit: str | None, si: str, field: str) -> float:
-    return 1.0 if not unit else float(to_float(f"1 {unit.replace('°', 'deg')}", si, field))
+def _parted(head: str, what: str) -> tuple[str, str]:
+    """Return the name and the unit of a column's head: `name (unit)`, `name / unit`; `name_unit` if the unit is known."""
+    part = _HEAD.match(head)
+    if part is not None:
+        return part["name"].strip(), part["unit"] or part["per"] or ""
+    tail = _TAIL.match(head)
+    if tail is not None and tail["tail"].lower() in _UNITS[what]:
+        return tail["name"].strip(), tail["tail"]
+    return head.strip(), ""
+
+
+def _factor(unit: str, what: str, field: str) -> float:
+    factor = _UNITS[what].get(unit.strip().lower())
+    if factor is None:
+        raise InputError(field, f"is {unit!r}, which is no unit of {what} here; write {_EXAMPLES[what]}")
+    return factor
+
+
+_EXAMPLES = {"time": "s, ms, us or min", "angle": "rad, mrad, deg, gon or turn"}

@@ -10,7 +10,8 @@ from swings import ROD, T, noisy, scipy_swing, scipy_swings
 import jaxvib as jv
 from jaxvib.runtime.compat import no_host_checks
 from jaxvib.study.bearing.decrement import turning_points
-from jaxvib.study.bearing.identify import first_guess, fit_swing, steps_for, student_quantile
+from jaxvib.study.bearing.fit import first_guess, fit_swing, steps_for
+from jaxvib.study.bearing.identify import student_quantile
 
 
 def test_large_swings_bias_the_formula_and_not_the_fit():

@@ -1,0 +1,182 @@
+"""Least-squares fit of a bearing's friction to a recorded swing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.runtime.programs import cached
+from jaxvib.study.bearing.decrement import TurningPoints, period_stretch
+from jaxvib.study.bearing.record import Record
+from jaxvib.study.bearing.swing import BearingPendulum, controller_to, swing_states
+
+__all__ = ["TOLERANCE", "Fit", "Unknowns", "first_guess", "fit_swing", "steps_for"]
+
+_MOST_ITERATIONS = 64
+
+TOLERANCE = 1e-9
+"""Relative error of a step of the integration behind a fit."""
+
+
+class Unknowns(NamedTuple):
+    """What a fit finds: `angle` rad and `rate` rad/s at the first sample, counted from hanging; `offset` rad of the record's
+    zero; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None."""
+
+    angle: Array
+    rate: Array
+    offset: Array
+    frequency: Array
+    viscous: Array
+    dry: Array | None
+
+
+class Fit(NamedTuple):
+    """A fit: the `unknowns`; `covariance` (p, p) of them in their order, from the Fisher information with the noise found;
+    `residual` (n,) rad, fit minus record; `noise` rad, standard deviation of a sample; `stopped_at` s; `converged`."""
+
+    unknowns: Unknowns
+    covariance: Array
+    residual: Array
+    noise: Array
+    stopped_at: Array
+    converged: Array
+
+
+def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool) -> tuple[Unknowns, Array]:
+    """Where a fit begins, from the turning points, and the width that dry friction is smoothed with.
+
+    A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
+    """
+    a = turns.amplitude
+    stretch = period_stretch(a)
+    w = math.pi * a.size / float(np.sum(np.diff(turns.time) / stretch))
+    inertia, length = float(pendulum.total_inertia), float(pendulum.length)
+    if dry and a.size > 3:
+        (share, loss), *_ = np.linalg.lstsq(np.stack([a[:-1], np.ones(a.size - 1)], axis=1), a[:-1] - a[1:], rcond=None)
+        share, loss = max(share, 0.0), max(loss, 0.0)
+    else:
+        weight = a**2 / np.sum(a**2)
+        k = np.arange(a.size) - np.sum(weight * np.arange(a.size))
+        share, loss = max(-float(np.sum(weight * k * np.log(a)) / np.sum(weight * k**2)), 0.0), 0.0
+    offset = float(np.mean((turns.angle[:-2] + 2.0 * turns.angle[1:-1] + turns.angle[2:]) / 4.0))
+    first = turns.angle[0] - offset
+    phase = w / stretch[0] * (record.time[0] - turns.time[0])
+    guess = Unknowns(
+        angle=jnp.asarray(first * math.cos(phase)),
+        rate=jnp.asarray(-first * w * math.sin(phase)),
+        offset=jnp.asarray(offset),
+        frequency=jnp.asarray(w),
+        viscous=jnp.asarray(2.0 * inertia * w * share / math.pi),
+        dry=jnp.asarray(loss * length / float(pendulum.bearing)) if dry and pendulum.bearing is not None else None,
+    )
+    return guess, jnp.asarray(0.005 * w * float(np.min(a)))
+
+
+def steps_for(start: Unknowns, time: Array | np.ndarray) -> int:
+    """More steps than the integration takes; a power of 2, so that few lengths of a record need few compilations."""
+    return 2 ** math.ceil(math.log2(4096 + 100.0 * float(jnp.max(start.frequency)) * float(np.max(time))))
+
+
+@cached
+def fit_swing(
+    pendulum: BearingPendulum, time: Array, angle: Array, weight: Array, start: Unknowns, width: Array, max_steps: int
+) -> Fit:
+    """The least-squares fit behind `identify`, for `vmap` over records: `time` (n,) s from 0, `angle` (n,) rad, and which of
+    them count, `weight` (n,) 1 or 0."""
+    size = jnp.std(angle) * jnp.sqrt(2.0)
+    duration = time[-1] - time[0]
+    inertia, length = pendulum.total_inertia, pendulum.length
+    scale = Unknowns(
+        angle=size,
+        rate=size * start.frequency,
+        offset=size,
+        frequency=1.0 / duration,
+        viscous=inertia / duration,
+        dry=None if start.dry is None else 2.0 * length * size / (_bearing(pendulum) * start.frequency * duration),
+    )
+
+    def states(at: Unknowns) -> tuple[Array, Array]:
+        pull = at.frequency**2 * inertia / (pendulum.mass * length)
+        freed = eqx.tree_at(lambda p: p.g, pendulum, pull)
+        solver, adjoint = diffrax.Tsit5(), diffrax.ForwardMode()
+        smooth = None if at.dry is None else width
+        run = swing_states(
+            freed, time, at.angle, at.rate, at.viscous, at.dry, smooth, controller_to(TOLERANCE), solver, adjoint, max_steps
+        )
+        return at.offset + run.angle, run.stopped_at
+
+    first, shape = jax.flatten_util.ravel_pytree(start)
+    unit, _ = jax.flatten_util.ravel_pytree(scale)
+
+    def residual(x: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        fitted, stopped_at = states(shape(first + unit * x))
+        left = jnp.where(weight > 0.0, fitted - angle, 0.0) / size
+        return left, (left, stopped_at, fitted)
+
+    x, left, slopes, (stopped_at, fitted), converged = _least_squares(residual, jnp.zeros_like(first), jnp.sum(weight))
+    left = size * left
+    variance = jnp.sum(left**2) / (jnp.sum(weight) - first.shape[0])
+    _, triangle = jnp.linalg.qr(size * slopes)
+    root = unit[:, None] * jnp.linalg.inv(triangle)
+    covariance = variance * root @ root.T
+    return Fit(
+        unknowns=shape(first + unit * x),
+        covariance=covariance,
+        residual=fitted - angle,
+        noise=jnp.sqrt(variance),
+        stopped_at=stopped_at,
+        converged=converged & jnp.all(jnp.isfinite(covariance)),
+    )
+
+
+def _least_squares(
+    residual: Callable[[Array], tuple[Array, tuple[Array, Array, Array]]], start: Array, n: Array
+) -> tuple[Array, Array, Array, tuple[Array, Array], Array]:
+    """Return x (p,) of the least sum of squares of `residual`, `n` of whose entries count; residual, slopes, the rest, success.
+
+    Levenberg and Marquardt's method, written so that the program holds the integration once: it is what takes long to compile.
+    It is done where the next full step is less than 0.01 standard errors, and good where it is less than 0.1: below, the
+    steps of the integration blur the sum.
+    """
+    slopes_of = jax.jacfwd(residual, has_aux=True)
+    size, p = jax.eval_shape(residual, start)[0].shape[0], start.shape[0]
+    floor = n * (0.01 * TOLERANCE) ** 2
+
+    def goes_on(carry: tuple[Array, ...]) -> Array:
+        return (carry[0] < _MOST_ITERATIONS) & (carry[-1] > 1e-4) & (carry[2] < 1e6)
+
+    def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        count, trial, damping, *best, _ = carry
+        slopes, (left, stopped_at, fitted) = slopes_of(trial)
+        cost = jnp.sum(left**2)
+        better = cost < best[0]  # and not NaN
+        latest = (cost, trial, left, slopes, stopped_at, fitted)
+        best = [jnp.where(better, new, old) for new, old in zip(latest, best, strict=True)]
+        damping = jnp.where(better, 0.1 * damping, 10.0 * damping)
+        cost, x, left, slopes, *_ = best
+        basis, triangle = jnp.linalg.qr(slopes)
+        reached = basis.T @ left
+        normal = triangle.T @ triangle
+        damped = normal + damping * jnp.diag(jnp.diagonal(normal))
+        trial = x - jnp.linalg.solve(damped, triangle.T @ reached)
+        # The full next step in standard errors: of the best point so far, for at a kink the sum may not fall any more.
+        left_to_go = jnp.sum(reached**2) / (cost / (n - p) + floor)
+        return count + 1, trial, damping, *best, left_to_go
+
+    none = (jnp.asarray(jnp.inf), start, jnp.zeros(size), jnp.zeros((size, p)), jnp.asarray(jnp.nan), jnp.zeros(size))
+    end = jax.lax.while_loop(goes_on, step, (jnp.asarray(0), start, jnp.asarray(0.1), *none, jnp.asarray(jnp.inf)))
+    return end[4], end[5], end[6], (end[7], end[8]), end[-1] < 1e-2
+
+
+def _bearing(pendulum: BearingPendulum) -> Array:
+    assert pendulum.bearing is not None
+    return pendulum.bearing
