@@ -213,7 +213,7 @@ def _returns(scene: Scene, state: State, steps: Tolerance) -> bool:
         scene, _TURNS * 2.0 * math.pi / slowest, start=state, samples=_SAMPLES, stepsize_controller=steps, estimate=False,
         throw=False,
     )  # fmt: skip
-    if run.trajectory is None or not bool(run.status == RunStatus.done):
+    if run.trajectory is None or not bool(run.finished):
         return False
     path = jax.tree.map(np.asarray, run.trajectory.state)
     begin = jax.tree.map(lambda x: x[:1], path)

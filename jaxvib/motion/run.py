@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -16,9 +17,11 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
 from jaxvib.motion.analysis.regime import Regime, regime
+from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.analysis.spectrum import Spectrum, spectrum_of
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
 
 if TYPE_CHECKING:
@@ -26,7 +29,7 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["Run", "RunStatus"]
+__all__ = ["Run", "RunStatus", "judged_by_separation"]
 
 
 @cached
@@ -189,3 +192,10 @@ class Run(AbstractMeasured, Result):
         }
         paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
+
+
+def judged_by_separation(run: Run) -> Run:
+    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    if not (bool(run.finished) and would_separate(run.scene, run.window)):
+        return run
+    return dataclasses.replace(run, status=member(RunStatus, "would_separate"))

@@ -22,13 +22,12 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
-from jaxvib.motion.analysis.separation import would_separate
 from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, wrap_angles
-from jaxvib.motion.run import Run, RunStatus
+from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.results.status import failure, member, status_name
+from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
@@ -129,10 +128,10 @@ def simulate(
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
     scene = brought_up(scene, end, start, spin_up)
-    if isinstance(start, State):
-        state = whole_state(scene, start, mode, apart)
-    else:
-        state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+    given = isinstance(start, State)
+    state = (
+        whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+    )
     fastest = functools.cache(lambda: fastest_and_slowest(scene)[0])
     if max_steps is None:
         max_steps = enough_steps(fastest(), end)
@@ -177,16 +176,7 @@ def simulate(
     found = _with(found, seconds=time.perf_counter() - begun, **estimated)
     if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
-    if concrete and not is_rehearsing() and bool(found.settled):
-        return judged_by_separation(found)
-    return found
-
-
-def judged_by_separation(run: Run) -> Run:
-    """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
-    if not (bool(run.finished) and would_separate(run.scene, run.window)):
-        return run
-    return dataclasses.replace(run, status=member(RunStatus, "would_separate"))
+    return judged_by_separation(found) if concrete and not is_rehearsing() and bool(found.settled) else found
 
 
 def _limited(chosen: _Control, most: int) -> tuple[_Control, int]:

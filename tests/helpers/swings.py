@@ -12,8 +12,10 @@ T = 0.05 * np.arange(400)
 ROD = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)
 
 
-def scipy_swing(rod, times, angle, rate, viscous, dry=0.0):
-    """The swing with the sharp sign of sliding, half a swing at a time, and when dry friction stops it (NaN: never)."""
+def scipy_swing(rod, times, angle, rate, viscous, dry=0.0, air=0.0, torque=0.0):
+    """Return the swing with the sharp sign of sliding, half a swing at a time, and when dry friction stops it (NaN: never).
+
+    `air`: quadratic drag, N m s^2; `torque`: a constant one, N m."""
     m, l, j, d, g = (float(x) for x in (rod.mass, rod.length, rod.total_inertia, rod.bearing, rod.g))
     out, t, y = np.full(len(times), np.nan), times[0], np.array([angle, rate])
     while True:
@@ -24,7 +26,10 @@ def scipy_swing(rod, times, angle, rate, viscous, dry=0.0):
 
         def rhs(t, y, sign=sign):
             load = abs(m * l * y[1] ** 2 + m * g * np.cos(y[0]))
-            return [y[1], (-m * g * l * np.sin(y[0]) - viscous * y[1] - dry * load * d / 2.0 * sign) / j]
+            return [
+                y[1],
+                (torque - m * g * l * np.sin(y[0]) - (viscous + air * abs(y[1])) * y[1] - dry * load * d / 2.0 * sign) / j,
+            ]
 
         turns = lambda t, y: y[1]  # noqa: E731
         turns.terminal, turns.direction = dry > 0.0, -sign

@@ -23,7 +23,10 @@ def table(head, separator=",", comma=False, factor=1.0):
         (table("Time;Angle\ns;deg\n", ";"), True),
         (table('"time / s", "angle / mrad"\n'), None),
         (table("", " "), False),
-        (table("clock, deflection\n"), False),
+        (table("TIME,ANGLE_DEG\n"), True),
+        (table("Time [MS]\tAngle [Deg]\n", "\t", False, 1000.0), True),
+        (table("t.ms;phi deg\n", ";", False, 1000.0), True),
+        (table("clock (s), deflection (degrees)\n"), True),
     ],
 )
 def test_records_come_in_as_laboratories_write_them(tmp_path, text, degrees):
@@ -33,6 +36,15 @@ def test_records_come_in_as_laboratories_write_them(tmp_path, text, degrees):
     np.testing.assert_allclose(record.time, np.arange(20) / 10, rtol=1e-12)
     unit = {True: np.pi / 180.0, False: 1.0, None: 1e-3}[degrees]
     np.testing.assert_allclose(record.angle, 0.1 * unit * (-1.0) ** np.arange(20), rtol=1e-12)
+
+
+@pytest.mark.parametrize("columns", [["time_ms", "theta_deg"], ["TIME_MS", " Theta_Deg"], ["time", "theta"]])
+def test_columns_are_named_as_in_the_file(tmp_path, columns):
+    path = tmp_path / "swing.csv"
+    path.write_text("time_ms,theta_deg,rate\n" + "".join(f"{100 * k},{k % 3},0\n" for k in range(20)))
+    record = jv.read_record(path, columns=columns)
+    np.testing.assert_allclose(record.time, np.arange(20) / 10, rtol=1e-12)
+    np.testing.assert_allclose(record.angle, np.deg2rad(np.arange(20) % 3), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +59,12 @@ def test_records_come_in_as_laboratories_write_them(tmp_path, text, degrees):
         ("0.1\n0.2\n", "has one column; two are needed"),
         ("1,2,3\n", "has 3 columns and no line of names"),
         ("time, x, y\n1,2,3\n", "has no column 'angle' for the angle; its columns are time, x, y"),
-        (table("time (s), angle (kg)\n"), "unit of angle is '1 kg', which is not in rad"),
+        (table("time (s), angle (kg)\n"), "unit of angle is 'kg', which is no unit of angle here; write rad, mrad, deg"),
+        (table("time (s), angle (percent)\n"), "unit of angle is 'percent', which is no unit of angle here"),
+        (table("time (s), angle (%)\n"), "unit of angle is '%', which is no unit of angle here"),
+        (table("clock (s), deflection\n"), "has the column 'deflection' for the angle, whose unit is not known; write angle"),
+        (table("TIME,ANGLE_RAW\n"), "has the column 'ANGLE_RAW' for the angle, whose unit is not known"),
+        (table("frame,angle_deg\n"), "has the column 'frame' for the time, whose unit is not known; write time (s)"),
         ("0,1\n1,2\n", "has 2 samples; a swing needs at least 16"),
         (table("").replace("0.100\n", "25.0\n"), "more than a full turn; if these are degrees, say so"),
     ],
