@@ -148,20 +148,20 @@ def open_regular(path: str | Path) -> IO[bytes]:
         raise OSError(None, str(error)) from error
 
 
-def read_text(path: str | Path, what: str) -> str:
+def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
     """Text of a file that a person wrote; `what` says in messages which file is expected, such as "a TOML file".
 
-    **Raises** `InputError` for a file that cannot be read, is no UTF-8 text, or is larger than 16 MB.
+    **Raises** `InputError` for a file that cannot be read, is no UTF-8 text, or has more than `most` bytes.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError("path", f"is {path!r}; give the path of {what}")
     try:
         with open_regular(path) as file:
-            content = file.read(MAX_TEXT_BYTES + 1)
+            content = file.read(most + 1)
     except OSError as error:
         raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of {what}") from error
-    if len(content) > MAX_TEXT_BYTES:
-        raise InputError(str(path), f"is larger than {MAX_TEXT_BYTES >> 20} MB; give the path of {what}")
+    if len(content) > most:
+        raise InputError(str(path), f"is larger than {most >> 20} MB; give the path of {what}")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

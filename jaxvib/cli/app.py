@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxvib.cli.output import Output
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import ComputationError, InputError, legible
 
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
@@ -226,7 +226,7 @@ def _way_out(arguments: list[str], error: InputError) -> str:
 
 
 def _failed(wants_json: bool, code: int, error: dict[str, str | None]) -> int:
-    click.echo(f"jaxvib: {error['message']}", err=True)
+    click.echo(legible(f"jaxvib: {error['message']}"), err=True)
     if wants_json:
         click.echo(json.dumps({"error": error}, indent=2))
     return code

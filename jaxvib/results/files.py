@@ -117,7 +117,10 @@ def _array(content: bytes) -> np.ndarray:
     begin = stream.tell()
     if kind.kind not in _KINDS or math.prod(shape) * kind.itemsize != len(content) - begin:
         raise ValueError("no array of numbers or text")
-    return np.ndarray(shape, kind, bytearray(content), begin, order="F" if is_fortran else "C")
+    array = np.ndarray(shape, kind, bytearray(content), begin, order="F" if is_fortran else "C")
+    if kind.kind == "U" and CONTROL.search("".join(array.ravel().tolist())):
+        raise ValueError("control characters")
+    return array
 
 
 def _digest(layout: str, arrays: Mapping[str, np.ndarray]) -> str:

@@ -202,8 +202,9 @@ class _Description:
         return {"class": _name(kind), "bases": self.of(list(kind.__bases__)), "digest": digest(entries)}
 
     def _function(self, function: types.FunctionType) -> Plain:
-        if _is_library(function.__module__):  # a wrapper or a closure of a package, whose version says what its code does
-            code: Plain = _version(function.__module__)
+        home = str(function.__globals__.get("__name__"))  # `functools.wraps` puts another name into `__module__`
+        if _is_library(home) and function.__globals__ is getattr(sys.modules.get(home), "__dict__", None):
+            code: Plain = _version(home)  # a wrapper or a closure of a package, whose version says what its code does
         else:
             code = self._code(function.__code__, function.__globals__)
         names = function.__code__.co_freevars

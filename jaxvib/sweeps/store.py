@@ -176,7 +176,7 @@ class Store:
         found: dict[str, Path] = {}
         for name in (*self.sampled, *self.names, "error", "status"):
             at = place[-1:] if name in self.sampled else place
-            extra = len(self.group[name].shape) - len(self.shape) if name in self.names else 0
+            extra = len(self.arrays[name].shape) - len(self.shape) if name in self.names else 0
             found[name] = self.path / name / "c" / "/".join(str(k) for k in (*at, *([0] * extra)))
         return found
 

@@ -124,8 +124,8 @@ def sweep(
     """Computes every case of a study and keeps it in a store on disk; where the store is there already, goes on with it.
 
     Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk
-    is written at once and never computed again, whatever ends the process. A case's numbers depend on the case alone: not on
-    the cases beside it, on the order, on how many workers there are, or on restarts.
+    is written at once and kept, whatever ends the process; one whose files are damaged is computed again. A case's numbers
+    depend on the case alone: not on the cases beside it, on the order, on how many workers there are, or on restarts.
 
     **Arguments**
 
@@ -150,7 +150,8 @@ def sweep(
 
     **Returns** `Sweep`. A case that fails raises nothing: its status and its sentence are in the store.
 
-    **Raises** `InputError` for values that are not allowed, a store of another study, and one that cannot be written.
+    **Raises** `InputError` for values that are not allowed, a store of another study (any value that its results depend on is
+    another one, those in functions of your own too), a store into which another sweep writes, and one that cannot be written.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import pathlib, tempfile, jaxvib as jv

@@ -121,6 +121,24 @@ def test_changes_in_this_process_change_the_identity(modules):
         assert before != (identity(function), identity(functools.partial(function)), identity(module.closed)), name
 
 
+def test_wrappers_that_bear_a_name_of_a_package_are_followed(modules):
+    def wrapped(factor):
+        @functools.wraps(np.linalg.norm)
+        def norm(scene):
+            return scene.drive.speed * factor
+
+        return norm
+
+    def other(factor):
+        @functools.wraps(np.linalg.norm)
+        def norm(scene):
+            return scene.drive.speed + factor
+
+        return norm
+
+    assert len({str(identity(f)) for f in (wrapped(1.0), wrapped(2.0), other(1.0), np.linalg.norm)}) == 4
+
+
 class Recursive:
     def __init__(self):
         self.itself = self

@@ -10,10 +10,13 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, read_text
 from jaxvib.results.fields import in_unit
 
 __all__ = ["Record", "read_record"]
+
+_MAX_BYTES, _MAX_LINE = 2**26, 10_000
+"""Bytes of a record, some million samples, and characters of a line."""
 
 _LEAST = 16
 """Samples a record needs: fewer hold no swing."""
@@ -122,12 +125,12 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     0.174533
     """
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise InputError(str(path), f"cannot be read ({error.strerror}); give the path of a CSV file") from error
-    except UnicodeDecodeError as error:
-        raise InputError(str(path), "is not UTF-8 text; save the table as CSV in UTF-8") from error
+    lines = read_text(path, "a CSV file", most=_MAX_BYTES).splitlines()
+    for k, line in enumerate(lines, 1):
+        if len(line) > _MAX_LINE:
+            raise InputError(
+                f"{path} line {k}", f"has {len(line)} characters; a record has one time and its angle in each line"
+            )
     rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
         raise InputError(str(path), "holds no lines of numbers; it needs two columns, time and angle")

@@ -1,5 +1,7 @@
 """Records of swings as laboratories write them, and what is said about wrong ones."""
 
+import os
+
 import numpy as np
 import pytest
 from swings import ROD
@@ -102,3 +104,13 @@ def test_wrong_records(tmp_path):
         jv.identify(ROD, jv.Record(t, 0.01 * t), instrument=2.0)
     with pytest.raises(jv.InputError, match=r"pendulum.bearing is missing"):
         jv.identify(jv.BearingPendulum(0.3, 0.2), jv.Record(t, 0.01 * t), dry=True)
+
+
+def test_records_in_one_line_and_pipes_are_refused_at_once(tmp_path):
+    path = tmp_path / "line.csv"
+    path.write_text("time,angle\n" + "1.0," * 5_000_000)
+    with pytest.raises(jv.InputError, match=r"line 2 has 20000000 characters; a record has one time and its angle"):
+        jv.read_record(path)
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(jv.InputError, match="a pipe or a device"):
+        jv.read_record(tmp_path / "pipe.csv")
