@@ -207,7 +207,7 @@ def _exact(scene: jv.Scene, unit: SpeedUnit, csv: Path | None, output: Output) -
                 f"{k}",
                 f"{float(jam.omega):.6g}",
                 f"{_RPM * float(jam.omega):.6g}",
-                "stable" if jam.stable else "unstable",
+                jam.judgement,
                 f"{float(jam.multiplier):.5g}",
                 *(f"{1e3 * float(a):.5g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.5g}",

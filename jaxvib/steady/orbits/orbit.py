@@ -39,8 +39,13 @@ if TYPE_CHECKING:
 __all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
 
 
+_MAX_STEPS = 2**17
+"""Integration steps of a turn beyond which no multipliers are computed: the carrier's fastest motion is then some 3e4 times as
+fast as the loads, and an orbit would take seconds to hours."""
+
+
 class OrbitStatus(eqx.Enumeration):
-    """What is known of an exact jam; the members are the sentences a user reads."""
+    """Outcome of a search for an exact jam; the members are the sentences a user reads."""
 
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"
@@ -48,6 +53,7 @@ class OrbitStatus(eqx.Enumeration):
     coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
     held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
+    unresolved = "the motion was found, its stability was not: the carrier's fastest motion is too fast beside the loads'"
     refused = REFUSED
 
 
@@ -118,6 +124,13 @@ class Orbit(Result):
                 raise InputError(name, f"is {coordinate}; the coordinates are numbered 1 to {most}")
         return _relative_amplitude(self.orders, self.displacement_harmonics, i, j)
 
+    @property
+    def judgement(self) -> str:
+        """ "stable" or "unstable", or that the stability is not known."""
+        if np.isnan(self.multiplier):
+            return "stability not known"
+        return "stable" if self.stable else "unstable"
+
     def force_peaks(self) -> Array:
         """The greatest force on the bed in each of 16 equal parts of the period, N, (16,); the largest is `foundation_force`,
         which bends where another one overtakes it. Of a force that does not turn its sign in half a period, or of two
@@ -134,7 +147,7 @@ class Orbit(Result):
         )
         return (
             f"loads {float(self.omega):.9g} rad/s, rotor {float(self.rotor_speed):.9g} rad/s, "
-            f"{'stable' if self.stable else 'unstable'} (largest multiplier {float(self.multiplier):.6g})\n"
+            f"{self.judgement} (largest multiplier {float(self.multiplier):.6g})\n"
             f"amplitude {amplitude}, foundation force {float(self.foundation_force):.6g} N, "
             f"power {float(self.power):.6g} W\n"
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
@@ -233,7 +246,9 @@ def orbits(
         motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
     else:
         motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
-    growth = floquet(model, grid, motion, harmonics, steps, implicit=implicit)
+    resolved = jnp.asarray(steps) <= _MAX_STEPS
+    limited = min(steps, _MAX_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
+    growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
@@ -250,6 +265,7 @@ def orbits(
 
     def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
         known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
+        known = OrbitStatus.where(resolved, known, OrbitStatus.unresolved)
         known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
         known = OrbitStatus.where(pulls, OrbitStatus.held, known)
         return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
@@ -262,10 +278,10 @@ def orbits(
         omega=or_nan(motion.omega),
         rotor_speed=or_nan(motion.rotor_speed),
         slope=or_nan(slope),
-        stable=met & (largest < 1.0) & ~parts,
-        multiplier=or_nan(largest),
-        multipliers=or_nan(multipliers),
-        trivial=or_nan(trivial),
+        stable=met & resolved & (largest < 1.0) & ~parts,
+        multiplier=or_nan(jnp.where(resolved, largest, jnp.nan)),
+        multipliers=or_nan(jnp.where(resolved, multipliers, jnp.nan)),
+        trivial=or_nan(jnp.where(resolved, trivial, jnp.nan)),
         amplitude=or_nan(amplitude),
         foundation_force=or_nan(force),
         power=or_nan(power),

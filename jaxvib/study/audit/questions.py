@@ -87,7 +87,7 @@ class JamQuestion(NamedTuple):
         """Values of the exact orbit; NaN, and a kind that says so, if there is no such jam."""
         orbit = jam_orbit(scene, mode=self.mode, throw=False)
         there = bool(np.isfinite(orbit.omega))
-        kind = f"jam mode {self.mode}, {'stable' if orbit.stable else 'unstable'}" if there else f"no jam mode {self.mode}"
+        kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
         # Loads that nothing holds together move in another way; other statuses tell of the computation alone.
         if there and bool(orbit.status == OrbitStatus.held):
             kind = f"{kind}, but the loads part"

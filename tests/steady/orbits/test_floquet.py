@@ -219,3 +219,14 @@ def test_derivatives_of_stiff_multipliers_are_those_of_differences():
     f = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
     reverse, h = jax.grad(f)(1000.0), 0.1
     np.testing.assert_allclose(reverse, (f(1000.0 + h) - f(1000.0 - h)) / (2.0 * h), rtol=1e-5)
+
+
+@pytest.mark.parametrize("question", [dict(omega=9.0), dict(near=9.0)])
+def test_stability_beside_a_far_faster_carrier_is_not_computed(question):
+    """The jam is found: on a machine whose resonance is 1e7 times as fast, thus rigid, the loads turn with the rotor."""
+    machine = jv.one_mass(mass=50.0, stiffness=5e17, damping=100.0)
+    scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(9.0))
+    found = jv.jam_orbit(scene, **question)
+    assert found.status_name == "unresolved" and found.judgement == "stability not known"
+    assert np.isnan(found.multiplier) and not found.stable and np.all(np.isnan(found.multipliers))
+    np.testing.assert_allclose([found.omega, found.rotor_speed], 9.0, rtol=1e-9)
