@@ -20,7 +20,7 @@ from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
 
-__all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "rotor_speed_at"]
+__all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "light_rotor_speed", "rotor_speed_at"]
 
 _POINTS = 64
 """Grid points on each side of each pole, where folds are looked for."""
@@ -65,6 +65,24 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None) -> Array:
     """`jam_rotor_speed` of a scene that is assembled already."""
     return _balance(model, omega, speed)[0]
+
+
+def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
+    """Rotor's speed of light loads at a load speed (rad/s), see `jam_rotor_speed`: a start for exact jams.
+
+    If the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
+    it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
+    """
+    if model.carrier.gyroscopic is None:
+        return rotor_speed_at(model, omega)
+
+    def residual(n: Array) -> Array:
+        return n - rotor_speed_at(model, omega, n)
+
+    speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
+    above = jax.vmap(residual)(speeds) > 0.0
+    first = jnp.maximum(jnp.argmax(above), 1)
+    return bracketed_root(residual, speeds[first - 1], speeds[first])
 
 
 def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:

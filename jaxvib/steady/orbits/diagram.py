@@ -24,10 +24,10 @@ from jaxvib.results.result import Result
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together
-from jaxvib.steady.jams.folds import fold_points
+from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, is_stiff, steps_for
-from jaxvib.steady.orbits.orbit import OrbitStatus, light_rotor_speed, orbits
+from jaxvib.steady.orbits.orbit import OrbitStatus, orbits
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:

@@ -22,11 +22,11 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together
-from jaxvib.steady.jams.folds import fold_points, piece_modes, without_ripples
+from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import is_stiff, steps_for
-from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, light_rotor_speed, numbers_of, orbits
+from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, numbers_of, orbits
 from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, number, traced
 

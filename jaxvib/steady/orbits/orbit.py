@@ -11,16 +11,13 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.collected import CollectedModel
-from jaxvib.equations.linear import JammedModel
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
-from jaxvib.numerics.roots import bracketed_root
 from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import rotor_speed_at
 from jaxvib.steady.orbits.collocation import (
     Harmonics,
     Parameter,
@@ -36,7 +33,7 @@ from jaxvib.units import count
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
 
-__all__ = ["Orbit", "OrbitStatus", "light_rotor_speed", "orbits"]
+__all__ = ["Orbit", "OrbitStatus", "orbits"]
 
 
 _MAX_STEPS = 2**17
@@ -198,24 +195,6 @@ def _relative_amplitude(orders: tuple[int, ...], displacement: Array, i: int, j:
 @cached
 def _force_peaks(orders: tuple[int, ...], force: Array) -> Array:
     return _peaks(np.asarray(orders), force[0])
-
-
-def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
-    """Where the rotor's speed starts from at a load speed (rad/s): that of light loads, see `jam_rotor_speed`.
-
-    Where the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
-    it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
-    """
-    if model.carrier.gyroscopic is None:
-        return rotor_speed_at(model, omega)
-
-    def residual(n: Array) -> Array:
-        return n - rotor_speed_at(model, omega, n)
-
-    speeds = omega * (1.0 + np.append(0.0, np.logspace(-6.0, 4.0, 120)))
-    above = jax.vmap(residual)(speeds) > 0.0
-    first = jnp.maximum(jnp.argmax(above), 1)
-    return bracketed_root(residual, speeds[first - 1], speeds[first])
 
 
 def orbits(

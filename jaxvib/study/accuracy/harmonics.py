@@ -22,8 +22,8 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
-from jaxvib.steady.orbits.orbit import light_rotor_speed
 from jaxvib.units import Number, number
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.steady.jams.folds import jam_rotor_speed
+from jaxvib.steady.jams.folds import jam_rotor_speed, light_rotor_speed
 from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution, periodic_motion
-from jaxvib.steady.orbits.orbit import _least_push, light_rotor_speed
+from jaxvib.steady.orbits.orbit import _least_push
 
 
 def different():
