@@ -134,7 +134,7 @@ def synthesize(
         raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
     tell("checking", 0.9)
     verify = verify and bool(kept[best])
-    run, unverified = _run(scene, mode, verify)
+    run, unverified = _run(scene, mode, verify) if kept[best] else (None, "the machine does not meet all demands")
     other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
     rows = _table(space, scene, named, told[:2, : len(named)], other)
     n = len(_standard(scene, mode, objective.of))

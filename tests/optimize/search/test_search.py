@@ -61,6 +61,7 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     total_off = sum(limit.broken * abs(limit.limit) for limit in broken)
     np.testing.assert_allclose(total_off, 1e4, rtol=1e-4)
     assert "not met" in "\n".join(best.said())
+    assert best.unverified == "the machine does not meet all demands" and best.run is None
     with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
         found(space, NEAREST, subject_to=demands)
 

@@ -123,3 +123,11 @@ def test_what_users_give_is_read():
     for wrong in ("drive.speed", "machine.kind", "machine", "effects.mass", 3):
         with pytest.raises(jv.InputError, match="must name numbers of a scene"):
             total(wrong)
+
+
+def test_a_mode_is_not_followed_to_another_one(modes):
+    """From the speed of mode 4, where the branch falls: mode 3 lies where it rises."""
+    key = ((), ("jam", 3))
+    near = {mode: Answers(SCENE, {key: modes.select(mode).omega}) for mode in (3, 4)}
+    np.testing.assert_allclose(near[3].orbit(3).omega, jv.jam_orbit(SCENE, mode=3).omega, rtol=1e-9)
+    assert np.isnan(near[4].jam(3).omega)

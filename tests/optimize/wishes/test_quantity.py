@@ -154,3 +154,8 @@ def test_hertz_and_radians_per_second_are_not_compared():
 def test_an_acceleration_is_compared_across_radians():
     size, speed = constant("size", 2e-3, "m"), constant("speed", 100.0, "rad/s")
     assert (size * speed**2 < "2 m/s^2").constant == 2.0
+
+
+def test_comparisons_make_demands_of_their_sense():
+    for demand, sense in ((A < 3.0, "at most"), (A <= 3.0, "at most"), (A > 3.0, "at least"), (A >= 3.0, "at least")):
+        assert demand.sense == sense and demand.constant == 3.0 and demand.words == f"a {sense} 3"
