@@ -141,23 +141,33 @@ def stability_chart(
     unit: SpeedUnit = "rad/s",
     ax: Axes | None = None,
 ) -> Drawn:
-    """Where `stable` (n, P) over load speed `omega` (n, P) rad/s, drawn in `unit`, and another number (n,), with marks (k,
-    2) by kind.
+    """Draw a band for each value (n,), shaded at the load speeds `omega` (n, P), rad/s, that are `stable` (n, P), with marks
+    (k, 2) by kind; speeds in `unit`.
     """
-    figure, (axes,) = panels(1, size=(7.5, 4.5), ax=ax)
-    height = np.broadcast_to(value[:, None], omega.shape)
-    if value.size > 1:
-        axes.contourf(speed_scale(unit) * omega, height, stable.astype(float), levels=[0.5, 1.5], colors=["#cfe3d6"])
-        if value[0] > 0.0 and value[-1] > 3.0 * value[0]:
-            axes.set_yscale("log")
-            log_ticks(axes)
+    figure, (axes,) = panels(1, size=(7.5, 5.0), ax=ax)
+    logarithmic = value[0] > 0.0 and value[-1] > 3.0 * value[0]
+    edges = np.exp(_edges(np.log(value))) if logarithmic else _edges(value)
+    for speeds, is_stable, low, high in zip(omega, stable, edges[:-1], edges[1:], strict=True):
+        axes.fill_between(speed_scale(unit) * speeds, low, high, where=is_stable, color="#cfe3d6", lw=0.0)
+    axes.set_ylim(edges[0], edges[-1])
+    if logarithmic:
+        axes.set_yscale("log")
+        log_ticks(axes)
     for (kind, points), color, shape in zip(marks.items(), COLORS, itertools.cycle("os^D"), strict=False):
-        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind, clip_on=False)
+        axes.plot(speed_scale(unit) * points[:, 0], points[:, 1], shape, color=color, ms=4.0, label=kind)
     axes.plot([], [], "s", color="#cfe3d6", ms=9.0, label="stable")
     axes.set_xlabel(f"speed of loads, {unit}")
     axes.set_ylabel(label)
-    legend_above(axes)
+    legend_above(axes, 1)
     return figure if ax is None else ax
+
+
+def _edges(places: np.ndarray) -> np.ndarray:
+    """Edges (n + 1,) of bands around ascending places (n,), in the middle between neighbours."""
+    if places.size == 1:
+        return places[0] + max(abs(float(places[0])), 1.0) * np.array([-0.1, 0.1])
+    between = (places[:-1] + places[1:]) / 2.0
+    return np.concatenate([[2.0 * places[0] - between[0]], between, [2.0 * places[-1] - between[-1]]])
 
 
 def audit_chart(

@@ -49,7 +49,8 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
                 heads.append(f"{part}{head} ({own})" if own else part + head)
                 rows.append(numbers)
     if not rows:
-        raise InputError("axis", f"is {axis!r}; {type(result).__name__} holds nothing along it")
+        there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
+        raise InputError("axis", f"is {axis!r}; the axes of {type(result).__name__} are: {', '.join(there) or 'none'}")
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -83,7 +83,7 @@ def envelope(
     run = jv.envelope(loaded, until, start=begin, mode=mode, spin_up=spin_up, stepsize_controller=steps)
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
-    output.csv(csv, run, "time")
+    output.csv(csv, run, "trajectory_time")
     document = {**measured_document(run, loaded), "ripple": run.ripple}
     output.done(document, run.summary, "envelope", run)
 
