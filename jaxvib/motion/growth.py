@@ -19,7 +19,7 @@ from jaxvib.motion.integrate import wrap_angles
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import Start, initial_state, whole_state
-from jaxvib.motion.steps import Tolerance
+from jaxvib.motion.steps import Tolerance, require_known
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, member, status_name
@@ -129,6 +129,7 @@ def growth(
 
     Source: Benettin, Galgani, Giorgilli, Strelcyn 1980.
     """
+    require_known(scene, "growth", "jam_orbit or simulate")
     scene = checked(scene)
     if not scene.drive.constant:
         raise InputError(

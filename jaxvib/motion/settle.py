@@ -18,7 +18,7 @@ from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, simulate, whole_turns
 from jaxvib.motion.start import APART, Start, initial_state, whole_state
-from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
+from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former, require_known
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
@@ -90,6 +90,7 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
+    require_known(scene, "settle", "jam_orbit or simulate")
     scene = checked(scene)
     if not scene.drive.constant:
         raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed: use ConstantSpeed")

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxvib.errors import InputError
 from jaxvib.imported import code_state
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import beneath, traced
@@ -70,7 +71,18 @@ class CachedFunction(Generic[P, T]):
         moved = [leaf for leaf in leaves if traced(leaf)]
         if not moved:
             return self.stored(leaves, treedef)
-        leaves = arrays_on_device(leaves)
+        try:
+            return self._transformed(moved, arrays_on_device(leaves), treedef, args, kwargs)
+        except TypeError as error:
+            if "forward-mode" not in str(error):
+                raise
+            # JAX's own words for a reverse derivative of the step-replay adjoint, which is the default of time integration.
+            raise InputError(
+                "adjoint", "allows reverse derivatives only; for jvp and jacfwd of a run write adjoint=diffrax.ForwardMode()"
+            ) from error
+
+    def _transformed(self, moved: Sequence[Any], leaves: Sequence[Any], treedef: Any, args: Any, kwargs: Any) -> T:
+        """The function of arguments some of which, `moved`, JAX is transforming."""
         if HAS_RULES and program_folder() is not None and not is_debugging() and all(map(_is_simple, moved)):
             question = _Question(self, Skeleton.of(leaves, treedef))
             if question.is_describable():

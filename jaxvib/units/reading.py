@@ -126,6 +126,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
             return magnitude * factor
         return _magnitude(_quantity(magnitude, written, value, unit, field), unit, field, value)
     if isinstance(value, Quantity):
+        if not hasattr(value, "units"):  # not pint's: it converts by itself
+            return value.m_as(unit or "dimensionless")
         return _magnitude(value, unit, field, str(value))
     require_real(value, unit, field)
     return value

@@ -37,8 +37,18 @@ def test_a_run_as_csv_is_its_trajectory(typed, tmp_path, monkeypatch):
     assert code == 2 and "--csv goes without --window, which keeps no trajectory to write" in err
     code, _, err = typed("simulate", "machine.toml", "--until", "0.5s", "--csv", "none/run.csv")
     assert code == 2 and "none/run.csv" in err and "cannot be written" in err
-    with pytest.raises(jv.InputError, match="axis is 'point'; Run holds nothing along it"):
+    with pytest.raises(jv.InputError, match=r"axis is 'point'; the axes of Run are: .*time"):
         jv.write_csv(kept, "point", tmp_path / "none.csv")
+
+
+def test_an_envelope_as_csv_is_its_trajectory(typed, tmp_path):
+    code, _, err = typed("envelope", "machine.toml", "--until", "1s", "--csv", "run_up.csv")
+    assert code == 0, err
+    head, *rows = read(tmp_path / "run_up.csv")
+    kept = jv.envelope(jv.load_scene("machine.toml"), "1s").trajectory
+    at = [head.index(f"trajectory_{name}") for name in ("time (s)", "amplitude y2 (m)", "rotor_speed (rad/s)")]
+    numbers = np.array(rows, dtype=float)[:, at]
+    np.testing.assert_allclose(numbers, np.stack([kept.time, kept.amplitude[:, 1], kept.rotor_speed], axis=1), rtol=1e-8)
 
 
 def test_branches_as_csv(typed, tmp_path):

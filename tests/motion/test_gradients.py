@@ -246,3 +246,26 @@ def test_every_gradient_through_time_is_the_finite_difference():
     scale = jnp.max(jnp.abs(forward), axis=1, keepdims=True)
     np.testing.assert_allclose(forward / scale, difference / scale, atol=1e-3)
     np.testing.assert_allclose(relative(forward), relative(jax.jacfwd(from_algebra)(x)), atol=10 * EPS)
+
+
+def of_stiffness(question):
+    """A function of one mass' stiffness, and the stiffness."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
+    k = scene.machine.stiffness
+    return lambda x: question(eqx.tree_at(lambda s: s.machine.stiffness, scene, x)), k
+
+
+@pytest.mark.parametrize("question", [lambda s: jv.simulate(s, 0.2).omega, lambda s: jv.envelope(s, 0.5).omega])
+def test_forward_derivatives_say_which_adjoint_they_need(question):
+    function, k = of_stiffness(question)
+    with pytest.raises(jv.InputError, match=r"adjoint .* write adjoint=diffrax.ForwardMode\(\)"):
+        jax.jvp(function, (k,), (k,))
+
+
+@pytest.mark.parametrize("transformation", [jax.jit, jax.grad, lambda f: lambda x: jax.vmap(f)(x[None])])
+@pytest.mark.parametrize("question", [lambda s: jv.settle(s).omega, lambda s: jv.growth(s, 5.0).rate])
+def test_what_decides_in_python_says_so_under_jax(question, transformation):
+    function, k = of_stiffness(lambda s: question(s).sum())
+    with pytest.raises(jv.InputError, match="transform jam_orbit or simulate instead"):
+        transformation(function)(k)

@@ -133,8 +133,16 @@ def stability_onset(
         return any(point.kind == kind for point in diagram.special)
 
     low, high = between
-    if not 0.0 < low < high or there(low) or not there(high):
-        raise InputError("between", f"is {between!r}; there must be no {kind} at the lower value and one at the upper value")
+    if not 0.0 < low < high:
+        raise InputError("between", f"is {between!r}; it must be two positive values, the lower one first")
+    for x, is_wanted in ((low, False), (high, True)):
+        if there(x) != is_wanted:
+            found, wanted = ("no", "a") if is_wanted else ("a", "no")
+            raise InputError(
+                "between",
+                f"is {between!r}; at {x:g} the diagram has {found} {kind} and must have {wanted}: "
+                f"{'raise' if is_wanted else 'lower'} this value (stability_map shows the special points)",
+            )
     while high / low > 1.0 + accuracy:
         middle = (low * high) ** 0.5
         low, high = (low, middle) if there(middle) else (middle, high)

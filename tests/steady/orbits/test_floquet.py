@@ -14,9 +14,10 @@ from scipy.integrate import solve_ivp
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.steady.orbits.diagram import SpecialPoint
 from jaxvib.steady.orbits.floquet import _deflated, _small_solve
 from jaxvib.steady.orbits.jam_orbit import _is_stiff
-from jaxvib.study.maps.stability_onset import stability_onset
+from jaxvib.study.maps.stability_onset import StabilityMap, stability_onset
 from jaxvib.study.stress.motions import multipliers
 from jaxvib.study.stress.plain import plain
 
@@ -119,6 +120,30 @@ def test_figure_of_stability_over_the_load_mass():
     assert found.plot(label="eps").axes[0].get_ylabel() == "eps"
     with pytest.raises(jv.InputError, match="ascending"):
         jv.stability_map(lambda x: published(eps=x).scene(), [0.05, 0.02], omega=(0.36, 0.5))
+
+
+def test_bands_of_the_stability_map_are_its_rows():
+    """Each value has a band up to the middle to its neighbours, in the logarithm; the legend fits into the figure."""
+    value, omega = np.array([0.1, 1.0]), np.tile(np.linspace(1.0, 5.0, 9), (2, 1))
+    found = StabilityMap(
+        value,
+        omega,
+        omega > np.array([[2.75], [3.75]]),
+        ((SpecialPoint("torus", 2.75, 9.0),), ()),
+    )
+    axes = found.plot().axes[0]
+    boxes = [band.get_paths()[0].get_extents() for band in axes.collections]
+    edge = np.sqrt(0.1)
+    np.testing.assert_allclose([[b.x0, b.x1, b.y0, b.y1] for b in boxes], [[3, 5, edge / 10, edge], [4, 5, edge, edge * 10]])
+    axes.figure.canvas.draw()
+    legend, whole = axes.get_legend().get_window_extent(), axes.figure.bbox
+    assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1 and axes.get_window_extent().width > 0.7 * whole.width
+
+
+@pytest.mark.parametrize(("between", "says"), [((0.06, 0.08), "0.06 the diagram has a torus"), ((0.01, 0.02), "has no torus")])
+def test_an_onset_says_which_end_is_wrong(between, says):
+    with pytest.raises(jv.InputError, match=says):
+        jv.stability_onset(lambda x: published(eps=x).scene(), "torus", between, omega=(0.36, 0.5), points=60)
 
 
 @pytest.mark.slow

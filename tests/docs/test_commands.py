@@ -1,0 +1,104 @@
+"""The command lines of README and documentation are ones that the command line takes, and run."""
+
+import pathlib
+import re
+import shlex
+import shutil
+
+import click
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.cli.app import app, run
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def printed():
+    """{command line: the page it is on first}, of blocks, and of code within sentences that has arguments."""
+    found = {}
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        lines = re.findall(r"^\s*(?:\$ )?(jaxvib [^\n]+)$", text, flags=re.M)
+        spans = [" ".join(span.split()) for span in re.findall(r"`(jaxvib [a-z-]+ [^-`][^`]*)`", text)]
+        for line in (*lines, *spans):
+            command = re.sub(r"\s+#.*", "", line).strip()
+            found.setdefault(command, page.stem)
+    return found
+
+
+COMMANDS = printed()
+CALLED = {"two-mass": "machine", "sweep": "study", "measurement": "swing"}
+FAST = ("new", "describe", "sketch", "modes", "whirl", "envelope")
+
+
+def words_of(line):
+    """The arguments of a command, and the file that its output goes to."""
+    words = shlex.split(line)[1:]
+    return (words[: words.index(">")], words[-1]) if ">" in words else (words, None)
+
+
+def test_the_documentation_has_command_lines():
+    assert len(COMMANDS) > 40 and {words_of(line)[0][0] for line in COMMANDS} == set(app.list_commands(None))
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+def test_printed_options_are_those_of_the_command(line):
+    (name, *arguments), _ = words_of(line)
+    command = app.get_command(click.Context(app), name)
+    command.make_context(name, arguments, parent=click.Context(app))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with what the documentation's commands refer to."""
+    folder = tmp_path_factory.mktemp("commands")
+    for name in ("two-mass", "rotor", "torus", "design", "sweep", "measurement"):
+        (folder / f"{CALLED.get(name, name)}.toml").write_text(template(name))
+    shutil.copytree(ROOT / "examples", folder / "examples")
+    return folder
+
+
+def template(name):
+    with pytest.MonkeyPatch.context() as patch:
+        said = []
+        patch.setattr(click, "echo", lambda text="", **_: said.append(str(text)))
+        assert run(["new", name]) == 0
+    return "\n".join(said) + "\n"
+
+
+def answered(line, folder, monkeypatch, capsys):
+    words, target = words_of(line)
+    monkeypatch.chdir(folder)
+    code = run(words)
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    if target is not None:
+        (folder / target).write_text(out)
+
+
+@pytest.mark.parametrize("line", [line for line in COMMANDS if words_of(line)[0][0] in FAST])
+def test_printed_command_runs(line, folder, monkeypatch, capsys):
+    answered(line.replace('"10 min"', "2s"), folder, monkeypatch, capsys)
+
+
+@pytest.mark.slow
+def test_all_printed_commands_run_one_after_the_other(folder, monkeypatch, capsys):
+    """In the order of the documentation: some read what others wrote."""
+    run_of = jv.simulate(jv.load_scene(folder / "machine.toml"), "6 s")
+    for place in ("out", "out/simulate"):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+        run_of.save(folder / place / "run.npz")
+    record(folder / "swing.csv")
+    for line in COMMANDS:
+        if words_of(line)[0][0] != "explore":  # serves until it is interrupted, see tests/explore/test_serve.py
+            answered(line, folder, monkeypatch, capsys)
+
+
+def record(path):
+    """The record of a swing with viscous friction only, in degrees."""
+    t = np.linspace(0.0, 20.0, 2001)
+    swing = np.stack([t, 10.0 * np.exp(-0.05 * t) * np.cos(6.0 * t)], axis=1)
+    np.savetxt(path, swing, delimiter=",", header="time (s), angle (deg)", comments="")
