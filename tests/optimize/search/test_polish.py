@@ -204,10 +204,10 @@ def test_the_size_of_an_objective_that_is_nothing_comes_from_its_slope():
 
 
 def test_the_last_step_is_taken_where_rounding_hides_its_fall():
-    """x^2 + y^2 along x + y = 7 at 1.5e-8 from its least value: the fall is 2e-17 of it, the slope still shows the way."""
+    """x^2 + y^2 along x + y = 7 at some 1e-8 from its least value: the fall is 1e-17 of it, the slope still shows the way."""
     squares = plain("squares", lambda x, y: x**2 + y**2)
-    problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), squares, [], starts=2)
-    start = at(problem, (3.5 + 1.5e-8, 3.5 - 1.5e-8), (3.5 - 1.5e-8, 3.5 + 1.5e-8))
+    problem = problem_of(DesignSpace(SCENE, FREE, [hold(SUM, 7.0)]), squares, [], starts=16)
+    start = at(problem, *((3.5 + off, 3.5 - off) for off in 1e-9 * np.arange(3.0, 35.0, 2.0)))
     ended = polish(problem, start, 4, lambda *_: None)
     np.testing.assert_allclose(xy(ended.point), 3.5, rtol=1e-13)
     assert np.all(ended.violation < 1e-14)
