@@ -40,6 +40,18 @@ def test_cma_finds_the_deepest_of_many_valleys(valleys):
     assert best.history.shape[1] == best.starts and best.plot().axes
 
 
+def test_cma_searches_a_single_free_number():
+    """The deepest of a dozen valleys, at 6e4 N/m."""
+
+    def rugged(s):
+        x = (s.machine.stiffness[0] - 6e4) / 1e4
+        return x**2 + 4.0 * jnp.sin(5.0 * x) ** 2
+
+    best = found(DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4)}), Quantity("rugged", "", rugged))
+    np.testing.assert_allclose(best.after.parameters["machine.stiffness[0]"], 6e4, rtol=1e-6)
+    assert best.status_name == "done" and best.designs.shape[1] == 1
+
+
 def test_cma_keeps_demands_and_what_is_held():
     best = found(DesignSpace(SCENE, FREE), NEAREST, subject_to=[SUM < "90 N/mm", FIRST < 4.5e4])
     np.testing.assert_allclose(best.after.parameters["machine.stiffness"], [4.5e4, 4.5e4], rtol=1e-6)
