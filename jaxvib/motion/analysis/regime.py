@@ -34,6 +34,10 @@ _SAME_SPEED = 3e-3
 _LOCKED = 0.1
 """Relative phases that move by less than this between two halves of the window count as fixed, rad."""
 
+_STEADY_SLIP = 0.02
+"""Slips of a load behind the rotor in two halves of the window that differ by less, relative, count as one: the load is jammed,
+however small its slip is."""
+
 _BALANCED = 0.02
 """Residual unbalance below which loads count as balancing the rotor, relative to the loads' own at one angle."""
 
@@ -130,7 +134,8 @@ def regime(scene: Scene, stretch: Trajectory) -> Regime:
     """Names the motion over a stretch of a run of `scene`, such as `run.window`.
 
     Loads that go round by less than a turn swing. Loads whose mean speed differs from the rotor's by less than 0.3 % turn with
-    it, balanced where loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about the tilts
+    it, unless they fall behind steadily: by more than 0.1 rad over the stretch, and by the same slip, to 2 %, in both halves.
+    They are balanced where loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about tilts
     where there are stations). Loads at one other speed, their relative phases fixed, are jammed. A speed that changes by more
     than 0.3 % of the rotor's from one half of the stretch to the other is not steady.
 
@@ -162,7 +167,10 @@ def _regime(scene: Scene, stretch: Trajectory) -> Regime:
     change = jnp.max(jnp.abs(late - early)[:-1]) / reference
     steady = change < _SAME_SPEED
     swings = jnp.max(phi, axis=0) - jnp.min(phi, axis=0) < 2.0 * jnp.pi
-    with_rotor = jnp.abs(speed - rotor) < _SAME_SPEED * reference
+    slips = [speeds[:-1] - speeds[-1] for speeds in (early, late)]
+    behind = jnp.abs(phi[-1] - phi[0] - (turn[-1] - turn[0])) > _LOCKED
+    behind = behind & (jnp.abs(slips[1] - slips[0]) < _STEADY_SLIP * jnp.abs(slips[1] + slips[0]) / 2.0)
+    with_rotor = (jnp.abs(speed - rotor) < _SAME_SPEED * reference) & ~behind
     # Relative to the first load: exp(i k (phi_j - phi_1)), averaged; how far apart the halves' averages are says whether fixed.
     to_first, moved = _relative(phi - phi[:, :1], half)
     to_rotor, slid = _relative(phi - turn[:, None], half)

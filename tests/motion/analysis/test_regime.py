@@ -11,6 +11,7 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
+from jaxvib.motion.analysis.regime import _caught
 from jaxvib.study.maps.published_rotor import published_rotor
 
 TIME = jnp.linspace(0.0, 1.0, 801)
@@ -51,7 +52,10 @@ CASES = {
         None,
         0,
     ),
-    "hardly slower than the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=0.9975 * 460.0), "unbalanced", "together", 0),
+    "steadily slower than the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=0.9971 * 460.0), "jammed", "together", 5),
+    "hardly slower than the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=460.0 - 0.09), "unbalanced", "together", 0),
+    "gaining on the rotor": (dict(phase=[0.0, 0.0, 0.1, 0.1], speed=0.9971 * 460.0, slow=0.4), "unbalanced", "together", 0),
+    "below half the first resonance": (dict(phase=[0.0, 0.1, -0.1, 0.05], speed=80.0), "jammed", "together", 1),
     "parted": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=[170.0, 170.0, 460.0, 460.0]), "parted", None, 0),
     "unsettled": (dict(phase=[0.0, 0.0, 0.0, 0.0], speed=200.0, slow=5.0), "unsettled", None, 0),
 }
@@ -177,3 +181,40 @@ def test_the_moment_that_is_left_is_told_relative_to_the_radius_of_gyration():
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.0))
     found = jv.regime(jv.Scene(machine, s.loads, s.drive, (jv.MomentImbalance(2e-5),)), motion)
     np.testing.assert_allclose(found.unbalance, 2e-5 / (4 * 0.05 * 0.08 * np.sqrt(0.479 / 37.0)), rtol=1e-9)
+
+
+def test_a_jam_close_to_the_rotors_speed_is_a_jam():
+    """An exact one, whose slip of 0.29 % balances drag and vibration."""
+    loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=2.8)
+    s = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0), loads, jv.ConstantSpeed(60.0))
+    orbit = jv.jam_orbit(s, mode=3)
+    assert 0.9965 < float(orbit.omega) / 60.0 < 0.9975
+    run = jv.simulate(s, 20.0, start=jv.State(*orbit.at(jnp.zeros(()))), save="window", estimate=False)
+    np.testing.assert_allclose(run.omega, orbit.omega, rtol=1e-7)
+    assert run.regime.label == "jammed" and int(run.regime.mode) == 3
+
+
+@pytest.mark.parametrize(
+    ("rotor", "caught"),
+    [(0.84, False), (0.86, True), (1.01, True), (1.03, False), (1.69, False), (1.95, True), (2.84, True), (2.86, False)],
+)
+def test_a_motor_is_caught_below_a_resonance_and_its_speed(rotor, caught):
+    """Resonances at 1, 2 and 3; the motor without a load turns at 3, so that from 2.85 on it is at its own speed."""
+    drive = jv.DCMotor(3.0, stall_torque=2.0, inertia=0.05)
+    natural = jnp.asarray([1.0, 2.0, 3.0])
+    assert bool(_caught(with_motor(drive), natural, jnp.asarray(rotor))) == caught
+    assert not bool(_caught(with_motor(jv.ConstantSpeed(3.0)), natural, jnp.asarray(rotor)))
+
+
+@pytest.mark.parametrize(("tilts", "label"), [(1.0, "balanced"), (0.0, "unbalanced"), (-1.0, "unbalanced")])
+def test_loads_beside_the_mass_centre_balance_a_tilted_rotor_only(tilts, label):
+    """Loads 0.05 m from an imbalance U tilt the rotor, unless its principal axis leans by 0.05 U: the carrier then rests."""
+    unbalance, place = 4.0 * 0.05 * 0.08 * 0.5, 0.05
+    effects = (jv.StaticImbalance(unbalance, np.pi), jv.MomentImbalance(tilts * place * unbalance, np.pi))
+    phase = jnp.asarray([1.0, -1.0, -1.0, 1.0]) * jnp.pi / 3.0
+    s, motion = made(phase, 460.0, effects=effects)
+    s = jv.Scene(eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(place)), s.loads, s.drive, effects)
+    start = jv.State(jnp.zeros(4), jnp.zeros(4), (phase,), (jnp.full(4, 460.0),))
+    pushed = float(jnp.max(jnp.abs(jv.vector_field(s)(0.0, start).velocity)))
+    assert (pushed < 1e-9) == (label == "balanced")
+    assert jv.regime(s, motion).label == label
