@@ -42,7 +42,7 @@ def test_identify_from_the_command_line(typed, tmp_path):
         (("swing.csv",), 2, "pendulum.mass is missing; needed here: mass, length"),
         (("swing.csv", "--mass", "3 s", "--length", "1"), 2, "pendulum.mass is '3 s', which is not in kg"),
         (("none.csv", "--mass", "1", "--length", "1"), 2, "none.csv cannot be read"),
-        (("m.toml", "--columns", "a,b"), 2, "swing.csv has no column 'a' for the time; its columns are time, angle"),
+        (("m.toml", "--columns", "a,b"), 2, "swing.csv has no column 'a' for the time; its columns are time (s), angle (deg)"),
         (("m.toml", "--columns", "a"), 2, "record.columns is ['a']; write the names of two columns"),
         (("m.toml", "--angle-unit", "rad"), 2, "more than a full turn; if these are degrees"),
         (("m.toml", "--from", "19.9 s"), 2, "has 2 samples from 19.9 s to inf s"),

@@ -77,7 +77,7 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
         **fields_of(found, "frequency", "offset"),
         "inertia": pendulum.total_inertia,
         "inertia_by_frequency": found.inertia,
-        **fields_of(found, "noise", "pattern", "stopped_at"),
+        **fields_of(found, "noise", "pattern", "structure", "until", "stopped_at"),
         "samples": swing.samples,
         "instrument": instrument,
     }
@@ -90,10 +90,12 @@ def identify(record: Path, output: Output, **given: str | bool | None) -> None:
             rows.append(_row(f"mu1 by the formula of {ten.periods} periods, N m s", ten.viscous))
         rows.append(_row("frequency of small swings, rad/s", found.frequency))
         rows.append(_row("zero of the record, rad", found.offset))
+        holds = found.status_name in ("found", "undetermined")
+        meaning = "an interval holds the number with 95 %" if holds else "intervals count noise alone"
         lines = [
             f"{swing.name}: {swing.samples} samples, noise {found.noise:.3g} rad",
             f"{found.status_name}: {found.message}",
-            table("friction of the bearing; an interval holds the number with 95 %", ["", "value", "from", "to"], rows),
+            table(f"friction of the bearing; {meaning}", ["", "value", "from", "to"], rows),
         ]
         if found.dry is not None:
             lines.append(f"errors of mu1 and mu2 are correlated by {found.correlation:.3f}")

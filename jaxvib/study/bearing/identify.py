@@ -223,6 +223,12 @@ def _judged(
     if samples < record.samples:
         notes.append(f"the record after {until:.4g} s is left out: the pendulum rests, or its swing is below the noise")
 
+    structured = float(fit.noise) > 10.0 * TOLERANCE and (abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE)
+    if structured:
+        notes.append("what the fit leaves is no noise: the intervals count noise alone and are too narrow")
+    if decrement is not None and decrement.is_drifting:
+        notes.append("the formula of ten periods is for viscous friction alone: its interval does not hold mu1 here")
+
     status = IdentifyStatus.found
     if not bool(fit.converged) or float(fit.noise) > 0.5 * float(np.std(record.angle[used])):
         status = IdentifyStatus.not_converged
@@ -232,7 +238,7 @@ def _judged(
         status = IdentifyStatus.undetermined
     elif abs(frequency.value / small - 1.0) > _CONTRADICTS + instrument:
         status = IdentifyStatus.contradicted
-    elif float(fit.noise) > 10.0 * TOLERANCE and (abs(pattern) > 4.0 / math.sqrt(samples) or chance < _STRUCTURE):
+    elif structured:
         status = IdentifyStatus.patterned
     return Identified(
         status=status,

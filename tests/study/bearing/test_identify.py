@@ -32,7 +32,7 @@ def test_records_that_end_at_rest_hold_both_frictions(degrees, dry):
         held += found.viscous.low < 5e-4 < found.viscous.high and found.dry.low < dry < found.dry.high
         assert found.status_name == "found" and found.dry.value > 0.0
         assert found.viscous.value > 0.0 or any("mu1 cannot be told from 0" in note for note in found.notes)
-        assert not stop < 17.0 or (found.until < stop and "left out" in found.notes[-1])
+        assert not stop < 17.0 or (found.until < stop and any("left out" in note for note in found.notes))
     assert held >= 3
 
 
@@ -52,7 +52,7 @@ def test_what_comes_before_the_release_is_left_out():
     ],
 )
 def test_another_law_is_seen_in_what_the_fit_leaves(law, degrees, note):
-    t = np.arange(0.0, 40.0, 0.1)
+    t = 0.05 * np.arange(800)
     clean, _ = scipy_swing(ROD, t, np.deg2rad(degrees), 0.0, 5e-4, **law)
     for seed in range(2):
         found = jv.identify(ROD, jv.Record(t, noisy(clean, 2e-3, seed)))
@@ -61,7 +61,7 @@ def test_another_law_is_seen_in_what_the_fit_leaves(law, degrees, note):
 
 
 def test_noise_alone_has_no_structure():
-    t = np.arange(0.0, 40.0, 0.1)
+    t = 0.05 * np.arange(800)
     clean, _ = scipy_swing(ROD, t, 0.3, 0.0, 5e-4)
     found = [jv.identify(ROD, jv.Record(t, noisy(clean, 2e-3, seed))) for seed in range(20)]
     assert {each.status_name for each in found} == {"found"}
