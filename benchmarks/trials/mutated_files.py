@@ -44,9 +44,16 @@ def machine() -> jv.Scene:
 
 def studies(folder: pathlib.Path):
     jv.save_scene(machine(), folder / "machine.toml")
-    (folder / "study.toml").write_text(mutations.STUDY)
-    original = mutations.load_study(folder / "study.toml")
-    return lambda rng: mutations.study_outcome(folder, mutations.mutated_text(mutations.STUDY, rng), original)
+    originals = {}
+    for base in (mutations.STUDY, mutations.STUDY_OF_JAMS, mutations.STUDY_OF_RUNS):
+        (folder / "study.toml").write_text(base)
+        originals[base] = mutations.load_study(folder / "study.toml")
+
+    def one(rng):
+        base = rng.choice(list(originals))
+        return mutations.study_outcome(folder, mutations.mutated_text(base, rng), originals[base], base)
+
+    return one
 
 
 def stores(folder: pathlib.Path):

@@ -137,7 +137,7 @@ class Store:
                 problem = f"{mine[UNKNOWN]}, so that nobody can tell if the numbers in {str(self.path)!r} are its own"
                 raise InputError(f"measure.{name}", f"{problem}; name another store")
         if (found := difference(json.loads(json.dumps(study.record)), self.record)) is not None:
-            name, mine, its = found
+            name, mine, its = found[0].replace(".tuple[", "[").replace(".dict[", "["), *found[1:]
             part = re.split(r"[.\[]", name)[0]
             problem = f"is {str(self.path)!r}, which holds another study: its {part} differs"
             where = "" if part == name else f" ({name} is {_short(its)} there and {_short(mine)} here)"

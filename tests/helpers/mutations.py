@@ -46,6 +46,42 @@ quantity = "static_deflection"
 of = 1
 """
 
+STUDY_OF_JAMS = """
+scene = "machine.toml"
+tier = "leading"
+[axes]
+"drive.speed" = ["600 rpm", "900 rpm"]
+[[measure]]
+quantity = "amplitude"
+mode = 3
+of = [1, 2]
+name = "a"
+[[measure]]
+quantity = "jam_frequency"
+mode = 3
+tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }
+statistic = "worst"
+samples = 4
+[[measure]]
+quantity = "phase"
+mode = 1
+"""
+
+STUDY_OF_RUNS = """
+scene = "machine.toml"
+[axes]
+"drive.speed" = { from = "200 rpm", to = "900 rpm", count = 3 }
+"start.rate" = [0.0, "300 rpm"]
+[run]
+until = "0.5 s"
+start = "rest"
+steps = 400
+[[measure]]
+quantity = "run.regime"
+[[measure]]
+quantity = "run.load_speed"
+"""
+
 WORDS = [
     "nan", "inf", "-1", "0", "1e400", "1" * 400, "1" * 5000, "true", '""', '"x"', "[]", "[2]", '["a"]', "[[1, 2], 3]", "{}",
     "{ a = 1 }", '"..\\u001b[31m"', '"zarr.json"', '"$x^{$"', '".."', '"é"', "1979-05-27", "07:32:00", '"1e5 N"', '"N/m"',
@@ -131,14 +167,14 @@ def leaves(value):
     return [value]
 
 
-def study_outcome(folder, text, original):
-    """Of a mutated study file: refused, or accepted with another identity where a number is another one."""
+def study_outcome(folder, text, original, base=STUDY):
+    """Of a study file mutated from `base`: refused, or accepted with another identity if a number is another one."""
     (folder / "study.toml").write_text(text, encoding="utf-8", errors="surrogateescape")
 
     def ask():
         found = load_study(folder / "study.toml")
         tables = tomllib.loads(text)
-        for each in (tables, before := tomllib.loads(STUDY)):
+        for each in (tables, before := tomllib.loads(base)):
             each.pop("chunk", None)  # how many cases are computed together changes no number
         mine, its = leaves(tables), leaves(before)
         changed = len(mine) == len(its) and any(
