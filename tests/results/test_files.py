@@ -117,7 +117,23 @@ def test_what_no_file_can_hold_is_refused_before_writing(tmp_path, modes):
             _encoded(value, {})
 
 
-def test_a_zip_bomb_is_refused(tmp_path):
+def test_a_changed_array_is_refused(modes, tmp_path):
+    path = modes.save(tmp_path / "modes")
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    name = next(name for name, array in arrays.items() if array.dtype == float and array.size)
+    np.savez(path, **{**arrays, name: arrays[name] + 1.0})
+    with pytest.raises(jv.InputError, match=LOST):
+        jv.load(path)
+    np.savez(path, **arrays)
+    assert type(jv.load(path)) is type(modes)
+    np.savez_compressed(path, **arrays)
+    with pytest.raises(jv.InputError, match=LOST):
+        jv.load(path)
+
+
+def test_a_zip_bomb_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
     path = tmp_path / "bomb.npz"
     zip_bomb(path, 1 << 28)
     assert path.stat().st_size < 1 << 20
@@ -165,6 +181,9 @@ def test_control_characters_never_reach_a_message(tmp_path):
 def test_a_failed_save_leaves_the_old_file_whole(modes, tmp_path, monkeypatch):
     path = modes.save(tmp_path / "modes")
     before = path.read_bytes()
+    with path.open("rb") as old:  # who reads the old file meanwhile reads all of it
+        modes.save(path)
+        assert old.read() == before
 
     def half(file, **arrays):
         file.write(b"half")

@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -183,6 +184,8 @@ def test_every_argument_of_a_study_changes_its_identity(given, others, monkeypat
             assert study(SCENE, **{**given, name: value}).key != before.key, name
     assert dataclasses.replace(before, mode=3).key != before.key or before.plan is None
     assert study(scene("two_mass", "balls", speed=61.0), **given).key != before.key
+    single = eqx.tree_at(lambda s: s.machine.mass, SCENE, SCENE.machine.mass.astype(jnp.float32))
+    assert study(single, **given).key != before.key
 
 
 def test_every_argument_of_a_study_is_tried():
