@@ -1,19 +1,24 @@
-"""How much of a changed equation do the tests see?
+"""Share of changes in the packages that the tests see, folder by folder.
 
-    python benchmarks/trials/mutants.py --count 300 --out out/mutants
-    python benchmarks/trials/mutants.py --count 100 --only optimize ode
+    python benchmarks/trials/mutants.py --count 30 --out out/mutants
+    python benchmarks/trials/mutants.py --folder jaxvib/steady optimize/search --count 30 --seed 1
 
-A mutant is the package with one change in one line: a sign, a factor, an index, a comparison, a sine in place of a cosine, a
-smaller in place of a larger. Mutants are drawn from `jaxvib/equations`, `steady`, `motion` and `ode` and from `optimize`, or
-from `--only` some of these with their tests alone, from every file in proportion to the changes it allows and at least one, by
-a seed and the file's name: a change of one file leaves the mutants of others as they were. Each is given to the tests that
-reach its line, those of its own name first, then of its folder, then the shortest, up to `--seconds` of them by their usual
-time; the first test that fails ends it. Which test reaches which line is measured once, each test file in a process of its own
-(`coverage`).
+A mutant is the package with one change in one line:
+
+- a sign, a factor, an index, a comparison, a sine in place of a cosine, a smaller in place of a larger
+- a term of a sum, a branch of an `if` or a keyword argument of a call that is dropped
+- two neighbouring arguments of a call that are swapped
+
+Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
+in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
+Each is given to the tests that reach its line, those of its own name first, then of its folder, then the shortest, up to
+`--seconds` of them by their usual time; the first test that fails ends it. The lines that a test file reaches are measured once
+for an `--out`, in a process of its own (`coverage`) that traces every program anew; with `--folder` only the test files of
+these folders are measured, unless `--all-tests` is given. Take a new `--out` for changed packages.
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
-What survived is printed with its change, to be explained or killed by a new test. All that is known is kept in `--out`, so
-that a second call goes on where the first was stopped; `--again` runs the survivors anew, after tests were added.
+Survivors are printed with their changes, to be explained or killed by a new test. All results are kept in `--out`, so that a
+second call goes on where the first was stopped; `--again` runs the survivors anew, after tests were added.
 """
 
 from __future__ import annotations
@@ -24,10 +29,11 @@ import collections
 import concurrent.futures
 import copy
 import dataclasses
+import hashlib
+import itertools
 import json
 import os
 import pathlib
-import random
 import shutil
 import subprocess
 import sys
@@ -35,8 +41,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
-FOLDERS = ("jaxvib/equations", "jaxvib/steady", "jaxvib/motion", "jaxvib/ode", "optimize")
-TESTS = tuple(folder.removeprefix("jaxvib/") for folder in FOLDERS)
+PACKAGES = ("jaxvib", "optimize")
 
 OPERATORS: dict[type, type] = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.MatMult: ast.Mult}
 COMPARISONS: dict[type, type] = {
@@ -53,6 +58,9 @@ COMPARISONS: dict[type, type] = {
 }
 PAIRS = (("sin", "cos"), ("minimum", "maximum"), ("min", "max"), ("argmin", "argmax"), ("any", "all"), ("real", "imag"))
 CALLS = {one: other for pair in PAIRS for one, other in (pair, pair[::-1])}
+
+SYMMETRIC = {"minimum", "maximum", "min", "max", "hypot", "logical_and", "logical_or", "isclose", "union", "intersection"}
+"""Functions whose arguments may be swapped."""
 
 FACTORS = (1e-3, 1e3)
 """Smallest and largest factor that is doubled: smaller ones are tolerances, larger ones limits of effort."""
@@ -74,12 +82,21 @@ class Mutant:
     def name(self) -> str:
         return f"{self.file}:{self.line}:{self.start} {self.kind}: {self.old} -> {self.new}"
 
+    @property
+    def folder(self) -> str:
+        """The package's folder that the file is in, or the package itself."""
+        return "/".join(pathlib.Path(self.file).parent.parts[:2])
 
-# --- what can be changed ---
+    def rank(self, seed: int) -> str:
+        """A random text that follows from the seed and the change, but not from its place in the file."""
+        return hashlib.sha256(f"{seed} {self.file} {self.kind} {self.old} {self.new}".encode()).hexdigest()
+
+
+# --- possible changes ---
 
 
 def mutants(file: str, text: str) -> Iterator[Mutant]:
-    """All changes that a file allows, outside docstrings, annotations, messages and what is run for type checkers only."""
+    """All changes that a file allows, outside docstrings, annotations, messages and code for type checkers."""
     starts = [0]
     for line in text.encode().splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -91,7 +108,7 @@ def mutants(file: str, text: str) -> Iterator[Mutant]:
 
 
 def _changes(node: ast.AST, place: str = "") -> Iterator[tuple[ast.expr, str, ast.expr]]:
-    """Changes of a node and of what is in it; `place` says what a number in it is: an index, a factor, or neither."""
+    """Changes of a node and of its parts; `place` tells whether a number in it is an index, a factor, or neither."""
     if isinstance(node, (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom)):
         return
     if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
@@ -102,6 +119,9 @@ def _changes(node: ast.AST, place: str = "") -> Iterator[tuple[ast.expr, str, as
             yield node, "factor", ast.BinOp(node.left, ast.Mult(), node.right)
         elif other is not None:
             yield node, "sign" if isinstance(node.op, (ast.Add, ast.Sub)) else "factor", _with(node, op=other())
+        if isinstance(node.op, (ast.Add, ast.Sub)):
+            yield node, "term", node.left
+            yield node, "term", node.right if isinstance(node.op, ast.Add) else ast.UnaryOp(ast.USub(), node.right)
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and not isinstance(node.operand, ast.Constant):
         yield node, "sign", node.operand
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
@@ -115,6 +135,14 @@ def _changes(node: ast.AST, place: str = "") -> Iterator[tuple[ast.expr, str, as
         if name in CALLS:
             func = _with(node.func, **{"attr" if isinstance(node.func, ast.Attribute) else "id": CALLS[name]})
             yield node, "function", _with(node, func=func)
+        yield from _calls(node, name)
+    elif isinstance(node, ast.If):
+        yield node.test, "branch", ast.Constant(False)
+        if node.orelse:
+            yield node.test, "branch", ast.Constant(True)
+    elif isinstance(node, ast.IfExp):
+        yield node, "branch", node.body
+        yield node, "branch", node.orelse
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
         if place == "index":  # one past the end of a JAX array is its last one
             yield node, place, ast.Constant(node.value - 1 if node.value > 0 else 1)
@@ -131,8 +159,19 @@ def _changes(node: ast.AST, place: str = "") -> Iterator[tuple[ast.expr, str, as
         yield from _changes(child, _place(node, child))
 
 
+def _calls(node: ast.Call, name: str) -> Iterator[tuple[ast.expr, str, ast.expr]]:
+    """The call with two neighbouring arguments swapped, and without each of its keyword arguments."""
+    plain = not any(isinstance(argument, ast.Starred) for argument in node.args) and name not in SYMMETRIC
+    for i, pair in enumerate(itertools.pairwise(node.args) if plain else ()):
+        if ast.dump(pair[0]) != ast.dump(pair[1]):
+            yield node, "argument", _with(node, args=[*node.args[:i], *pair[::-1], *node.args[i + 2 :]])
+    for keyword in node.keywords:
+        if keyword.arg is not None:
+            yield node, "keyword", _with(node, keywords=[one for one in node.keywords if one is not keyword])
+
+
 def _place(node: ast.AST, child: ast.AST) -> str:
-    """A number that stands alone is a limit, a count or a default, and no part of an equation: it is left alone."""
+    """ "index", "factor" or "": a number that stands alone is a limit, a count or a default and stays as it is."""
     if isinstance(node, ast.Subscript) and child is node.slice:
         return "index"
     if isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div, ast.Pow)):
@@ -156,54 +195,80 @@ def _with(node: ast.AST, **fields) -> ast.expr:
     return changed
 
 
-def drawn(count: int, seed: int, reached: dict[str, set[int]], only: Sequence[str]) -> tuple[list[Mutant], dict[str, int]]:
-    """`count` mutants on lines that a test reaches, and how many changes there are on reached and on other lines."""
-    folders = [folder for folder, name in zip(FOLDERS, TESTS, strict=True) if name in only]
-    files = sorted(file for folder in folders for file in (ROOT / folder).rglob("*.py"))
-    possible, total = {}, collections.Counter()
-    for path in files:
-        file = str(path.relative_to(ROOT))
-        found = list(mutants(file, path.read_text()))
-        inside = [one for one in found if one.line in reached.get(file, ())]
-        total["reached"] += len(inside)
-        total["not reached"] += len(found) - len(inside)
-        if inside:
-            possible[file] = random.Random(f"{seed} {file}").sample(inside, len(inside))
-    share = {file: max(1, round(count * len(found) / total["reached"])) for file, found in possible.items()}
-    taken = [one for file, found in possible.items() for one in found[: share[file]]]
-    random.Random(seed).shuffle(taken)
-    return taken, dict(total)
+def drawn(
+    count: int, seed: int, reached: dict[str, set[int]], folders: Sequence[str]
+) -> tuple[list[Mutant], collections.Counter]:
+    """`count` mutants of each folder on lines that a test reaches, and the number of changes on reached and on other lines."""
+    possible, total = collections.defaultdict(list), collections.Counter()
+    for file in sources():
+        for one in mutants(file, (ROOT / file).read_text()):
+            if one.folder in folders:
+                inside = one.line in reached.get(file, ())
+                total["reached" if inside else "not reached"] += 1
+                if inside:
+                    possible[one.folder, one.kind].append(one)
+    taken = []
+    for folder in folders:
+        kinds = [sorted(found, key=lambda one: one.rank(seed)) for (place, _), found in possible.items() if place == folder]
+        mixed = [one for row in itertools.zip_longest(*kinds) for one in row if one is not None]
+        taken += mixed[:count]
+    return sorted(taken, key=lambda one: one.rank(seed)), total
 
 
-# --- which test reaches which line ---
+def sources() -> list[str]:
+    """All files of the packages, relative to the root."""
+    return sorted(str(path.relative_to(ROOT)) for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
-def reach(out: pathlib.Path, workers: int, only: Sequence[str]) -> dict[str, dict]:
-    """For each test file its seconds and the lines it reaches in each file of the package."""
+def all_folders() -> list[str]:
+    """All folders that mutants are counted by, see `Mutant.folder`."""
+    return sorted({"/".join(pathlib.Path(file).parent.parts[:2]) for file in sources()})
+
+
+# --- tests and the lines that they reach ---
+
+
+def test_files(folders: Sequence[str], everything: bool) -> list[str]:
+    """The test files of folders: those in the test folder of the same name, or whose own name begins with it; or all."""
+    files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("test_*.py"))
+    names = {folder.split("/")[0 if folder.startswith("optimize") else -1] for folder in folders}
+    top = [path.stem for package in PACKAGES if package in folders for path in (ROOT / package).glob("*.py")]
+
+    def own(file: str) -> bool:
+        folder, stem = file.split("/")[1], pathlib.Path(file).stem.removeprefix("test_")
+        return folder in names or stem in names or stem in top
+
+    return [file for file in files if everything or own(file)]
+
+
+def reach(out: pathlib.Path, workers: int, tests: Sequence[str]) -> dict[str, dict]:
+    """For each test file its seconds and the lines it reaches in each file of the packages."""
     kept = out / "reach.json"
     known = json.loads(kept.read_text()) if kept.exists() else {}
-    tests = sorted(str(path.relative_to(ROOT)) for folder in only for path in (ROOT / "tests" / folder).rglob("test_*.py"))
 
     def one(test: str) -> None:
-        data = out / f"{pathlib.Path(test).stem}.coverage"
-        report = data.with_suffix(".json")
-        environment = {**os.environ, "COVERAGE_FILE": str(data)}
+        data = out / f"{test.replace('/', '-')}.coverage"
+        report, home = data.with_suffix(".json"), data.with_suffix(".cache")
+        # An empty cache: a program that is read from the disk executes none of the lines that it was traced from.
+        environment = {**os.environ, "COVERAGE_FILE": str(data), "XDG_CACHE_HOME": str(home)}
         coverage = [sys.executable, "-m", "coverage"]
-        command = [*coverage, "run", "--source=jaxvib,optimize", "-m", "pytest", "-p", "no:cacheprovider", test]
+        command = [*coverage, "run", f"--source={','.join(PACKAGES)}", "-m", "pytest", "-p", "no:cacheprovider", test]
         began = time.perf_counter()
         result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         seconds = time.perf_counter() - began
-        if result.returncode != 0:
-            raise SystemExit(f"{test} fails without a change:\n{result.stdout[-3000:]}")
+        shutil.rmtree(home, ignore_errors=True)
+        if result.returncode not in (0, 5):  # 5: all of its tests are slow ones
+            print(f"left out, as it fails without a change: {test}\n{result.stdout[-1000:]}", flush=True)
+            return
         command = [*coverage, "json", "-q", "-o", str(report)]
         subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
         files = json.loads(report.read_text())["files"]
-        lines = {file: sorted(entry["executed_lines"]) for file, entry in files.items() if file.startswith(FOLDERS)}
+        lines = {file: sorted(entry["executed_lines"]) for file, entry in files.items()}
         known[test] = {"seconds": seconds, "lines": {file: found for file, found in lines.items() if found}}
         kept.write_text(json.dumps(known))
         data.unlink()
         report.unlink()
-        print(f"{len(known):3} of {len(tests)} {seconds:6.1f} s {test}", flush=True)
+        print(f"{len(known):3} known, {seconds:6.1f} s {test}", flush=True)
 
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         list(pool.map(one, [test for test in tests if test not in known]))
@@ -231,7 +296,7 @@ def tests_of(mutant: Mutant, known: dict[str, dict], seconds: float) -> tuple[li
     return taken, usual
 
 
-# --- what the tests see ---
+# --- fates ---
 
 
 def tried(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds: float) -> dict:
@@ -243,7 +308,8 @@ def tried(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds
     try:
         path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
         command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *taken]
-        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(copy_of)}
+        home = str(copy_of.with_suffix(".cache"))  # a mutant's programs are of no use to others
+        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(copy_of), "XDG_CACHE_HOME": home}
         result = subprocess.run(
             command, cwd=copy_of, env=environment, capture_output=True, text=True, timeout=3 * usual + 60, errors="replace"
         )
@@ -259,23 +325,25 @@ def tried(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=300, help="mutants to draw (300)")
-    parser.add_argument("--seed", type=int, default=0, help="which ones (0)")
+    parser.add_argument("--folder", nargs="+", choices=all_folders(), default=all_folders(), help="folders to draw from (all)")
+    parser.add_argument("--count", type=int, default=30, help="mutants of each folder (30)")
+    parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
     parser.add_argument("--seconds", type=float, default=180.0, help="tests a mutant is given, by their usual time (180)")
-    parser.add_argument("--only", nargs="+", choices=TESTS, default=TESTS, help="folders to draw from (all)")
+    parser.add_argument("--all-tests", action="store_true", help="measure all test files, not only those of the folders")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of what is known")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of the results")
     asked = parser.parse_args()
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
-    known = reach(out, asked.workers, asked.only)
+    everything = asked.all_tests or asked.folder == all_folders()
+    known = reach(out, asked.workers, test_files(asked.folder, everything))
     reached = collections.defaultdict(set)
     for entry in known.values():
         for file, lines in entry["lines"].items():
             reached[file].update(lines)
-    taken, total = drawn(asked.count, asked.seed, reached, asked.only)
+    taken, total = drawn(asked.count, asked.seed, reached, asked.folder)
     kept = out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
     if asked.again:
@@ -299,11 +367,11 @@ def main() -> None:
     report(taken, fates, total)
 
 
-def report(taken: list[Mutant], fates: dict[str, dict], total: dict[str, int]) -> None:
+def report(taken: list[Mutant], fates: dict[str, dict], total: collections.Counter) -> None:
     """Killed and survived, by folder and by kind of change, and every survivor."""
     print(f"\n{total['reached']} changes are possible on lines that tests reach, {total['not reached']} on others")
     for title, key in (
-        ("folder", lambda one: next(f for f in FOLDERS if one.file.startswith(f))),
+        ("folder", lambda one: one.folder),
         ("kind", lambda one: one.kind),
     ):
         groups = collections.defaultdict(list)
@@ -313,7 +381,7 @@ def report(taken: list[Mutant], fates: dict[str, dict], total: dict[str, int]) -
         for name, killed in sorted(groups.items()):
             print(f"{name:18} {len(killed):7} {sum(killed):6} {100 * sum(killed) / len(killed):5.1f} %")
     alive = [mutant for mutant in taken if fates[mutant.name]["fate"] == "survived"]
-    print(f"\n{len(taken)} mutants, {len(taken) - len(alive)} killed ({100 - 100 * len(alive) / len(taken):.1f} %); survivors:")
+    print(f"\n{len(taken)} mutants, {len(taken) - len(alive)} killed; survivors:")
     for mutant in sorted(alive, key=lambda one: (one.file, one.line)):
         print(f"  {mutant.name}")
 
