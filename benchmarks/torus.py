@@ -1,11 +1,12 @@
 """Captures of balls in a torus: 1000 starts of 2000 turns, beside a native loop in the same run; the paper's tables.
 
     pip install numba
-    python benchmarks/torus.py [--starts 1000] [--turns 2000] [--share 8] [--tables derived printed cosine letter contact]
+    python benchmarks/torus.py [--starts 1000] [--turns 2000] [--share 8] [--tables derived printed "gap lever" contact]
 
 The native loop (parts/native_torus.py) and the engine take the same steps from the same starts; how far apart they end is
 printed. Times are the processor's, of the whole process, since other programs may be running: divide by the number of cores.
-The ratio is measured with a share of the turns. --tables prints the paper's tables by these models (some minutes each).
+The ratio is measured with a share of the turns. --tables prints the paper's tables by these models, by steps that are doubled
+--doublings times at most (some ten minutes of the processor each).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from parts.common import machine_line  # noqa: E402
 
 from jaxvib.study.capture.capture import thrown_state  # noqa: E402
 from jaxvib.study.capture.published_torus import published_torus  # noqa: E402
+from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402
 from jaxvib.study.capture.tables import CONTACT, MODELS, published_tables  # noqa: E402
 
 SCENE = published_torus(2.5)
@@ -62,6 +64,7 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=2000)
     parser.add_argument("--share", type=int, default=8, help="the ratio is measured with this part of the turns")
     parser.add_argument("--tables", nargs="*", choices=list(MODELS), default=[])
+    parser.add_argument("--doublings", type=int, default=DOUBLINGS, help="of the tables' steps, at most")
     options = parser.parse_args()
     print(machine_line())
     speeds = np.linspace(-1.0, -0.1, options.starts // 64 * 64)
@@ -94,7 +97,7 @@ def main() -> None:
             f"{whole:.0f} s of the processor"
         )
     if options.tables:
-        print(published_tables(options.tables).summary())
+        print(published_tables(options.tables, doublings=options.doublings).summary())
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, get_args
@@ -12,18 +13,17 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
-from jaxvib.motion.integrate import added_rate
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import Turning, with_spin
 from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
+from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
@@ -31,16 +31,10 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "steps_per_second", "thrown_state"]
+__all__ = ["CAUGHT", "Capture", "CaptureStatus", "capture", "capture_time", "thrown_state"]
 
 CAUGHT = 3e-3
 """A load whose mean speed differs from the rotor's by less turns with it, as in `regime`."""
-
-PER_RADIAN = 1.0
-"""Steps for each radian of what moves fastest, balls up and down their tube: errors far below those of chance."""
-
-_PER_ADDED = 2.0
-"""Steps for each radian of what effects add, such as a contact between balls: six for a collision."""
 
 _SCAN = 32
 """Initial speeds that are tried side by side where a threshold is looked for."""
@@ -52,6 +46,7 @@ class CaptureStatus(eqx.Enumeration):
     found = "from the threshold up every start was captured"
     all_captured = "every start was captured: the threshold lies below the speeds that were tried"
     none_captured = "not every start at the highest speed was captured: the threshold lies above the speeds that were tried"
+    not_converged = "the last doubling of the steps moved the threshold by more than the distance of the speeds tried there"
 
 
 class Capture(Result):
@@ -62,8 +57,9 @@ class Capture(Result):
     the end; `finite` (S, starts) whether the motion stayed so; `detached` (S, starts) whether a load did not press on its wall
     on the way, where it was kept on it all the same; `threshold`, the least speed from which on all starts were captured,
     halfway to the next lower speed that was tried, and `uncertainty`, half the distance to that speed or to the highest speed
-    at which half of the starts fail, whichever is more, NaN where there is no threshold; `turns` of the rotor that each run
-    took; `status` a `CaptureStatus`.
+    at which half of the starts fail, whichever is more, and at least the move, NaN where there is no threshold; `moved`, by how
+    much the last doubling of the steps moved the threshold, infinite if it appeared or vanished, NaN without a doubling;
+    `steps` and `turns` of the rotor that each run took; `status` a `CaptureStatus`.
 
     Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` says how often.
     """
@@ -74,6 +70,8 @@ class Capture(Result):
     detached: np.ndarray = eqx.field(metadata=in_unit("", "speed", "start"))
     threshold: Array = eqx.field(metadata=in_unit(""))
     uncertainty: Array = eqx.field(metadata=in_unit(""))
+    moved: Array = eqx.field(metadata=in_unit(""))
+    steps: Array = eqx.field(metadata=in_unit(""))
     turns: Array = eqx.field(metadata=in_unit(""))
     status: CaptureStatus
 
@@ -81,6 +79,11 @@ class Capture(Result):
     def fraction(self) -> np.ndarray:
         """The share of starts captured at each speed, (S,)."""
         return np.mean(self.captured, axis=1)
+
+    @property
+    def border(self) -> float:
+        """The threshold, but -1 if every start was captured."""
+        return -1.0 if np.all(self.captured) else float(self.threshold)
 
     @property
     def standard_error(self) -> np.ndarray:
@@ -99,6 +102,8 @@ class Capture(Result):
         """The threshold with its uncertainty, and what stands below it, for a person to read."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
+        doubled = "" if np.isnan(self.moved) else f"; their last doubling moved the threshold by {float(self.moved):.1e}"
+        head += f"\n  {int(self.steps) / int(self.turns):.4g} steps a turn{doubled}"
         if np.any(self.detached):
             share = 100.0 * np.mean(self.detached)
             head += (
@@ -119,13 +124,6 @@ class Capture(Result):
         from jaxvib.draw.capture import threshold_chart  # slow to import: only who draws pays
 
         return threshold_chart(self.speed, self.fraction, self.standard_error, float(self.threshold), ax=ax)
-
-
-def steps_per_second(scene: Scene) -> float:
-    """How many equal steps a second resolve what moves in the tube, and the contacts and slips that effects add."""
-    speed, own = scene.drive.speed, scene.loads.own_frequency(scene.drive.speed)
-    slowest = float(speed) if own is None else float(jnp.max(own))
-    return max(PER_RADIAN * slowest, _PER_ADDED * float(added_rate(scene)))
 
 
 def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> State:
@@ -160,14 +158,16 @@ def capture(
     resolution: float | None = None,
     turning: Turning = "rolling",
     stepsize_controller: EqualSteps | None = None,
+    doublings: int = DOUBLINGS,
     equations: Equations = vector_field,
 ) -> Capture:
-    """From which initial speeds the balls of a torus come to turn with the rotor, and the least such speed.
+    """Find the initial speeds from which the balls of a torus come to turn with the rotor, and the least such speed.
 
     Each speed is tried from `starts` positions of the loads along the ring, and each run taken to its end: a run without
     progress may still be captured late, so that none is cut short. With a `resolution` the stretch between the threshold and
     the next lower speed is tried again, finer and finer. Above the threshold of the speeds tried first nothing is looked at
-    again: an island of failures narrower than their distance stays unseen.
+    again: an island of failures narrower than their distance stays unseen. All of it is repeated with twice the steps until the
+    threshold moves by no more than the resolution, or the distance of the `speeds`.
 
     **Arguments**
 
@@ -177,8 +177,10 @@ def capture(
     - `resolution`: how finely the threshold is looked for, relative to the rotor's speed
     - `turning` "rolling", for balls that roll from the start, or "still", for balls that are thrown without turning, so that
       they slide until they roll; it needs the effect `Sliding`
-    - `stepsize_controller`: `EqualSteps(n)` for the whole run; the default is a step for each radian of the fastest motion, two
-      where that is a contact between balls or the end of a slip
+    - `stepsize_controller`: `EqualSteps(n)` for the whole run, which are not doubled; the default begins with a step for each
+      radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time
+      constant of the fastest decay
+    - `doublings` of the default steps at most; 0 takes the first answer
     - `equations`: as `ensemble`; `jaxvib.study.capture.published_torus.printed_torus` for the paper's printed ones
 
     **Returns** `Capture`. **Raises** `InputError` for loads that are none of a torus, a motor, and numbers not allowed.
@@ -211,33 +213,42 @@ def capture(
     width = float(number(spread, "rad", "spread", low=0.0))
     shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
     shifts[0] = 0.0
-    if stepsize_controller is None:
-        fastest = max(steps_per_second(scene), PER_RADIAN * float(jnp.max(estimated_frequencies(scene))))
-        stepsize_controller = EqualSteps(max(16, math.ceil(end * fastest)))
+    given, most = stepsize_controller, count(doublings, "doublings", low=0)
+    first = given.number if given is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))
 
-    def outcomes(which: np.ndarray) -> list[np.ndarray]:
-        """Which runs are captured, stay finite, leave their wall, (speeds, starts) each."""
+    def outcomes(which: np.ndarray, steps: int) -> list[np.ndarray]:
+        """Return True for runs that are captured, that stay finite, and that leave their wall, (speeds, starts) each."""
         lanes = (scene, np.repeat(which, starts), np.tile(shifts, (which.size, 1)))
         shared = eqx.filter_vmap(lambda _: lanes[0])(jnp.arange(lanes[1].size))
         values = (shared, jnp.asarray(lanes[1]), jnp.asarray(lanes[2]))
         make = _thrown if turning == "rolling" else _thrown_still
-        ran = ensemble(make, values, end, stepsize_controller=stepsize_controller, estimate=False, equations=equations)
+        ran = ensemble(make, values, end, stepsize_controller=EqualSteps(steps), estimate=False, equations=equations)
         slip = np.abs(np.asarray(ran.load_speed) / float(scene.drive.speed) - 1.0)
         finite = np.asarray(ran.finite)
         found = (np.all(slip < CAUGHT, axis=1) & finite, finite, np.any(ran.detached, axis=1))
         return [each.reshape(which.size, starts) for each in found]
 
-    parts = outcomes(tried)
-    while resolution is not None:
-        least = _least(parts[0])
-        if least in (0, tried.size) or tried[least] - tried[least - 1] <= resolution:
-            break
-        finer = np.linspace(tried[least - 1], tried[least], max(4, _SCAN // starts) + 2)[1:-1]
-        order = np.argsort(np.concatenate([tried, finer]))
-        tried = np.concatenate([tried, finer])[order]
-        parts = [np.concatenate(pair)[order] for pair in zip(parts, outcomes(finer), strict=True)]
-    captured, finite, detached = parts
-    return _judged(tried, captured, finite, detached, turns)
+    def scan(_: np.ndarray, multiple: int) -> list[Capture]:
+        speed, steps = tried, first * multiple
+        parts = outcomes(speed, steps)
+        while resolution is not None:
+            least = _least(parts[0])
+            if least in (0, speed.size) or speed[least] - speed[least - 1] <= resolution:
+                break
+            finer = np.linspace(speed[least - 1], speed[least], max(4, _SCAN // starts) + 2)[1:-1]
+            order = np.argsort(np.concatenate([speed, finer]))
+            speed = np.concatenate([speed, finer])[order]
+            parts = [np.concatenate(pair)[order] for pair in zip(parts, outcomes(finer, steps), strict=True)]
+        captured, finite, detached = parts
+        return [_judged(speed, captured, finite, detached, turns, steps)]
+
+    # A threshold beside one of the speeds may fall into either of the neighbouring stretches.
+    tolerance = 1.001 * max(np.max(np.diff(tried), initial=0.0) if resolution is None else resolution, 1e-12)
+    found = refine(scan, lambda answer: np.array([answer.border]), 1, tolerance, most if given is None else 0)
+    (answer,), moved = found.answers, float(found.moved[0, 0])
+    uncertainty = jnp.fmax(answer.uncertainty, moved) if np.isfinite(answer.threshold) else answer.uncertainty
+    status = CaptureStatus.not_converged if moved > tolerance else answer.status
+    return dataclasses.replace(answer, moved=jnp.asarray(moved), uncertainty=uncertainty, status=status)
 
 
 def _thrown(value: tuple[Scene, Array, Array]) -> tuple[Scene, State]:
@@ -256,7 +267,9 @@ def _least(captured: np.ndarray) -> int:
     return 0 if failing.size == 0 else int(failing[-1]) + 1
 
 
-def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int) -> Capture:
+def _judged(
+    speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detached: np.ndarray, turns: int, steps: int
+) -> Capture:
     least = _least(captured)
     threshold, uncertainty, status = math.nan, math.nan, CaptureStatus.found
     if least == 0:
@@ -275,6 +288,8 @@ def _judged(speed: np.ndarray, captured: np.ndarray, finite: np.ndarray, detache
         detached=detached,
         threshold=jnp.asarray(threshold),
         uncertainty=jnp.asarray(uncertainty),
+        moved=jnp.asarray(math.nan),
+        steps=jnp.asarray(steps),
         turns=jnp.asarray(turns),
         status=status,
     )

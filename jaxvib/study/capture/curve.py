@@ -31,10 +31,10 @@ __all__ = ["ThresholdCurve", "threshold_curve"]
 class ThresholdCurve(Result):
     """The initial speed from which on balls are captured, over a number.
 
-    **Attributes** (V values): `value` (V,); `threshold` and `uncertainty` (V,), those of `Capture` at each value: -1 where
-    every start was captured, NaN where not every start at the highest speed was; `least` (V,), the least speed at which any
-    start was captured, NaN where none was: between both, captures and failures alternate; `turns` of the rotor that each run
-    took.
+    **Attributes** (V values): `value` (V,); `threshold` and `uncertainty` (V,), those of `Capture` at each value: -1 if every
+    start was captured, NaN if not every start at the highest speed was; `least` (V,), the least speed at which any start was
+    captured, NaN if none was: between both, captures and failures alternate; `moved` (V,), by how much the last doubling of the
+    steps moved the threshold; `turns` of the rotor that each run took.
     """
 
     status = Computed.done
@@ -43,6 +43,7 @@ class ThresholdCurve(Result):
     threshold: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     uncertainty: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     least: np.ndarray = eqx.field(metadata=in_unit("", "value"))
+    moved: np.ndarray = eqx.field(metadata=in_unit("", "value"))
     turns: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
@@ -111,9 +112,10 @@ def threshold_curve(
     ]
     return ThresholdCurve(
         value=numbers,
-        threshold=np.array([-1.0 if each.status_name == "all_captured" else float(each.threshold) for each in found]),
-        uncertainty=np.array([0.0 if each.status_name == "all_captured" else float(each.uncertainty) for each in found]),
+        threshold=np.array([each.border for each in found]),
+        uncertainty=np.array([0.0 if each.border == -1.0 else float(each.uncertainty) for each in found]),
         least=np.array([_least(each) for each in found]),
+        moved=np.array([float(each.moved) for each in found]),
         turns=jnp.asarray(turns),
     )
 

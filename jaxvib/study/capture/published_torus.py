@@ -24,7 +24,7 @@ __all__ = [
     "PrintedTorus",
     "PublishedRow",
     "cosine_torus",
-    "letter_torus",
+    "gap_torus",
     "printed_torus",
     "published_scene",
     "published_torus",
@@ -32,8 +32,8 @@ __all__ = [
 
 _SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
 
-_SIGN_WIDTH = 0.02
-"""Over so much of a relative speed, in the rotor's, the printed model's signs are smoothed."""
+_TURN_WIDTH, _CLIMB_WIDTH = 0.02, 0.1
+"""Width of the smoothed signs in the printed model: of psi' in w, of the velocity rho a' along the wall in e w."""
 
 
 class PublishedRow(NamedTuple):
@@ -151,14 +151,16 @@ class PrintedTorus(eqx.Module):
         kappa rho a'' = B f'^2 cos a - g sin a - cos a (x'' c + y'' s) - e w^2 M_r/M cos a (sin psi - cos psi)
                         - (k/r) N L/rho sign(a'),              N = g cos a + R f'^2 sin a + rho a'^2
 
-    f = w t + psi. Against what the same paper's drawing asks for: the rotor's unbalance comes into the last equation with the
-    sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling adds inertia to
-    second derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the tube is printed
-    as R_1; with it the smallest gap of the tables has no threshold, with the gap rho in its place the row p = 0.010 comes out
-    within 0.05 (`jaxvib.study.capture.tables`): so that R_1 is a misprint of the paper, not of its program. The sine in place
-    of the cosine moves no threshold of that row by 0.01, but for chaotic ones. For comparison with the paper's tables only.
+    f = w t + psi. Differences from the projection of the forces in the paper's drawing: the rotor's unbalance enters the last
+    equation with the sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling
+    adds inertia to second derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the
+    tube is printed as R_1, although the contact force has the lever rho. R_1 is an error of physics, but no mere misprint: the
+    paper's tables come out nearer with it than with rho (`jaxvib.study.capture.tables`). For comparison with the paper only.
 
-    **Attributes**: the scene's parts; `lever` L m; `sine` 1, or 0 where the unbalance comes in with the cosine, as it should.
+    With R_1 the smoothed friction of the smallest ball is stiff, up to 116 w: steps that do not resolve it hide every capture
+    (`jaxvib.study.capture.refinement`).
+
+    **Attributes**: the scene's parts; `lever` L m; `sine` 1, or 0 for the unbalance with the correct cosine.
     """
 
     machine: PlanarRotor
@@ -180,9 +182,8 @@ class PrintedTorus(eqx.Module):
         arm = r + gap * up
         whole = self.machine.mass + loads.count * m
         pressed = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0) * self.friction / loads.own_radius
-        width = _SIGN_WIDTH * w
-        slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / width)
-        stop = pressed * self.lever / gap**2 * jnp.tanh(climb / width)
+        slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / (_TURN_WIDTH * w))
+        stop = pressed * self.lever / gap**2 * jnp.tanh(gap * climb / (_CLIMB_WIDTH * _ECCENTRICITY * w))
         lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin
         wrong = self.sine * self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
         free_turn = (-2.0 * gap * across * climb * turn / arm - slow) / kappa
@@ -206,24 +207,24 @@ class PrintedTorus(eqx.Module):
 
 
 def printed_torus(scene: Scene) -> PrintedTorus:
-    """The paper's equations for a scene of `published_torus`, see `PrintedTorus`; what `ensemble` takes as its `equations`.
+    """Return the paper's equations for a scene of `published_torus`, to the letter: the friction up the tube has the lever R_1.
 
-    The friction up the tube has the gap as its lever, as the tables ask for; `letter_torus` has R_1, as printed.
+    `ensemble` and `capture` take this function as their `equations`; see `PrintedTorus`.
     """
     gravity, imbalance, rolling = scene.effects
     assert isinstance(gravity, Gravity) and isinstance(imbalance, StaticImbalance) and isinstance(rolling, RollingFriction)
     machine, loads = cast(PlanarRotor, scene.machine), in_torus(scene.loads, "the paper")
     one = jnp.ones_like(loads.gap)
-    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.gap, one)
+    return PrintedTorus(machine, loads, scene.drive.speed, gravity.g, imbalance.moment, rolling.coefficient, loads.tube, one)
 
 
-def letter_torus(scene: Scene) -> PrintedTorus:
-    """As `printed_torus`, to the letter: the friction up the tube has the lever R_1."""
+def gap_torus(scene: Scene) -> PrintedTorus:
+    """Return `printed_torus` with the correct lever of the friction up the tube, the gap R_1 - r."""
     printed = printed_torus(scene)
-    return eqx.tree_at(lambda p: p.lever, printed, printed.loads.tube)
+    return eqx.tree_at(lambda p: p.lever, printed, printed.loads.gap)
 
 
 def cosine_torus(scene: Scene) -> PrintedTorus:
-    """As `printed_torus`, with the rotor's unbalance projected onto the tube as it should be, by the cosine."""
+    """Return `printed_torus` with the correct projection of the rotor's unbalance onto the tube, the cosine."""
     printed = printed_torus(scene)
     return eqx.tree_at(lambda p: p.sine, printed, jnp.zeros_like(printed.sine))

@@ -14,7 +14,6 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import require_one_of
-from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
@@ -24,15 +23,16 @@ from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.study.capture.capture import CAUGHT, steps_per_second, thrown_state
+from jaxvib.study.capture.capture import CAUGHT, thrown_state
 from jaxvib.study.capture.published_torus import (
     TABLES,
     PublishedRow,
     cosine_torus,
-    letter_torus,
+    gap_torus,
     printed_torus,
     published_scene,
 )
+from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
 from jaxvib.units import count
 
 if TYPE_CHECKING:
@@ -46,6 +46,9 @@ CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
 SPIN = FreeSpin()
 
 _COARSE, _ROUNDS, _LANES = 19, 2, 64
+
+_GRID = np.linspace(-1.0, -0.1, _COARSE)
+"""Initial speeds that are tried first."""
 
 
 class _Runs(NamedTuple):
@@ -82,33 +85,43 @@ def _spinning(run: _Runs) -> tuple[Scene, State]:
 class _Model(NamedTuple):
     make: Callable[[_Runs], tuple[Scene, State]]
     equations: Equations
-    effects: tuple[Effect, ...] = ()
 
 
 MODELS = {
     "derived": _Model(_alone, vector_field),
     "printed": _Model(_alone, printed_torus),
+    "gap lever": _Model(_alone, gap_torus),
     "cosine": _Model(_alone, cosine_torus),
-    "letter": _Model(_alone, letter_torus),
-    "spinning": _Model(_spinning, vector_field, (SPIN,)),
-    "contact": _Model(_touching, vector_field, (CONTACT,)),
+    "spinning": _Model(_spinning, vector_field),
+    "contact": _Model(_touching, vector_field),
 }
-"""By name: this package's equations, the paper's (`PrintedTorus`), those with the unbalance put right, to the letter, this
-package's with `FreeSpin`, and with `CONTACT`."""
+"""Models by name: this package's equations; those of the paper to the letter (`PrintedTorus`), with the gap as the lever of the
+friction up the tube, and with the correct projection of the unbalance; this package's with `FreeSpin`, and with `CONTACT`."""
+
+
+TABLE_TOLERANCE = 0.011
+"""Largest move of a border at a doubling of steps that counts as converged: 0.01 and half of the resolution."""
 
 
 class TorusTables(Result):
-    """Tables 1 and 2 of the paper, point by point, beside what was computed.
+    """Points of the paper's tables 1 and 2 beside computed ones.
 
-    **Attributes** (P points, M models): `damping` n, `stiffness` p, `friction` k m, `gap`, and the `paper`'s speed, (P,) of
-    the points; `models` M names; `least` (M, P), the least initial speed that is captured, -1 where a ball at rest is, NaN
-    where none is; `threshold` (M, P), the speed from which on all are captured, NaN where the highest is not; both halfway
-    between speeds that differ by `resolution`; `captured` (M, P, S), whether each of the speeds `tried` (S,) is; `fraction`
-    (M, P), the share captured of `starts` perturbed starts at the paper's speed; `turns` of the rotor that each run took.
+    **Attributes** (P points, M models):
 
-    Where `least` and `threshold` differ, captures and failures alternate between them, and the paper's one number leaves open
-    which of their borders it is; where the share is neither 0 nor 1 the outcome at the paper's speed is chaotic. Bands narrower
-    than the distance of the speeds `tried` stay unseen.
+    - `damping` n, `stiffness` p, `friction` k m, `gap`, and the `paper`'s speed, (P,); `models`, M names
+    - `least` (M, P), the least initial speed that is captured, -1 if a ball at rest is, NaN if none is
+    - `threshold` (M, P), the speed from which on all are captured, NaN if the highest is not; both borders lie halfway between
+      speeds that differ by `resolution`
+    - `captured` (M, P, S), True if a speed of those `tried` (S,) is captured
+    - `fraction` (M, P), the share captured of `starts` perturbed starts at the paper's speed
+    - `steps_per_turn` (M, P), the least number of steps for a turn of the rotor in the last scan
+    - `moved` (M, P, 2), by how much the last doubling of the steps moved `least` and `threshold`, infinite if it made one
+      appear or vanish; NaN without a doubling
+    - `turns` of the rotor that each run took
+
+    If `least` and `threshold` differ, captures and failures alternate between them, and the paper's one number may be any of
+    their borders; if the share is neither 0 nor 1, or a border still moves, the outcome there is chaotic. Bands
+    narrower than the distance of the speeds `tried` stay unseen.
     """
 
     status = Computed.done
@@ -124,6 +137,8 @@ class TorusTables(Result):
     fraction: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
     tried: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
     captured: np.ndarray = eqx.field(metadata=in_unit("", "model", "point", "speed"))
+    steps_per_turn: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
+    moved: np.ndarray = eqx.field(metadata=in_unit("", "model", "point", "border"))
     resolution: Array = eqx.field(metadata=in_unit(""))
     starts: Array = eqx.field(metadata=in_unit(""))
     turns: Array = eqx.field(metadata=in_unit(""))
@@ -136,28 +151,39 @@ class TorusTables(Result):
 
     @property
     def difference(self) -> np.ndarray:
-        """What is computed less the paper's, (M, P): of `least` and `threshold` the one that is nearer."""
-        both = np.stack([self.least, self.threshold]) - self.paper
-        far = np.where(np.isnan(both), np.inf, np.abs(both))
-        return np.take_along_axis(both, np.argmin(far, axis=0)[None], axis=0)[0]
+        """The computed speed minus the paper's, (M, P): of `least` and `threshold` the nearer one; NaN if there is neither."""
+        return self._nearer(np.stack([self.least, self.threshold], axis=-1) - self.paper[:, None])
+
+    @property
+    def converged(self) -> np.ndarray:
+        """True if the last doubling of the steps moved the nearer border by 0.011 of the rotor's speed at most, (M, P)."""
+        return self._nearer(self.moved) <= TABLE_TOLERANCE
+
+    def _nearer(self, values: np.ndarray) -> np.ndarray:
+        """Those of `values` (M, P, 2) that belong to the border nearer to the paper's speed."""
+        far = np.abs(np.stack([self.least, self.threshold], axis=-1) - self.paper[:, None])
+        which = np.argmin(np.where(np.isnan(far), np.inf, far), axis=-1)
+        return np.take_along_axis(values, which[..., None], axis=-1)[..., 0]
 
     def summary(self) -> str:
         """For each row of the tables a line for each gap and model, for a person to read; "#" are captures, "." failures."""
         low, high, n = self.tried[0], self.tried[-1], self.tried.size
-        head = (
-            f"initial speeds that are captured in {int(self.turns)} turns: the least, all from; {n} speeds {low:g} .. {high:g};"
-        )
-        lines = [f"{head}\nof {int(self.starts)} starts perturbed at the paper's speed the share; difference of the nearer one"]
+        lines = [
+            f"initial speeds captured in {int(self.turns)} turns: the least, all from; {n} speeds {low:g} .. {high:g};",
+            f"difference of the nearer one from the paper; share of {int(self.starts)} starts perturbed at the paper's speed;",
+            "steps for a turn, and by how much their last doubling moved the two borders",
+        ]
         for row in self.rows():
             i = row[0]
             lines.append(f"n = {self.damping[i]:g}, p = {self.stiffness[i]:g}, k = {self.friction[i]:g} m")
-            lines.append(f"   gap   paper  {'model':8s}  least    from  nearer  share  {'outcomes':{n}s}")
+            lines.append(f"   gap   paper  {'model':9s}  least    from  nearer  share  steps   moved         {'outcomes':{n}s}")
             for i in row:
                 for m, name in enumerate(self.models):
                     point = f"  {self.gap[i]:4.1f} {self.paper[i]:7.3f}" if m == 0 else " " * 14
                     pattern = "".join(".#"[int(x)] for x in self.captured[m, i])
                     numbers = f"{self.least[m, i]:7.3f} {self.threshold[m, i]:7.3f} {self.difference[m, i]:+7.3f}"
-                    lines.append(f"{point}  {name:8s}{numbers}  {self.fraction[m, i]:5.2f}  {pattern}")
+                    steps = f"{self.steps_per_turn[m, i]:5.0f} " + " ".join(f"{x:6.3f}" for x in self.moved[m, i])
+                    lines.append(f"{point}  {name:9s}{numbers}  {self.fraction[m, i]:5.2f}  {steps}  {pattern}")
         return "\n".join(lines)
 
     def plot(self, *, ax: Onto = None) -> Drawn:
@@ -189,79 +215,66 @@ def published_tables(
     starts: int = 8,
     spread: float = 1e-3,
     seed: int = 0,
+    doublings: int = DOUBLINGS,
 ) -> TorusTables:
-    """The paper's tables of least initial speeds by other equations, and how sure each entry is.
+    """Compute the paper's tables of least initial speeds by other equations, with the certainty of each entry.
 
-    For each point 19 speeds from -1 to -0.1 are tried, the stretches below the least that is captured and below that from which
-    on all are twice finer, five times each, and `starts` perturbed starts at the paper's own speed. All points advance
-    together, sorted by the steps they need: 2000 runs a model, some minutes on two cores.
+    For each point 19 speeds from -1 to -0.1 are tried, then twice four speeds between the least captured one and the next lower
+    one, and below the speed from which on all are captured. The scan is repeated with twice the steps until both borders move
+    by 0.011 at most; points that have converged drop out. Last come `starts` perturbed starts at the paper's own speed. All
+    points advance together, sorted by the steps they need: about 5000 runs a model, some ten minutes of the processor.
 
     **Arguments**: `models` names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor that each run takes; `starts`, all but
-    the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`.
+    the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`; `doublings` of the steps at most.
 
-    **Returns** `TorusTables`. **Raises** `InputError` for a model that there is not.
+    **Returns** `TorusTables`. **Raises** `InputError` for an unknown model.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> from jaxvib.study.capture.published_torus import TABLES
     >>> row = TABLES[-1]._replace(gap=(5.1,), speed=(-0.868,))
     >>> found = published_tables(["printed"], [row], turns=5, starts=1)
-    >>> found.paper.tolist(), found.threshold.shape
-    ([-0.868], (1, 1))
+    >>> found.paper.tolist(), found.threshold.shape, bool(found.converged[0, 0])
+    ([-0.868], (1, 1), True)
 
-    By "printed" 45 of the 47 points come out within 0.1 of the paper, half of them within 0.04; the other two, of the
-    smallest gaps with the lesser friction and the greater damping, are not captured from the paper's speeds in 6000 turns
-    either. The mass that the paper does not print does not explain them: with 6.6 to 7.4 kg two of 120 starts from -0.95 to
-    -0.4 were captured in 2000 turns, at speeds that do not follow one another. Nor does it explain the gap of 5.1 at p =
-    0.010, where with 6.8 to 7.4 kg all of 12 speeds from -0.95 on are captured (the paper has -0.868); with 6.6 kg one at
-    -0.84 fails, so that the paper's number may be the upper end of a narrow band of failures. At p = 0.005 the same gap has
-    such bands with every mass. "cosine", tried for two rows, moves no border by more than 0.002 but for chaotic ones. By
-    "derived" captures from speeds below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to
-    0.7 above the paper's: what does it is the ball's own rotation, which the paper counts with f'^2 and not with f' (f' - w).
-    "spinning", tried for eight points of all gaps, is captured from rest at seven and from -0.967 at the other: a free spin
-    that begins at the bottom takes the balls up by as much as 0.35 of the rotor's speed. "contact" moves the thresholds of
-    "derived" by -0.07 to 0.07, a quarter of them by more than 0.03, mostly up.
+    By "printed" 35 of the 47 speeds come out within 0.05 of the paper, by "gap lever" 28 (`doublings=1`): the lever R_1 is
+    wrong, but the tables come out nearer with it. The three smallest gaps that are far off, with the lesser friction, are slow:
+    with n = 0.1 the gap of 0.5 is captured from -0.757 in 2000 turns and from -0.865 in 4000 (paper -0.857). At p = 0.010 and a
+    gap of 5.1 lone failures stand among captures up to -0.87 (paper -0.868), at other speeds with other steps. "cosine", tried
+    for two rows with the gap as its lever, moves no border by more than 0.002 but for chaotic ones. By "derived" captures from
+    speeds below -0.7 are gone, but for lone ones, and thresholds at p = 0.003 and 0.005 lie 0.2 to 0.7 above the paper's: the
+    paper counts the ball's own rotation with f'^2 and not with f' (f' - w). "spinning", tried for eight points of all gaps, is
+    captured from rest at seven and from -0.967 at the other: a free spin that begins at the bottom takes the balls up by as
+    much as 0.35 of the rotor's speed. "contact" moves the thresholds of "derived" by -0.07 to 0.07, a quarter of them by more
+    than 0.03, mostly up.
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
     for name in models:
         require_one_of(name, MODELS, "models", "has")
-    points = [
-        (row.damping, row.stiffness, row.friction, *pair) for row in rows for pair in zip(row.gap, row.speed, strict=True)
-    ]
-    damping, stiffness, friction, gap, paper = np.asarray(points).T
+    points = np.asarray(
+        [(row.damping, row.stiffness, row.friction, *pair) for row in rows for pair in zip(row.gap, row.speed, strict=True)]
+    )
+    damping, stiffness, friction, gap, paper = points.T
     shifts = np.random.default_rng(seed).uniform(-spread, spread, (count(starts, "starts"), 2))
     shifts[0] = 0.0
+    most, length = count(doublings, "doublings", low=0), count(turns, "turns")
 
-    def tried(model: _Model, speed: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """Whether each point is captured from speeds (P, S) and positions (S, 2)."""
-        each = speed.shape[1]
-        gaps, dampings, stiffnesses, frictions = (jnp.repeat(jnp.asarray(x), each) for x in (gap, damping, stiffness, friction))
-        places = jnp.tile(jnp.asarray(shift), (gap.size, 1))
-        runs = _Runs(gaps, dampings, stiffnesses, frictions, jnp.asarray(speed.ravel()), places)
-        return _outcomes(model, runs, count(turns, "turns")).reshape(speed.shape)
+    def column(model: _Model) -> list[np.ndarray]:
+        """Borders (P, 2), outcomes of the first speeds (P, S), shares, steps for a turn, moves (P,)."""
+        needed = np.array([_steps_per_second(model, *point[:4]) for point in points])
+        found = refine(
+            lambda which, multiple: _scanned(model, points[which], multiple * needed[which], length),
+            lambda answer: answer[0],
+            gap.size,
+            TABLE_TOLERANCE,
+            most,
+        )
+        steps = needed * found.multiple
+        fraction = np.mean(_tried(model, points, steps, np.tile(paper[:, None], (1, starts)), shifts, length), axis=1)
+        per_turn = steps * 2.0 * np.pi / _rotor_speed()
+        return [*map(np.stack, zip(*found.answers, strict=True)), fraction, per_turn, found.moved]
 
-    grid = np.linspace(-1.0, -0.1, _COARSE)
-
-    def entry(model: _Model) -> tuple[np.ndarray, ...]:
-        speed = np.tile(grid, (gap.size, 1))
-        captured = first = tried(model, speed, np.zeros((_COARSE, 2)))
-        for _ in range(_ROUNDS):
-            inside = [_between(speed, np.argmax(captured, axis=1)), _between(speed, _from(captured))]
-            finer = np.concatenate([low + (high - low) * _SHARES for low, high in inside], axis=1)
-            speed = np.concatenate([speed, finer], axis=1)
-            captured = np.concatenate([captured, tried(model, finer, np.zeros((finer.shape[1], 2)))], axis=1)
-            order = np.argsort(speed, axis=1)
-            speed, captured = (np.take_along_axis(x, order, axis=1) for x in (speed, captured))
-        lowest, above = np.argmax(captured, axis=1), _from(captured)
-        least, threshold = (np.where(at == 0, -1.0, np.mean(_between(speed, at), axis=0)[:, 0]) for at in (lowest, above))
-        least = np.where(np.any(captured, axis=1), least, math.nan)
-        threshold = np.where(above == speed.shape[1], math.nan, threshold)
-        fraction = np.mean(tried(model, np.tile(paper[:, None], (1, starts)), shifts), axis=1)
-        return least, threshold, fraction, first
-
-    least, threshold, fraction, captured = (
-        np.stack(part) for part in zip(*(entry(MODELS[name]) for name in models), strict=True)
-    )
+    borders, captured, fraction, per_turn, moved = map(np.stack, zip(*(column(MODELS[m]) for m in models), strict=True))
     return TorusTables(
         damping=damping,
         stiffness=stiffness,
@@ -269,12 +282,14 @@ def published_tables(
         gap=gap,
         paper=paper,
         models=tuple(models),
-        least=least,
-        threshold=threshold,
+        least=borders[..., 0],
+        threshold=borders[..., 1],
         fraction=fraction,
-        tried=grid,
+        tried=_GRID,
         captured=captured,
-        resolution=jnp.asarray((grid[1] - grid[0]) * _SHARES[0] ** _ROUNDS),
+        steps_per_turn=per_turn,
+        moved=moved,
+        resolution=jnp.asarray((_GRID[1] - _GRID[0]) * _SHARES[0] ** _ROUNDS),
         starts=jnp.asarray(starts),
         turns=jnp.asarray(turns),
     )
@@ -296,15 +311,42 @@ def _between(speed: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.take_along_axis(speed, at - 1, axis=1), np.take_along_axis(speed, at, axis=1)
 
 
-def _outcomes(model: _Model, runs: _Runs, turns: int) -> np.ndarray:
-    """Whether all balls of each run (B,) turn with the rotor at its end.
+def _scanned(model: _Model, points: np.ndarray, steps: np.ndarray, turns: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return of each point (P, 5), by so many steps a second (P,), the two borders and the outcomes of the first speeds."""
+    speed = np.tile(_GRID, (len(points), 1))
+    captured = first = _tried(model, points, steps, speed, np.zeros((_COARSE, 2)), turns)
+    for _ in range(_ROUNDS):
+        inside = [_between(speed, np.argmax(captured, axis=1)), _between(speed, _from(captured))]
+        finer = np.concatenate([low + (high - low) * _SHARES for low, high in inside], axis=1)
+        outcomes = _tried(model, points, steps, finer, np.zeros((finer.shape[1], 2)), turns)
+        speed, captured = np.concatenate([speed, finer], axis=1), np.concatenate([captured, outcomes], axis=1)
+        order = np.argsort(speed, axis=1)
+        speed, captured = (np.take_along_axis(x, order, axis=1) for x in (speed, captured))
+    lowest, above = np.argmax(captured, axis=1), _from(captured)
+    least, threshold = (np.where(at == 0, -1.0, np.mean(_between(speed, at), axis=0)[:, 0]) for at in (lowest, above))
+    least = np.where(np.any(captured, axis=1), least, math.nan)
+    threshold = np.where(above == speed.shape[1], math.nan, threshold)
+    return list(zip(np.stack([least, threshold], axis=1), first, strict=True))
 
-    Runs go in blocks of one size, sorted by the steps they need, so that one program answers them all. Beside the runs each
-    block has one of its own kind: no number is shared by all, which would ask for another program.
+
+def _tried(
+    model: _Model, points: np.ndarray, steps: np.ndarray, speed: np.ndarray, shift: np.ndarray, turns: int
+) -> np.ndarray:
+    """Return True for each point (P, 5) that is captured from speeds (P, S) and positions (S, 2)."""
+    each = speed.shape[1]
+    damping, stiffness, friction, gap = (jnp.asarray(np.repeat(x, each)) for x in points.T[:4])
+    places = jnp.asarray(np.tile(shift, (len(points), 1)))
+    runs = _Runs(gap, damping, stiffness, friction, jnp.asarray(speed.ravel()), places)
+    return _outcomes(model, runs, np.repeat(steps, each), turns).reshape(speed.shape)
+
+
+def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.ndarray:
+    """Return True for each run (B,) whose balls all turn with the rotor at its end, by `needed` steps a second at least.
+
+    Runs go in blocks of one size, sorted by the steps they need, so that one program answers them all. Each block has a further
+    run with numbers of its own: otherwise a number that all runs share would ask for another program.
     """
-    gaps, which = np.unique(runs.gap, return_inverse=True)
-    speed = float(published_scene(1.0, 0.1, 0.01, 0.0).drive.speed)
-    needed = np.array([_steps_per_second(model, float(gap)) for gap in gaps])[which]
+    speed = _rotor_speed()
     order, size = np.argsort(-needed, kind="stable"), _LANES * len(jax.devices()) - 1
     gap, damping, stiffness, friction, still = (jnp.asarray([x]) for x in (7.5, 0.2, 0.02, 1e-5, 0.0))
     other = _Runs(gap, damping, stiffness, friction, still, jnp.asarray([[1e-3, 2e-3]]))
@@ -322,6 +364,11 @@ def _outcomes(model: _Model, runs: _Runs, turns: int) -> np.ndarray:
     return captured
 
 
-def _steps_per_second(model: _Model, gap: float) -> float:
-    scene = published_scene(gap, 0.1, 0.01, 0.0)
-    return steps_per_second(Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, *model.effects)))
+def _steps_per_second(model: _Model, damping: float, stiffness: float, friction: float, gap: float) -> float:
+    numbers = [jnp.asarray(x) for x in (gap, damping, stiffness, friction)]
+    scene, _ = model.make(_Runs(*numbers, speed=jnp.zeros(()), shift=jnp.zeros(2)))
+    return steps_per_second(scene, model.equations)
+
+
+def _rotor_speed() -> float:
+    return float(published_scene(1.0, 0.1, 0.01, 0.0).drive.speed)
