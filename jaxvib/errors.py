@@ -18,9 +18,9 @@ __all__ = [
     "InputError",
     "legible",
     "open_regular",
+    "quoted",
     "read_text",
     "require_one_of",
-    "shown",
     "written",
 ]
 
@@ -34,12 +34,13 @@ _MAX_WORD, _MAX_MESSAGE = 300, 2000
 """Letters of a word, and of a message, beyond which the middle is left out."""
 
 
-def legible(text: str) -> str:
+def legible(text: object) -> str:
     """A text on one line for a terminal: control characters as escapes, the middle of long words and texts left out.
 
     >>> legible("a\\x1b[31m" + 1000 * "b")[:20]
     'a\\\\x1b[31mbbbbbbbbbbb'
     """
+    text = text if isinstance(text, str) else quoted(text)
     plain = re.sub(f"{CONTROL.pattern}|[\n\t\ud800-\udfff]", lambda found: repr(found[0])[1:-1], text)
     plain = re.sub(rf"\S{{{_MAX_WORD + 1},}}", lambda found: _shortened(found[0], _MAX_WORD), plain)
     return _shortened(plain, _MAX_MESSAGE)
@@ -65,17 +66,17 @@ class InputError(ValueError):
     problem: str
 
     def __init__(self, field: str, problem: str):
-        self.field, self.problem = legible(str(field)), legible(str(problem))
+        self.field, self.problem = legible(field), legible(problem)
         super().__init__(f"{self.field} {self.problem}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str]]:
         return type(self), (self.field, self.problem)  # processes hand errors to each other
 
 
-def shown(value: object, longest: int = 60) -> str:
+def quoted(value: object, longest: int = 60) -> str:
     """Return the value as an error message quotes it: its representation, at most `longest` characters of one line.
 
-    >>> shown("left"), shown(10**5000)
+    >>> quoted("left"), quoted(10**5000)
     ("'left'", 'a whole number of 16610 bits')
     """
     if isinstance(value, int) and abs(value).bit_length() > 1024:  # Python refuses to write numbers of more than 4300 digits
@@ -97,7 +98,7 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
     """
     allowed = tuple(allowed)
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(field, f"{verb} {shown(value)}; allowed: {', '.join(allowed)}")
+        raise InputError(field, f"{verb} {quoted(value)}; allowed: {', '.join(allowed)}")
 
 
 @contextlib.contextmanager
@@ -125,7 +126,7 @@ def written(path: Path) -> Iterator[Path]:
         if isinstance(error, ValueError) and "null" not in str(error):
             raise
         why = getattr(error, "strerror", None) or str(error)
-        raise InputError("path", f"is {str(path)!r}, which cannot be written ({why}); name another file") from error
+        raise InputError("path", f"is {quoted(str(path))}, which cannot be written ({why}); name another file") from error
     finally:
         if part is not None:
             with contextlib.suppress(OSError):
@@ -154,7 +155,7 @@ def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
     **Raises** `InputError` for a file that cannot be read, is no UTF-8 text, or has more than `most` bytes.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise InputError("path", f"is {path!r}; give the path of {what}")
+        raise InputError("path", f"is {quoted(path)}; give the path of {what}")
     try:
         with open_regular(path) as file:
             content = file.read(most + 1)
@@ -182,7 +183,7 @@ class ComputationError(RuntimeError):
     status: str
 
     def __init__(self, status: str, message: str):
-        super().__init__(f"{status}: {legible(message)}")
+        super().__init__(f"{legible(status)}: {legible(message)}")
         self.status, self.message = status, message
 
     def __reduce__(self) -> tuple[type[ComputationError], tuple[str, str]]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, called, closest, load_scene, out_of_place, read_toml
 from jaxvib.units import count, number
 from optimize.result import Synthesis
@@ -43,6 +44,7 @@ class Design:
         return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})
 
 
+@validated
 def load_design(path: str | Path) -> Design:
     """Reads a design file.
 
@@ -75,7 +77,7 @@ def load_design(path: str | Path) -> Design:
         if name not in tables and not (name == "free" and "choices" in tables):
             raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
     if not isinstance(tables["scene"], str):
-        raise InputError("scene", f"is {tables['scene']!r}; give the path of a scene file, in quotes")
+        raise InputError("scene", f"is {quoted(tables['scene'])}; give the path of a scene file, in quotes")
     for name in ("free", "ties", "choices", "objective", "search"):
         if not isinstance(tables.get(name, {}), Mapping):
             raise InputError(name, f"is not a table; write [{name}]")
@@ -91,7 +93,7 @@ def load_design(path: str | Path) -> Design:
     demands = tuple(d for k, table in enumerate(tables.get("demand", [])) for d in _demands(table, f"demand[{k}]"))
     objective, more = quantity_from_table(tables["objective"], "objective", ("maximize",))
     if not isinstance(more.get("maximize", False), bool):
-        raise InputError("objective.maximize", f"is {more['maximize']!r}; write true or false, without quotes")
+        raise InputError("objective.maximize", f"is {quoted(more['maximize'])}; write true or false, without quotes")
     if more.get("maximize", False):
         objective = -objective
     search = dict(tables.get("search", {}))
@@ -125,7 +127,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     **Raises** `InputError` for an unknown quantity, and for values that are not allowed.
     """
     if not isinstance(table, Mapping):
-        raise InputError(section, f"is {table!r}; it must be a table with a quantity")
+        raise InputError(section, f"is {quoted(table)}; it must be a table with a quantity")
     name = table.get("quantity")
     if not isinstance(name, str) or name not in _QUANTITIES:
         problem = "is missing" if name is None else f"is {name!r}"
@@ -141,7 +143,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     if "tolerances" in table:
         how = table.get("statistic", "expected")
         if not isinstance(how, str) or how not in _STATISTICS:
-            raise InputError(f"{section}.statistic", f"is {how!r}; {closest(str(how), list(_STATISTICS))}")
+            raise InputError(f"{section}.statistic", f"is {quoted(how)}; {closest(str(how), list(_STATISTICS))}")
         quantity = _STATISTICS[how](quantity, table["tolerances"], samples=table.get("samples", 64))
     return quantity, {k: table[k] for k in more if k in table}
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.errors import ComputationError, InputError
 from jaxvib.machine.files import scene_from_toml, scene_to_toml
 from jaxvib.machine.scene import Scene
@@ -51,6 +52,7 @@ class Front(Result):
     units: tuple[str, ...]
     machines: tuple[str, ...]
 
+    @validated
     def scene(self, k: int) -> Scene:
         """The machine behind point `k`, counted from 0. **Raises** `InputError` for a point that the front does not have."""
         if count(k, "k", low=0) >= len(self.machines):
@@ -73,6 +75,7 @@ class Front(Result):
             columns.append(factor * column)
         return labels, columns
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The front, each point with the number by which `scene` gives its machine.
 
@@ -84,6 +87,7 @@ class Front(Result):
         return front_chart(values[1], values[0], across=labels[1], up=labels[0], ax=ax)
 
 
+@validated
 def pareto(
     space: DesignSpace,
     first: Quantity,

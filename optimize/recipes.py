@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count
@@ -116,7 +116,7 @@ def widest_range(scene: Scene, *, mode: int, keep: float = 0.9, of: int | tuple[
     """
     count(mode, "mode")
     if not 0.0 < keep <= 1.0:
-        raise InputError("keep", f"is {keep!r}; it must be greater than 0 and at most 1")
+        raise InputError("keep", f"is {quoted(keep)}; it must be greater than 0 and at most 1")
     machine = _platforms(scene, 1)
     space = DesignSpace(scene, _springs(machine, 3.0, ("stiffness", "link_stiffness")))
     whose = amplitude(mode=mode, of=of)

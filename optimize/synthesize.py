@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import jammed_loads, require_drag
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
@@ -47,6 +48,7 @@ _SPREAD = 1e-3
 Tell = Callable[[str, float], None]
 
 
+@validated
 def synthesize(
     space: DesignSpace,
     objective: Quantity,
@@ -172,7 +174,7 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
     count(iterations, "iterations")
     count(polishing, "polishing", low=0)
     if not 0.0 < rate < 1.0:
-        raise InputError("rate", f"is {rate!r}; it must be greater than 0 and less than 1")
+        raise InputError("rate", f"is {quoted(rate)}; it must be greater than 0 and less than 1")
     count(seed, "seed", low=0)
     require_searcher(searcher)
     return Options(starts, seed, iterations, float(rate), polishing, searcher)
@@ -180,16 +182,16 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
 
 def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Demand]) -> tuple[Demand, ...]:
     if not isinstance(space, DesignSpace):
-        raise InputError("space", f"is {space!r}; it must be a DesignSpace")
+        raise InputError("space", f"is {quoted(space)}; it must be a DesignSpace")
     require_quantity(objective, "objective")
     demands = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)
     for demand in demands:
         if not isinstance(demand, Demand):
-            raise InputError("subject_to", f"has {demand!r}; write demands such as amplitude(mode=3) > '2 mm'")
+            raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'")
     checked(space.scene)
     between(space.scene, objective.of)
     if not space.scene.drive.constant:
-        raise InputError("drive", f"is {space.scene.drive.kind!r}; a design is sought at one speed, give a ConstantSpeed")
+        raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a design is sought at one speed, give a ConstantSpeed")
     if space.scene.drive.speed.dtype != jnp.float64:
         raise InputError(
             "scene", 'is in float32; a search needs jax.config.update("jax_enable_x64", True) before the scene is built'
@@ -199,7 +201,7 @@ def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Deman
 
 def _begun(space: DesignSpace, begin: Synthesis) -> np.ndarray:
     if not isinstance(begin, Synthesis):
-        raise InputError("begin", f"is {begin!r}; it must be the Synthesis of an earlier search of this space")
+        raise InputError("begin", f"is {quoted(begin)}; it must be the Synthesis of an earlier search of this space")
     if begin.designs.shape[1] != space.size:
         raise InputError("begin", f"has {begin.designs.shape[1]} free numbers; this space has {space.size}")
     return np.asarray(begin.designs)

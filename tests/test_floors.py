@@ -20,6 +20,7 @@ FLOORS = (
     ("jaxvib.ode", "jaxvib.draw", "jaxvib.results", "jaxvib.units"),
     ("jaxvib.numerics",),
     ("jaxvib.runtime",),
+    ("jaxvib.boundary",),
     ("jaxvib.errors", "jaxvib.imported"),
 )
 """From the top down; a module may import from its own package and from floors below its own."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from jaxvib.cli.output import Output
-from jaxvib.errors import ComputationError, InputError, legible
+from jaxvib.errors import ComputationError, InputError, legible, quoted
 
 if TYPE_CHECKING:
     from jaxvib.machine.scene import Scene
@@ -41,7 +41,7 @@ def loaded_scene(path: Path, without: Sequence[str] = (), speed: str | None = No
     there = [effect.kind for effect in scene.effects]
     for kind in without:
         if kind not in there:
-            raise InputError("--without", f"is {kind!r}; the scene's effects are: {', '.join(there) or 'none'}")
+            raise InputError("--without", f"is {quoted(kind)}; the scene's effects are: {', '.join(there) or 'none'}")
     kept = tuple(effect for effect in scene.effects if effect.kind not in without)
     return scene if len(kept) == len(there) else Scene(scene.machine, scene.loads, scene.drive, kept)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 import jaxvib as jv
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,7 +44,7 @@ class Output:
         self.figures: list[tuple[str, Figure]] = []
         if report is not None:
             if report.suffix.lower() not in (".html", ".htm"):
-                raise InputError("--report", f"is {str(report)!r}; a report is a web page, name a file that ends in .html")
+                raise InputError("--report", f"is {quoted(str(report))}; a report is a web page, name it .html")
             self._make(report.parent, "--report")
         if folder is not None:
             self._make(folder, "--out")
@@ -55,7 +55,7 @@ class Output:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(option, f"is {str(folder)!r}, which cannot be made a folder ({error.strerror})") from error
+            raise InputError(option, f"is {quoted(str(folder))}, which cannot be made a folder ({error.strerror})") from error
 
     def file(self, name: str) -> Path | None:
         """The path of a result file; None where no folder was asked for."""

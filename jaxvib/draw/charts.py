@@ -25,7 +25,7 @@ from jaxvib.draw.style import (
     panels,
     speed_scale,
 )
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 
 __all__ = [
     "PARTS",
@@ -71,7 +71,7 @@ def branch_diagram(
     """
     scale = speed_scale(unit)
     if not show or any(part not in PARTS for part in show):
-        raise InputError("show", f"is {tuple(show)!r}; it names some of: {', '.join(PARTS)}")
+        raise InputError("show", f"is {quoted(tuple(show))}; it names some of: {', '.join(PARTS)}")
     apart = len(names) > 2
     rows: list[tuple[str, list[tuple[str, np.ndarray]]]] = []
     for part in show:

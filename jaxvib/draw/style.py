@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 
 __all__ = [
     "COLORS",
@@ -89,7 +89,7 @@ def speed_scale(unit: str) -> float:
     9.549
     """
     if unit not in _SCALES:
-        raise InputError("unit", f"is {unit!r}; it must be one of 'rad/s', 'rpm', 'Hz'")
+        raise InputError("unit", f"is {quoted(unit)}; it must be one of 'rad/s', 'rpm', 'Hz'")
     return _SCALES[unit]
 
 
@@ -115,7 +115,7 @@ def panels(
     if ax is not None:
         given = [ax] if isinstance(ax, Axes) else list(np.ravel(np.asarray(ax, dtype=object)))
         if not all(isinstance(each, Axes) for each in given):
-            raise InputError("ax", f"is {ax!r}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
+            raise InputError("ax", f"is {quoted(ax)}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
         if len(given) != rows * columns:
             raise InputError("ax", f"has {len(given)} axes; this figure has {rows * columns} panels, give as many")
         return given[0].figure.figure, given

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.sliding import Kinematics, dot, kinematics, missing_force, slid, slip_rates, total
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import Drive
@@ -338,6 +339,7 @@ class Dynamics(eqx.Module):
         return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
 
 
+@validated
 def vector_field(scene: Scene) -> Dynamics:
     """The right-hand side of the scene's equations of motion.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import Dynamics, State, vector_field
 from jaxvib.equations.sliding import dot, kinematics, missing_force
 from jaxvib.errors import InputError
@@ -20,6 +21,7 @@ from jaxvib.runtime.programs import cached
 __all__ = ["energy", "foundation_force", "normal_force", "power"]
 
 
+@validated
 def foundation_force(scene: Scene, state: State) -> Array:
     """Force of all supports on the bed, gravity excluded, (nb,) N: R = sum_i (k_i y_i + b_i y_i').
 
@@ -41,6 +43,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
     return force
 
 
+@validated
 def energy(scene: Scene, state: State, t: Array | float = 0.0) -> Array:
     """Kinetic and potential energy of a state, J.
 
@@ -97,6 +100,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
     return sum(parts[1:], parts[0])
 
 
+@validated
 def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
     """Power that the rotor puts in, and power that dampers, drag and friction dissipate, W; dE/dt is their difference.
 
@@ -166,6 +170,7 @@ def _spin_power(
     return rates, (supplied, lost)
 
 
+@validated
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     """The force N with which each load presses on its track, (count,) N; negative where the track would have to pull.
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
@@ -129,7 +130,7 @@ class JammedModel(AbstractLinearModel):
         """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
         if self.carrier.gyroscopic is not None and speed is None:
             problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
-            raise InputError("machine.kind", f"is {self.scene.machine.kind!r}; {problem}")
+            raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
         return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.push)
 
 
@@ -139,6 +140,7 @@ def jammed_model(scene: Scene) -> JammedModel:
     return JammedModel(scene, model.carrier, model.mass, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
+@validated
 def natural_frequencies(scene: Scene) -> Array:
     """Undamped natural frequencies of the carrier with its loads, ascending, (nd,) rad/s.
 
@@ -249,15 +251,15 @@ def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
     and, where the formula has it, `friction`. **Raises** `InputError` that names the property a part lacks.
     """
     if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     loads, drive = scene.loads, scene.drive
     if not loads.circular:
         holds = "this holds for loads on a circle (property circular): ball, roller, pendulum"
-        raise InputError("loads.kind", f"is {loads.kind!r}, and {holds}; simulate others")
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}, and {holds}; simulate others")
     if not drive.ideal:
         raise InputError(
             "drive.kind",
-            f"is {drive.kind!r}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
+            f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
     named = "averages_out or has_friction" if friction else "averages_out"
     require_effects(

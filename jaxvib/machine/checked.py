@@ -5,20 +5,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import weakref
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import rebuilt
 from jaxvib.machine.scene import Scene, require_comparable
 from jaxvib.runtime.compat import evaluating
-from jaxvib.units import bounds_of_unknowns, traced
+from jaxvib.units import bounds_of_unknowns, require_real, traced
 
-__all__ = ["allowed_unknowns", "checked"]
+__all__ = ["allowed_unknowns", "checked", "made"]
 
 _FOUND_GOOD: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
 """Scenes that need not be looked at again, by their identity: a scene never changes."""
@@ -38,7 +38,7 @@ def checked(scene: Scene) -> Scene:
     jaxvib.errors.InputError: drive.speed is -60 rad/s; it must be greater than 0
     """
     if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     if _FOUND_GOOD.get(id(scene)) is scene:
         return scene
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
@@ -100,13 +100,30 @@ def _require_good(asked: _Asked) -> None:
     require_comparable(scene.machine, scene.loads, scene.drive)
 
 
+def made(make: Callable[..., Scene], *values: object) -> Scene:
+    """The scene that a user's function makes of some values. **Raises** `InputError` for what is no scene, as `checked` does.
+
+    >>> made(lambda x: None, 1.0)
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: make(1.0) is None; it must return a Scene
+    """
+    scene = make(*values)
+    if not isinstance(scene, Scene):
+        call = f"make({', '.join(map(quoted, values))})"
+        raise InputError(call, f"is {quoted(scene)}; it must return a Scene")
+    return checked(scene)
+
+
 def _number(name: str, leaf: object) -> Array:
     """A leaf as a floating-point array. **Raises** `InputError` for a text, and for what is known and not finite."""
+    if not isinstance(leaf, str):
+        require_real(leaf, "", name)
     if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):
         try:
             leaf = jnp.asarray(leaf, dtype=float)
         except (TypeError, ValueError) as error:
-            raise InputError(name, f"is {leaf!r}, which is not a number; put one in, in SI units") from error
+            raise InputError(name, f"is {quoted(leaf)}, which is not a number; put one in, in SI units") from error
     if not traced(leaf) and not np.all(np.isfinite(leaf)):
         wrong = np.asarray(leaf)[~np.isfinite(leaf)].ravel()[0]
         raise InputError(name, f"is {wrong}; a finite number is needed, see how it was computed")

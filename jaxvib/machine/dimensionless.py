@@ -8,7 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.platforms import Platforms
@@ -66,6 +67,7 @@ class Dimensionless(eqx.Module):
     count: int = eqx.field(static=True)
     form: Literal["antiphase", "criterion"] = eqx.field(static=True)
 
+    @validated
     def __init__(
         self,
         form: Literal["antiphase", "criterion"],
@@ -85,7 +87,7 @@ class Dimensionless(eqx.Module):
         kappa: Number = 1.0,
     ):
         if form not in ("antiphase", "criterion"):
-            raise InputError("form", f"is {form!r}; it must be 'antiphase' or 'criterion'")
+            raise InputError("form", f"is {quoted(form)}; it must be 'antiphase' or 'criterion'")
         n_i = numbers(natural, "", "natural", None, low=0.0)
         n = 1 if n_i.ndim == 0 else n_i.shape[0]
         if n not in _LINKS:
@@ -158,6 +160,7 @@ class Dimensionless(eqx.Module):
         )
         return Scene(machine, loads, ConstantSpeed(self.speed * w))
 
+    @validated
     def read(
         self, *, omega: Array | None = None, amplitude: Array | None = None, force: Array | None = None
     ) -> dict[str, Array]:
@@ -169,4 +172,7 @@ class Dimensionless(eqx.Module):
         """
         units = {"omega": self.frequency_scale, "amplitude": self.lengths, "force": self.force}
         given = {"omega": omega, "amplitude": amplitude, "force": force}
+        if amplitude is not None and jnp.shape(amplitude)[-1:] not in ((), (1,), jnp.shape(self.lengths)):
+            shape = jnp.shape(amplitude)
+            raise InputError("amplitude", f"has shape {shape}; its last axis is the {self.lengths.shape[0]} platforms")
         return {name: value / units[name] for name, value in given.items() if value is not None}

@@ -11,7 +11,8 @@ from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from jaxvib.errors import CONTROL, InputError, read_text, written
+from jaxvib.boundary import validated
+from jaxvib.errors import CONTROL, InputError, quoted, read_text, written
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, InductionMotor, RunUp, SpinUp
 from jaxvib.machine.effects.registry import EFFECTS
@@ -75,16 +76,20 @@ def closest(name: str, allowed: list[str]) -> str:
 def read_toml(path: str | Path) -> Tables:
     """The tables of a TOML file. **Raises** `InputError` for a file that is missing, no TOML, or not written by hand: larger
     than 16 MB, nested too deep, with control characters or numbers of thousands of digits."""
-    text = read_text(path, "a TOML file, in UTF-8 as `jaxvib new ... --out DIR` writes it")
+    return _tables(read_text(path, "a TOML file, in UTF-8 as `jaxvib new ... --out DIR` writes it"), str(path))
+
+
+def _tables(text: str, name: str) -> Tables:
+    """Return the tables of a TOML text. **Raises** `InputError` that begins with `name`."""
     try:
         tables = tomllib.loads(text)
         _require_plain(tables, "")
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(str(path), "is nested too deep; the files of jaxvib need four levels") from error
+        raise InputError(name, "is nested too deep; the files of jaxvib need four levels") from error
     except ValueError as error:  # no TOML, or a number of more digits than Python reads
-        raise InputError(str(path), f"is no TOML file: {error}") from error
+        raise InputError(name, f"is no TOML file: {error}") from error
     return tables
 
 
@@ -98,7 +103,7 @@ def _require_plain(value: object, name: str) -> None:
         for k, entry in enumerate(value):
             _require_plain(entry, f"{name}[{k}]")
     elif isinstance(value, str) and (found := CONTROL.search(value)):
-        raise InputError(name or "the file", f"holds the control character {found[0]!r}; leave it out")
+        raise InputError(name or "the file", f"holds the control character {quoted(found[0])}; leave it out")
 
 
 _MARKS = {
@@ -125,6 +130,7 @@ def out_of_place(name: str, tables: Tables, kind: str, allowed: list[str]) -> In
     return InputError(name, f"is no part of a {kind} file: this is a {other} file; `jaxvib new {new}` prints a {kind} file")
 
 
+@validated
 def load_scene(path: str | Path) -> Scene:
     """Reads a scene file, see `scene_from_toml`.
 
@@ -143,6 +149,7 @@ def load_scene(path: str | Path) -> Scene:
     return scene_from_tables(read_toml(path))
 
 
+@validated
 def save_scene(scene: Scene, path: str | Path) -> Path:
     """Writes a scene file that `load_scene` reads back bit for bit.
 
@@ -163,6 +170,7 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
     return path
 
 
+@validated
 def scene_from_toml(text: str) -> Scene:
     """A scene from the text of a scene file.
 
@@ -192,10 +200,7 @@ def scene_from_toml(text: str) -> Scene:
     >>> float(scene.machine.stiffness[0])
     40000.0
     """
-    try:
-        return scene_from_tables(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError("scene", f"is no TOML: {error}") from error
+    return scene_from_tables(_tables(text, "scene"))
 
 
 def scene_from_tables(tables: Tables) -> Scene:
@@ -222,18 +227,18 @@ def scene_from_tables(tables: Tables) -> Scene:
         elif value is True:
             effects.append(called(EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
-            raise InputError(f"effects.{name}", f"is {value!r}; write true, false or a table of its arguments")
+            raise InputError(f"effects.{name}", f"is {quoted(value)}; write true, false or a table of its arguments")
     return Scene(**parts, effects=tuple(effects))
 
 
 def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -> T:
     if not isinstance(table, Mapping):
-        raise InputError(section, f"is {table!r}; it must be a table, write [{section}]")
+        raise InputError(section, f"is {quoted(table)}; it must be a table, write [{section}]")
     if "kind" not in table:
         raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
     kind = table["kind"]
     if not isinstance(kind, str) or kind not in kinds:
-        raise InputError(f"{section}.kind", f"is {kind!r}; {closest(str(kind), list(kinds))}")
+        raise InputError(f"{section}.kind", f"is {quoted(kind)}; {closest(str(kind), list(kinds))}")
     return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
@@ -261,6 +266,7 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
     return [name for name, parameter in parameters.items() if parameter.default is parameter.empty]
 
 
+@validated
 def scene_to_toml(scene: Scene) -> str:
     """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit.
 

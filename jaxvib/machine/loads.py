@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
 __all__ = [
@@ -137,7 +137,7 @@ def own_radius(loads: Loads, field: str = "loads.own_radius") -> Array:
     own = getattr(loads, "own_radius", None)
     if own is None:
         advice = "give balls or rollers their own_radius"
-        raise InputError(field, f"needs loads that roll, with an own_radius; {loads.kind!r} have none here: {advice}")
+        raise InputError(field, f"needs loads that roll, with an own_radius; {quoted(loads.kind)} have none here: {advice}")
     return own
 
 

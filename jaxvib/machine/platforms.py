@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.units import Number, Numbers, count, numbers
 
@@ -105,12 +105,12 @@ def _platforms(
 
 def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...]:
     if not isinstance(links, (list, tuple)):
-        raise InputError("machine.links", f"is {links!r}; it must be a list of pairs of platforms such as [[1, 2]]")
+        raise InputError("machine.links", f"is {quoted(links)}; it must be a list of pairs of platforms such as [[1, 2]]")
     joined = []
     for index, link in enumerate(links):
         field = f"machine.links[{index}]"
         if not isinstance(link, (list, tuple)) or len(link) != 2:
-            raise InputError(field, f"is {link!r}; a link is a pair of platforms such as [1, 2]")
+            raise InputError(field, f"is {quoted(link)}; a link is a pair of platforms such as [1, 2]")
         i, j = (count(end, field) for end in link)
         if i == j or max(i, j) > n:
             raise InputError(field, f"is [{i}, {j}]; a link joins two different platforms of 1 to {n}")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.units import Number, Numbers, number, numbers, traced
 
@@ -127,7 +127,7 @@ def rotor(
         if values is None:
             return None
         if not isinstance(values, (list, tuple)) and getattr(values, "ndim", 0) != 1:
-            problem = f"is {values!r}; it must be a list of three numbers, in {', '.join(units)}"
+            problem = f"is {quoted(values)}; it must be a list of three numbers, in {', '.join(units)}"
             raise InputError(f"machine.{field}", problem)
         if len(values) != 3:
             raise InputError(f"machine.{field}", f"has {len(values)} values; 3 are needed")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
@@ -47,15 +47,15 @@ class Scene(eqx.Module):
         parts += (("drive", drive, Drive, 'ConstantSpeed("1500 rpm")'),)
         for name, part, kind, example in parts:
             if not isinstance(part, kind):
-                raise InputError(name, f"is {part!r}; it must be a {kind.__name__}, for example {example}")
+                raise InputError(name, f"is {quoted(part)}; it must be a {kind.__name__}, for example {example}")
         if isinstance(effects, Effect):
             effects = (effects,)
         if not isinstance(effects, (tuple, list)):
-            raise InputError("effects", f"is {effects!r}; it must be a tuple of effects, for example (Gravity(),)")
+            raise InputError("effects", f"is {quoted(effects)}; it must be a tuple of effects, for example (Gravity(),)")
         effects = tuple(effects)
         for index, effect in enumerate(effects):
             if not isinstance(effect, Effect):
-                raise InputError(f"effects[{index}]", f"is {effect!r}; it must be an Effect, for example Gravity()")
+                raise InputError(f"effects[{index}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
         kinds = [effect.kind for effect in effects if not effect.repeatable]
         for kind in kinds:
             if kinds.count(kind) > 1:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.loads import Loads, Pressing, Twisting, require_side_by_side, side_by_side
 from jaxvib.units import Number, number, numbers, traced
 from jaxvib.units import count as whole
@@ -118,7 +118,7 @@ def in_torus(loads: Loads, asking: str) -> TorusBalls:
     """The loads, where they are balls in a torus. **Raises** `InputError`, which says who is `asking` for them, for others."""
     if not isinstance(loads, TorusBalls):
         told = f"{asking} asks for balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
-        raise InputError("loads.kind", f"is {loads.kind!r}; {told}")
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}; {told}")
     return loads
 
 

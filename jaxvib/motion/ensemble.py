@@ -15,8 +15,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
@@ -99,6 +100,7 @@ class Ensemble(Result):
         worst = "error not estimated" if np.all(np.isnan(error)) else f"estimated error up to {np.nanmax(error):.1e}"
         return f"{head}\n  loads turn at {np.min(speeds):.6g} .. {np.max(speeds):.6g} rad/s; {worst}"
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The mean speed of each load in `unit`, over the runs.
 
@@ -111,6 +113,7 @@ class Ensemble(Result):
         return points_chart(speeds, across="run", up=f"speed of loads, {unit}", ax=ax)
 
 
+@validated
 @refuse_former(steps=FORMER["steps"])
 def ensemble(
     make: Callable[..., Scene | tuple[Scene, State]],
@@ -216,7 +219,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
             return given, initial_state(given)
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
-            raise InputError("make", f"gives {given!r}; it must give a Scene, or a Scene and a State")
+            raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
         return scene, with_spin(scene, state)
 
     return eqx.filter_vmap(one)(values)

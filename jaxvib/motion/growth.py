@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
@@ -85,6 +86,7 @@ class Growth(Result):
         lasts = "" if math.isinf(self.horizon) else f", horizon {least}{self.horizon:.3g} s"
         return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{lasts}"
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Draw the rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import growth_chart  # slow to import
@@ -92,6 +94,7 @@ class Growth(Result):
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)
 
 
+@validated
 def growth(
     scene: Scene, until: Number, *, start: Start | State = "rest", mode: int | None = None, stretches: int = 40
 ) -> Growth:
@@ -133,7 +136,7 @@ def growth(
     scene = checked(scene)
     if not scene.drive.constant:
         raise InputError(
-            "drive", f"is {scene.drive.kind!r}; how disturbances grow is asked under a constant speed: use ConstantSpeed"
+            "drive", f"is {quoted(scene.drive.kind)}; how disturbances grow is asked under a constant speed: use ConstantSpeed"
         )
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.forces import normal_force
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured, Trajectory
@@ -140,6 +141,7 @@ class Run(AbstractMeasured, Result):
             return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
         return _detached(self.scene, self.window if self.trajectory is None else self.trajectory)
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Time histories: platforms, load speeds against the rotor's, foundation force. To the left the whole run as bands
         between its peaks (the window if nothing else was kept), to the right its last three periods, where phases are seen.
@@ -159,6 +161,7 @@ class Run(AbstractMeasured, Result):
         named = dict(names=structure.coordinates, units=structure.units, directions=structure.bed_directions)
         return time_histories(whole, end, **named, unit=unit, ax=ax)
 
+    @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
         """Which frequencies the motion holds: over the window, or from piece to piece over `parts` pieces of the whole run,
         each of which shares its halves with its neighbours.
@@ -168,6 +171,7 @@ class Run(AbstractMeasured, Result):
         """
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
+    @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
         """The path of a rotor's axis across and up over the last three periods, mm; of one that tilts at every station.
 
@@ -181,7 +185,7 @@ class Run(AbstractMeasured, Result):
         if carrier.axes != (0, 1):
             kind = self.scene.machine.kind
             raise InputError(
-                "machine.kind", f"is {kind!r}, which moves up and down only; a path needs a rotor such as rotor(...)"
+                "machine.kind", f"is {quoted(kind)}, which moves up and down only; a path needs a rotor such as rotor(...)"
             )
         moved = np.asarray(self.window.state.displacement)
         moved = moved[last_periods(np.asarray(self.window.time), moved)]

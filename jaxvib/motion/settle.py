@@ -9,9 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import linear_model
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
@@ -41,6 +42,7 @@ _FALLS = -3.0
 """A drift whose logarithm falls by so many standard errors of its slope is not there to stay."""
 
 
+@validated
 @refuse_former(tolerance=FORMER["tolerance"])
 @compiled_together
 def settle(
@@ -93,7 +95,7 @@ def settle(
     require_known(scene, "settle", "jam_orbit or simulate")
     scene = checked(scene)
     if not scene.drive.constant:
-        raise InputError("drive", f"is {scene.drive.kind!r}; a motion settles under a constant speed: use ConstantSpeed")
+        raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")
     double = scene.drive.speed.dtype.itemsize >= 8
     usual, in_the_mean = 1e-6 if double else 1e-3, drift is None

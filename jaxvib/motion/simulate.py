@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
@@ -37,9 +38,7 @@ from jaxvib.units import Number, count, known_number, traced
 __all__ = ["enough_steps", "simulate"]
 
 _Control: TypeAlias = "StepControl | diffrax.AbstractStepSizeController"
-
 _MOST_STEPS = 2**31 - 1
-
 _FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
 
 _COARSER = 100.0
@@ -52,6 +51,7 @@ _STRETCH = 2.0e4
 """Turns after which single precision no longer resolves time; longer runs are cut into stretches."""
 
 
+@validated
 @refuse_former(**FORMER)
 @compiled_together
 def simulate(
@@ -123,7 +123,7 @@ def simulate(
     scene = checked(scene)
     end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
-        raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
+        raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)

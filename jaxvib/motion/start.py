@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import Spin, State
 from jaxvib.equations.sliding import dot, kinematics
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.scene import Scene
@@ -35,6 +36,7 @@ Turning = Literal["rolling", "still"]
 """How loads turn by themselves at the start: they roll on their track, or not at all in space."""
 
 
+@validated
 def initial_state(
     scene: Scene,
     start: Start = "rest",
@@ -71,9 +73,9 @@ def initial_state(
     [0.0, 0.1]
     """
     if start not in ("rest", "jam", "spin_up"):
-        raise InputError("start", f"is {start!r}; it must be 'rest', 'jam' or 'spin_up'")
+        raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'jam' or 'spin_up'")
     if start != "jam" and mode is not None:
-        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out or start in a jam")
+        raise InputError("mode", f"is {quoted(mode)}, which goes with start='jam' only; leave it out or start in a jam")
     scene = checked(scene)
     n = scene.loads.count
     mass = scene.machine.structure().mass
@@ -96,7 +98,7 @@ def initial_state(
         raise InputError("mode", "is missing; start='jam' needs the number of a jam mode, for example mode=3")
     if not scene.drive.constant:
         raise InputError(
-            "start", f"is 'jam', but the drive is {scene.drive.kind!r} and starts at another speed; start at 'rest'"
+            "start", f"is 'jam', but the drive is {quoted(scene.drive.kind)} and starts at another speed; start at 'rest'"
         )
     try:
         modes = jam_modes(scene)
@@ -132,6 +134,7 @@ def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: A
     return State(turned.real, -omega[row] * turned.imag, (angle,), (jnp.full_like(angle, omega[row]),))
 
 
+@validated
 def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:
     """The state with the loads' own rotation, as far as effects of the scene make it free; one that has it stays as it is.
 
@@ -151,7 +154,7 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     -21.0
     """
     if turning not in get_args(Turning):
-        raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
+        raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
     twists = any(effect.frees_twist for effect in scene.effects)
     slips = any(effect.slip_limit is not None for effect in scene.effects)
     if not (twists or slips):
@@ -196,7 +199,7 @@ def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number |
             raise InputError("spin_up", "goes with start='spin_up' only; leave it out or start with 'spin_up'")
         return scene
     if not scene.drive.constant:
-        raise InputError("start", f"is 'spin_up', but the drive is {scene.drive.kind!r} already; start at 'rest'")
+        raise InputError("start", f"is 'spin_up', but the drive is {quoted(scene.drive.kind)} already; start at 'rest'")
     drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
     if not traced(end - drive.duration) and drive.duration > end:
         raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
@@ -209,15 +212,17 @@ def whole_state(scene: Scene, state: State, mode: int | None, apart: Number | No
     **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `apart` is given beside it.
     """
     if apart is not None:
-        raise InputError("apart", f"is {apart!r}, which goes with named starts; put the loads' angles into the State")
+        raise InputError("apart", f"is {quoted(apart)}, which goes with named starts; put the loads' angles into the State")
     if mode is not None:
-        raise InputError("mode", f"is {mode!r}, which goes with start='jam' only; leave it out where the start is a State")
+        raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out if the start is a State")
     nd, n = scene.machine.structure().mass.shape[0], scene.loads.count
     if scene.drive.ideal != (state.rotor is None):
         needed = (
             "(angle, speed), the motor's rotor is a state" if state.rotor is None else "None, the drive alone turns the rotor"
         )
-        raise InputError("start.rotor", f"is {state.rotor!r}; under the drive {scene.drive.kind!r} it must be {needed}")
+        raise InputError(
+            "start.rotor", f"is {quoted(state.rotor)}; under the drive {quoted(scene.drive.kind)} it must be {needed}"
+        )
     for name, length in (("displacement", nd), ("velocity", nd), ("angle", n), ("rate", n)):
         shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(getattr(state, name))]
         if any(shape != (length,) for shape in shapes):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.units import traced
 
@@ -80,7 +80,7 @@ def require(chosen: object, *kinds: type) -> None:
     if chosen is not None and not isinstance(chosen, kinds):
         names = {diffrax.AbstractStepSizeController: "a step size controller of diffrax"}
         allowed = ", ".join(names.get(kind, f"{kind.__name__}(...)") for kind in kinds)
-        raise InputError("stepsize_controller", f"is {chosen!r}; it must be one of: {allowed}")
+        raise InputError("stepsize_controller", f"is {quoted(chosen)}; it must be one of: {allowed}")
 
 
 def small_number(value: float, name: str, time: Array, least: float) -> float:
@@ -94,7 +94,7 @@ def small_number(value: float, name: str, time: Array, least: float) -> float:
         # 5 % more, so that what is said, two digits, is not below what is allowed.
         raise InputError(
             name,
-            f"is {value!r}; in {time.dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
+            f"is {quoted(value)}; in {time.dtype} it must be at least {1.05 * least * precision:.2g} and less than 1"
             + ("" if plain else ", a number of Python's own such as 1e-6")
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )

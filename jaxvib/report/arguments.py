@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import EFFECTS, SECTIONS, closest
 
 __all__ = ["GROUPS", "Argument", "arguments_of", "described", "units_of_fields"]
@@ -119,9 +119,9 @@ def _shown(value: object) -> str:
 def described(group: str, name: str) -> Callable[..., object]:
     """What builds the part of that name. **Raises** `InputError` for a group or a name that there is not."""
     if group not in GROUPS:
-        raise InputError("group", f"is {group!r}; {closest(group, list(GROUPS))}")
+        raise InputError("group", f"is {quoted(group)}; {closest(group, list(GROUPS))}")
     if name not in GROUPS[group]:
-        raise InputError("name", f"is {name!r}; {closest(name, list(GROUPS[group]))}")
+        raise InputError("name", f"is {quoted(name)}; {closest(name, list(GROUPS[group]))}")
     return GROUPS[group][name]
 
 

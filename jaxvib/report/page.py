@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 
+from jaxvib.boundary import validated
 from jaxvib.errors import InputError, written
 from jaxvib.machine.scene import Scene
 from jaxvib.report.tables import Units, escaped, parameters, results, worth
@@ -64,6 +65,7 @@ class Report:
         return _PAGE.format(title=escaped(self.title), style=_STYLE, body="\n".join(filter(None, parts)))
 
 
+@validated
 def html_report(
     result: Result,
     path: str | Path,

@@ -9,12 +9,14 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
-from jaxvib.errors import InputError, written
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, written
 from jaxvib.results.fields import Labels, columns, labels_of
 
 __all__ = ["write_csv"]
 
 
+@validated
 def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     """Writes everything that a result has along an axis into a CSV file, a row for each of its points.
 
@@ -50,7 +52,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
                 rows.append(numbers)
     if not rows:
         there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
-        raise InputError("axis", f"is {axis!r}; the axes of {type(result).__name__} are: {', '.join(there) or 'none'}")
+        raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(there) or 'none'}")
     path = Path(path)
     with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -23,7 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import CONTROL, InputError, open_regular, written
+from jaxvib.boundary import validated
+from jaxvib.errors import CONTROL, InputError, open_regular, quoted, written
 from jaxvib.results.fields import Plain, is_named_tuple
 from jaxvib.results.status import is_status, member, status_names
 from jaxvib.runtime.compat import enumeration_of
@@ -59,6 +60,7 @@ def save(result: eqx.Module, path: str | Path) -> Path:
     return path
 
 
+@validated
 def load(path: str | Path) -> Any:
     """Reads a result written by `save`, of whatever class it is.
 
@@ -74,7 +76,7 @@ def load(path: str | Path) -> Any:
     ('JamModes', True)
     """
     if not isinstance(path, (str, Path)):
-        raise InputError("path", f"is {path!r}; give the path of a result written by save")
+        raise InputError("path", f"is {quoted(path)}; give the path of a result written by save")
     try:
         with open_regular(path) as file:
             arrays = _arrays(file)
@@ -86,9 +88,9 @@ def load(path: str | Path) -> Any:
             raise ValueError("not a result")
         return found
     except FileNotFoundError as error:
-        raise InputError("path", f"is {str(path)!r}; there is no such file") from error
+        raise InputError("path", f"is {quoted(str(path))}; there is no such file") from error
     except _ODD as error:
-        raise InputError("path", f"is {str(path)!r}; it is no result written by save") from error
+        raise InputError("path", f"is {quoted(str(path))}; it is no result written by save") from error
 
 
 _ODD = (
@@ -151,7 +153,7 @@ def _encoded(value: object, arrays: dict[str, np.ndarray]) -> Plain:
         return {type(value).__name__: [_encoded(entry, arrays) for entry in value]}
     if isinstance(value, Mapping):
         return {"dict": [[_encoded(name, arrays), _encoded(entry, arrays)] for name, entry in value.items()]}
-    raise InputError("result", f"holds {value!r}, which no file can hold; save what it was made from")
+    raise InputError("result", f"holds {quoted(value)}, which no file can hold; save what it was made from")
 
 
 def _encoded_field(field: dataclasses.Field, owner: object, arrays: dict[str, np.ndarray]) -> Plain:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Self, final
 
 import equinox as eqx
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.results import fields, files
 from jaxvib.results.status import sentence, status_name
 
@@ -68,12 +69,14 @@ class Result(eqx.Module):
         return fields.to_xarray(self)
 
     @final
+    @validated
     def save(self, path: str | Path) -> Path:
         """Writes the result to a NumPy archive that `load` reads back bit for bit. **Returns** its path (".npz")."""
         return files.save(self, path)
 
     @classmethod
     @final
+    @validated
     def load(cls, path: str | Path) -> Self:
         """Reads a result of this class written by `save`.
 
@@ -81,5 +84,5 @@ class Result(eqx.Module):
         """
         found = files.load(path)
         if not isinstance(found, cls):
-            raise InputError("path", f"is {str(path)!r}; it is no {cls.__name__} but holds a {type(found).__name__}")
+            raise InputError("path", f"is {quoted(str(path))}; it is no {cls.__name__} but holds a {type(found).__name__}")
         return found

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jax
 
+from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.runtime.compat import user_folder
 
@@ -18,6 +19,7 @@ __all__ = ["compiled_anew", "default_folder", "use_cache"]
 _folder: list[Path] = []
 
 
+@validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
     """Caches compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
 

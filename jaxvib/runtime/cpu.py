@@ -9,7 +9,8 @@ import platform
 import re
 from pathlib import Path
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import accepted_flags, backend_started, wide_vectors_are_right
 
 __all__ = ["has_flags", "prepare_cpu", "processor"]
@@ -22,6 +23,7 @@ _COMPILING = "--xla_cpu_use_fusion_emitters=false"
 _WIDTH = "--xla_cpu_prefer_vector_width"
 
 
+@validated
 def prepare_cpu(devices: int | None = 1) -> str:
     """Lets XLA compile a whole time loop into one function; it must be called before JAX computes anything.
 
@@ -52,7 +54,7 @@ def prepare_cpu(devices: int | None = 1) -> str:
     if devices is None:
         devices = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
-        raise InputError("devices", f"is {devices!r}; it must be a whole number, at least 1, or None for all cores")
+        raise InputError("devices", f"is {quoted(devices)}; it must be a whole number, at least 1, or None for all cores")
     if backend_started():
         raise InputError("prepare_cpu", "comes too late, JAX has begun to compute; call it before any array is made")
     flags = os.environ.get("XLA_FLAGS", "").split()

@@ -10,11 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 
+from jaxvib.boundary import validated
 from jaxvib.draw.machine.film import Film
 from jaxvib.draw.machine.parts import Part, put
 from jaxvib.draw.motion.histories import period_of
 from jaxvib.draw.style import COLORS, GUIDE, STROKES, legend_above, panels
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.show.motion import Stretch, of_orbit, of_run
@@ -36,6 +37,7 @@ _MOST = 600
 """Pictures of a film."""
 
 
+@validated
 def animate(
     motion: Run | Orbit,
     path: str | Path | None = None,
@@ -78,9 +80,9 @@ def animate(
     """
     owner = checked_scene(_scene_of(motion, scene))
     if path is not None and Path(path).suffix.lower() not in (".gif", ".html", ".htm"):
-        raise InputError("path", f"is {str(path)!r}; films are written as .gif or .html")
+        raise InputError("path", f"is {quoted(str(path))}; films are written as .gif or .html")
     if isinstance(fps, bool) or not isinstance(fps, int) or not 1 <= fps <= 50:
-        raise InputError("fps", f"is {fps!r}; it must be a whole number of pictures a second, 1 to 50")
+        raise InputError("fps", f"is {quoted(fps)}; it must be a whole number of pictures a second, 1 to 50")
     first, last = _stretch(motion, begin, end)
     speed = _fastest(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)

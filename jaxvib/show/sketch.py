@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax
 from matplotlib.axes import Axes
 
+from jaxvib.boundary import validated
 from jaxvib.draw.machine.parts import put
 from jaxvib.draw.style import Drawn, panels
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.show.views import View, view_of
 from jaxvib.show.wheel import at_rest, caption
@@ -19,6 +20,7 @@ _INCH = 0.62
 """Inches of a drawing's unit."""
 
 
+@validated
 def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
     """Draws a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
 
@@ -52,7 +54,7 @@ def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
 def checked_scene(scene: object) -> Scene:
     """The scene. **Raises** `InputError` for what is none, and for one whose numbers are not known."""
     if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     if any(traced(leaf) for leaf in jax.tree.leaves(scene)):
         raise InputError(
             "scene", "has numbers that are not known under a JAX transformation; draw it outside of jit, grad or vmap"

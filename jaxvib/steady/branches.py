@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
@@ -49,6 +50,7 @@ class Branches(AbstractJam):
         )
         return branch_summary(self, [("fold", w, n) for w, n in folds], JUDGED)
 
+    @validated
     def plot(
         self,
         *,
@@ -73,10 +75,12 @@ class Branches(AbstractJam):
         return picture(self, marks, unit, most, JUDGED, show, ax, np.asarray(self.mode), np.asarray(self.resonances))
 
 
+@validated
 @overload
 def branches(scene: Scene, *, exact: Literal[False] = False, points: int = 2000, most: Number | None = None) -> Branches: ...
 
 
+@validated
 @overload
 def branches(
     scene: Scene,
@@ -89,6 +93,7 @@ def branches(
 ) -> ExactBranches: ...
 
 
+@validated
 def branches(
     scene: Scene,
     *,

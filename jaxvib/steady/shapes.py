@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import linear_model
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -46,6 +47,7 @@ class ModeShapes(Result):
         ]
         return "\n".join(parts)
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The shapes as bars, a group for each mode with its frequency in `unit`.
 
@@ -56,6 +58,7 @@ class ModeShapes(Result):
         return shapes_chart(np.asarray(self.frequency), np.asarray(self.shape), names=self.coordinates, unit=unit, ax=ax)
 
 
+@validated
 def mode_shapes(scene: Scene) -> ModeShapes:
     """Natural frequencies and mode shapes of the machine with its loads on it, no damping, rotor at rest.
 

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import LinearModel, linear_model
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -104,6 +105,7 @@ class Whirl(Result):
         lost = [self.message] if self.status_name != "done" else []
         return "\n".join([*lines, *lost, self.critical.summary()])
 
+    @validated
     def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, the synchronous line with the
         critical speeds on it, and the speed `at` which the rotor runs, rad/s, where it is given. Speeds are drawn in `unit`.
@@ -117,6 +119,7 @@ class Whirl(Result):
         return campbell_diagram(*whirls, critical=critical, at=at, unit=unit, ax=ax)
 
 
+@validated
 def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
     """Whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
 
@@ -220,6 +223,7 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
     return -(2.0 * values + c / m).real, step / length
 
 
+@validated
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
     """Synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
 
@@ -265,7 +269,7 @@ def _two_directions(scene: Scene) -> LinearModel:
     if carrier.axes != (0, 1):
         raise InputError(
             "machine.kind",
-            f"is {scene.machine.kind!r}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
+            f"is {quoted(scene.machine.kind)}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
             "whirl needs a rotor such as rotor(...)",
         )
     if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
@@ -171,7 +171,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
             raise InputError(f"axes.{name}", f"goes from {low:g} to {high:g}; the first must be less than the second")
         scale = spec.get("scale", "even")
         if scale not in ("even", "log"):
-            raise InputError(f"axes.{name}.scale", f"is {scale!r}; it must be 'even' or 'log'")
+            raise InputError(f"axes.{name}.scale", f"is {quoted(scale)}; it must be 'even' or 'log'")
         if scale == "log" and not low > 0.0:
             raise InputError(f"axes.{name}.from", f"is {low:g}, and the scale 'log'; it must be greater than 0 there")
         values = None
@@ -181,7 +181,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         axis = Axis(name, unit, values, low, high, scale == "log", spot)
     else:
         if isinstance(spec, str) or not isinstance(spec, (list, tuple, np.ndarray)) or len(spec) == 0:
-            raise InputError(f"axes.{name}", f"is {spec!r}; give a list of values, or a table with from, to and count")
+            raise InputError(f"axes.{name}", f"is {quoted(spec)}; give a list of values, or a table with from, to and count")
         values = np.asarray([value(v, f"axes.{name}[{k}]") for k, v in enumerate(spec)])
         if np.unique(values).size < values.size:
             raise InputError(f"axes.{name}", "has a value twice; name each one once")

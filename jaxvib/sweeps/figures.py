@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.files import closest, scene_from_toml
 from jaxvib.steady.orbits.diagram import exact_branches
@@ -125,7 +125,7 @@ def plot_map(
     grid = [d for d in dims if d != SAMPLE]
     for name, given in (("x", x), ("y", y)):
         if given is not None and given not in grid:
-            raise InputError(name, f"is {given!r}; {closest(given, grid)}")
+            raise InputError(name, f"is {quoted(given)}; {closest(given, grid)}")
     rest = [d for d in grid if d not in (x, y)]
     across = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
     rest = [d for d in rest if d != across]
@@ -159,7 +159,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     grid = [d for d in dims if d != SAMPLE]
     over = over or (grid[0] if grid else None)
     if over not in grid:
-        raise InputError("over", f"is {over!r}; {closest(str(over), grid)}")
+        raise InputError("over", f"is {quoted(over)}; {closest(str(over), grid)}")
     if not _has_labels(opened):
         raise InputError("store", "has neither regime nor mode, whose shares could be shown; measure run.regime")
     place = dims.index(over)
@@ -188,7 +188,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
         values = values[np.isfinite(values)]
         low, high = min(low, np.min(values, initial=np.inf)), max(high, np.max(values, initial=-np.inf))
     if not low <= high:
-        raise InputError("measure", f"is {name!r}, which no case has; name another one: {', '.join(opened.names)}")
+        raise InputError("measure", f"is {quoted(name)}, which no case has; name another one: {', '.join(opened.names)}")
     edges = np.linspace(low, high if high > low else low + max(abs(low), 1.0) * 1e-6, _BINS + 1)
     counts = sum(np.histogram(_values(opened, name, rows), edges)[0] for rows in opened.pieces())
     return distribution_chart(edges, np.asarray(counts), across=_measure_label(opened, name), ax=ax)
@@ -219,7 +219,7 @@ def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | No
                 chosen = there & inside
                 sums[axis][k] += [np.sum(values[chosen]), np.sum(chosen)]
     if not found[1]:
-        raise InputError("measure", f"is {name!r}, which no case has; name another one: {', '.join(opened.names)}")
+        raise InputError("measure", f"is {quoted(name)}, which no case has; name another one: {', '.join(opened.names)}")
     means = np.asarray([sums[axis][:, 0] / np.maximum(sums[axis][:, 1], 1) for axis in axes])
     means = np.where(np.asarray([sums[axis][:, 1] for axis in axes]) > 0, means, np.nan)
     label = f"mean {_measure_label(opened, name)}"
@@ -259,7 +259,7 @@ def _measure(store: Store, name: str | None) -> str:
     plain = [n for n in store.names if not _is_label(store, n)]
     found = name or next(iter(plain or store.names))
     if found not in store.names:
-        raise InputError("measure", f"is {found!r}; {closest(found, list(store.names))}")
+        raise InputError("measure", f"is {quoted(found)}; {closest(found, list(store.names))}")
     return found
 
 

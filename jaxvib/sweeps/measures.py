@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import closest
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.lanes import WatchedRun
@@ -113,4 +113,6 @@ def measure_of(given: Measure | str, field: str) -> Measure:
     if isinstance(given, str) and given in RUN_MEASURES:
         return RUN_MEASURES[given]
     advice = closest(str(given), list(RUN_MEASURES))
-    raise InputError(field, f"is {given!r}; give a quantity of optimize, such as jam_frequency(mode=3), or a name; {advice}")
+    raise InputError(
+        field, f"is {quoted(given)}; give a quantity of optimize, such as jam_frequency(mode=3), or a name; {advice}"
+    )

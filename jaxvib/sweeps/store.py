@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.imported import code_state, digest_of_sources
 from jaxvib.machine.files import Tables
 from jaxvib.results.fields import Plain
@@ -79,7 +79,7 @@ class Store:
         zarr = require_zarr()
         self.path = path
         if not path.exists():
-            raise InputError("store", f"is {str(path)!r}; there is no such store")
+            raise InputError("store", f"is {quoted(str(path))}; there is no such store")
         changed = seals.changed_layout(path)
         if changed is not None:
             raise self.damaged(changed)
@@ -87,7 +87,7 @@ class Store:
             self.group = zarr.open_group(path, mode="r+" if writable else "r", zarr_format=3)
             self.attributes: Tables = dict(self.group.attrs)
             if self.attributes.get("jaxvib_sweep") != _FORMAT:
-                raise InputError("store", f"is {str(path)!r}, which is no store of a sweep; name another one")
+                raise InputError("store", f"is {quoted(str(path))}, which is no store of a sweep; name another one")
             self.record: Tables = self.attributes["study"]
             # A chunk without any answer gets its file too: one that is missing is damage.
             with zarr.config.set({"array.write_empty_chunks": True}):
@@ -104,7 +104,7 @@ class Store:
     def damaged(self, what: str) -> InputError:
         """The error to raise for a store that cannot be used."""
         return InputError(
-            "store", f"is {str(self.path)!r}, which is no store of a sweep, or a damaged one ({what}); name another"
+            "store", f"is {quoted(str(self.path))}, which is no store of a sweep, or a damaged one ({what}); name another"
         )
 
     @classmethod
@@ -297,7 +297,7 @@ def cannot_write(path: Path, error: OSError) -> InputError:
     """The error to raise where a store cannot be written: finished chunks are safe all the same."""
     why = error.strerror or str(error)
     advice = "make room or name another store; chunks that are finished are kept, and the same command goes on from there"
-    return InputError("store", f"is {str(path)!r}, which cannot be written ({why}); {advice}")
+    return InputError("store", f"is {quoted(str(path))}, which cannot be written ({why}); {advice}")
 
 
 def _fill(zarr: ModuleType, path: Path, study: Study) -> None:

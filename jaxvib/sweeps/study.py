@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from jaxvib.errors import ComputationError, InputError, require_one_of, shown
+from jaxvib.errors import ComputationError, InputError, quoted, require_one_of
 from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
@@ -133,7 +133,7 @@ def _named(measure: Measures) -> tuple[tuple[str, ...], tuple[Measure, ...]]:
             return tuple(found), tuple(found.values())
         measure = ()
     if isinstance(measure, (str, Quantity, RunMeasure)) or not isinstance(measure, Sequence) or not measure:
-        raise InputError("measure", f"is {measure!r}; give a list of what is measured, such as ['run.regime']")
+        raise InputError("measure", f"is {quoted(measure)}; give a list of what is measured, such as ['run.regime']")
     measures = [measure_of(m, f"measure[{k}]") for k, m in enumerate(measure)]
     names = [m.name.removeprefix("run.").replace(" ", "_").replace("/", "_per_") for m in measures]
     several = {name for name in names if names.count(name) > 1}
@@ -173,7 +173,7 @@ def load_study(path: str | Path) -> Study:
         if name not in tables:
             raise InputError(name, "is missing; a study file needs scene, [axes] and [[measure]]")
     if not isinstance(tables["scene"], str):
-        raise InputError("scene", f"is {tables['scene']!r}; give the path of a scene file, in quotes")
+        raise InputError("scene", f"is {quoted(tables['scene'])}; give the path of a scene file, in quotes")
     for name in ("axes", "run"):
         if not isinstance(tables.get(name, {}), Mapping):
             raise InputError(name, f"is not a table; write [{name}]")
@@ -198,11 +198,11 @@ def load_study(path: str | Path) -> Study:
 
 def _measure(table: object, field: str, path: Path) -> tuple[str, Measure | str]:
     if not isinstance(table, Mapping):
-        raise InputError(field, f"is {table!r}; it must be a table with a quantity")
+        raise InputError(field, f"is {quoted(table)}; it must be a table with a quantity")
     name, rest = table.get("name", ""), {key: value for key, value in table.items() if key != "name"}
     for key in ("name", "function", "unit", "quantity"):
         if not isinstance(table.get(key, ""), str):
-            raise InputError(f"{field}.{key}", f"is {shown(table[key])}; write a text in quotes")
+            raise InputError(f"{field}.{key}", f"is {quoted(table[key])}; write a text in quotes")
     if "function" in rest:
         return name, _function(rest, name, field)
     if str(rest.get("quantity", "")).startswith("run."):
@@ -224,7 +224,7 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
         found = getattr(importlib.import_module(module), function)
     except Exception as error:  # whatever the module of the user raises
         said = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
-        problem = f"is {shown(table['function'])}, which cannot be imported ({said}); write 'module:function'"
+        problem = f"is {quoted(table['function'])}, which cannot be imported ({said}); write 'module:function'"
         raise InputError(f"{field}.function", problem) from error
     return Quantity(name or function, str(table.get("unit", "")), found)
 

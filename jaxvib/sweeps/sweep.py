@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.machine.files import scene_from_toml
 from jaxvib.machine.scene import Scene
@@ -94,6 +95,7 @@ class Sweep(Result):
             lines.append(f"  {self.computed} of them in this call, in {self.seconds:.3g} s ({each:.3g} ms a case)")
         return "\n".join(lines)
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.sweeps.figures import plot_sweep
@@ -101,6 +103,7 @@ class Sweep(Result):
         return plot_sweep(self.store, ax=ax)
 
 
+@validated
 def sweep(
     scene: Scene,
     axes: Mapping[str, AxisSpec],
@@ -247,6 +250,7 @@ def _cases(asked: Study, chunk: int) -> int:
     return int(np.prod([s.stop - s.start for s in asked.grid.region(chunk)], dtype=np.int64))
 
 
+@validated
 def open_sweep(store: str | Path) -> Sweep:
     """Read the store of a study that was run, or is being run: every file once, so that damaged chunks are known and counted.
 

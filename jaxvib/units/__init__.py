@@ -15,7 +15,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.errors import InputError, shown
+from jaxvib.boundary import is_whole
+from jaxvib.errors import InputError, quoted
 from jaxvib.runtime.compat import traced
 from jaxvib.units.reading import Number, Numbers, Quantity, in_own_unit, require_real, to_float, unit_name, unit_ratio
 
@@ -62,6 +63,10 @@ def bounds_of_unknowns() -> Iterator[list[Array]]:
         yield found
     finally:
         _COLLECTED.reset(token)
+
+
+_MAX_NUMBERS = 10**7
+"""The longest list of numbers; larger ones come as arrays."""
 
 
 def _checked(value: Array | np.ndarray, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
@@ -120,10 +125,13 @@ def numbers(
     [44000.0, 50000.0]
     """
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes, bytearray)):
-        parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
-        for i, part in enumerate(parts):
-            if np.ndim(part) != 0:
+        if len(value) > (_MAX_NUMBERS if length is None else length):
+            needed = f"{length} are needed" if length is not None else f"at most {_MAX_NUMBERS} are allowed"
+            raise InputError(field, f"has {len(value)} values; {needed}")
+        for i, part in enumerate(value):
+            if isinstance(part, (list, tuple)) or getattr(part, "ndim", 0) != 0:
                 raise InputError(f"{field}[{i}]", f"is not a single number; write a number in {unit_name(unit)}")
+        parts = [to_float(v, unit, f"{field}[{i}]") for i, v in enumerate(value)]
         if length is not None and len(parts) != length:
             raise InputError(field, f"has {len(parts)} values; {length} are needed")
         if not parts:
@@ -162,9 +170,9 @@ def _converted(
             with np.errstate(over="ignore"):  # what single precision cannot hold is infinite, which `_checked` refuses
                 array = np.asarray(value, dtype=float).astype(jnp.result_type(float))
     except OverflowError as error:
-        raise InputError(field, f"is {shown(value)}, which is too large; give a number below 1e308") from error
+        raise InputError(field, f"is {quoted(value)}, which is too large; give a number below 1e308") from error
     except (TypeError, ValueError) as error:
-        raise InputError(field, f"is {shown(value)}, which is not a number; write a number in {unit_name(unit)}") from error
+        raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}") from error
     if array.shape != shape:
         raise InputError(field, f"has shape {array.shape}; one number in {unit_name(unit)} is needed")
     _checked(array, field, unit, low, open_low, place="each" if shape else "")
@@ -185,13 +193,13 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
         ...
     jaxvib.errors.InputError: loads.count is 0; it must be a whole number, at least 1
     """
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < low:
-        raise InputError(field, f"is {shown(value)}; it must be a whole number, at least {low}")
+    if not isinstance(value, (int, np.integer)) or not is_whole(value) or value < low:
+        raise InputError(field, f"is {quoted(value)}; it must be a whole number, at least {low}")
     if each and 2.0**30 / each < value < 2**63:
         room = 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2.0**33
         if value * each > room:
             needs = f"needs {value * each / 2.0**30:.3g} GiB, more than half of this machine's memory"
             raise InputError(field, f"is {value}, which {needs}; {int(room / each)} at most fit")
     if value > _MAX_COUNT:
-        raise InputError(field, f"is {shown(value)}; it must be a whole number from {low} to {_MAX_COUNT}")
+        raise InputError(field, f"is {quoted(value)}; it must be a whole number from {low} to {_MAX_COUNT}")
     return int(value)

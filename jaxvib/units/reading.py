@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-import numbers as numbers_of
 import re
 import tokenize
 from collections.abc import Sequence
-from decimal import Decimal
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, shown
+from jaxvib.boundary import is_real
+from jaxvib.errors import InputError, quoted
 
 __all__ = ["Number", "Numbers", "Quantity", "in_own_unit", "require_real", "to_float", "unit_name", "unit_ratio"]
 
@@ -117,8 +115,8 @@ def to_float(value: Number, unit: str, field: str) -> float | Array | np.ndarray
         parts = _TEXT.fullmatch(text) if len(text) < 100 else None
         if parts is None:
             if len(text) < 100 and _COMMA.fullmatch(text):
-                point, none = shown(text.replace(",", ".")), shown(text.replace(",", ""))
-                raise InputError(field, f"is {shown(value)}, with a comma; write {point} for a decimal comma, else {none}")
+                point, none = quoted(text.replace(",", ".")), quoted(text.replace(",", ""))
+                raise InputError(field, f"is {quoted(value)}, with a comma; write {point} for a decimal comma, else {none}")
             raise _wrong_unit(value, unit, field)
         magnitude, written = float(parts[1]), (parts[2] + parts[3]).strip()
         factor = _FACTORS.get(unit, {}).get("rpm" if written in _PER_MINUTE else _SPELLINGS.get(written, written))
@@ -144,26 +142,17 @@ def require_real(value: object, unit: str, field: str) -> None:
         ...
     jaxvib.errors.InputError: machine.mass is True, which is not a number; write a number in kg
     """
-    if type(value) is float or type(value) is int:
-        return
-    kind = getattr(value, "dtype", None)
     if np.ma.is_masked(value):
         raise InputError(field, "has masked values; fill them in or leave them out")
-    if getattr(kind, "kind", "O") == "O":
-        entries = np.asarray(value, dtype=object).ravel() if isinstance(value, np.ndarray) else (value,)
-        real = all(isinstance(each, (numbers_of.Real, Decimal)) and not isinstance(each, (bool, np.bool_)) for each in entries)
-    else:
-        assert kind is not None
-        real = kind.kind != "m" and (jnp.issubdtype(kind, np.floating) or jnp.issubdtype(kind, np.integer))
-    if not real and not (kind is None and hasattr(value, "__jax_array__")):
-        raise InputError(field, f"is {shown(value)}, which is not a number; write a number in {unit_name(unit)}")
+    if not is_real(value):
+        raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}")
 
 
 def _wrong_unit(value: str, unit: str | None, field: str) -> InputError:
     """Return the error about a text that is not in `unit`, None for a text without a readable unit of its own."""
     wanted = "no number with a unit" if unit is None else f"not in {unit}" if unit else "no plain number"
     return InputError(
-        field, f"is {shown(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
+        field, f"is {quoted(value)}, which is {wanted}; write for example {_example('m' if unit is None else unit)}"
     )
 
 
@@ -192,6 +181,8 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
     and for a bare 1/s where a speed is needed."""
     import pint
 
+    if not hasattr(given, "units"):  # a quantity of another library
+        return given.m_as(unit or "dimensionless")
     require_real(given.m, unit, field)
     try:
         registry, wanted = pint.get_application_registry(), _parsed(unit)
@@ -210,7 +201,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         return magnitude * (2.0 * math.pi) ** (hertz - wanted_hertz)
     if angle != wanted_angle and not rest.keys() - {"second"}:
         if unit == "rad/s":
-            raise InputError(field, f"is {shown(text)}, which does not say what it counts; write {_example(unit)}")
+            raise InputError(field, f"is {quoted(text)}, which does not say what it counts; write {_example(unit)}")
         raise _wrong_unit(text, unit, field)
     return magnitude
 
@@ -269,5 +260,5 @@ def in_own_unit(value: str | Quantity, field: str) -> tuple[float, str]:
 
 def _finite(value: Any, field: str) -> float:
     if not math.isfinite(value):
-        raise InputError(field, f"is {shown(float(value))}; a finite number is needed")
+        raise InputError(field, f"is {quoted(float(value))}; a finite number is needed")
     return float(value)

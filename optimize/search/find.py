@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
@@ -73,7 +73,7 @@ class Found(NamedTuple):
 def require_searcher(searcher: object) -> None:
     """**Raises** `InputError` for what is no `Searcher`, or one that is not installed."""
     if searcher not in get_args(Searcher):
-        raise InputError("searcher", f"is {searcher!r}; it must be one of: {', '.join(map(repr, get_args(Searcher)))}")
+        raise InputError("searcher", f"is {quoted(searcher)}; it must be one of: {', '.join(map(repr, get_args(Searcher)))}")
     if searcher == "cma":
         require_cma()
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
 from optimize.space.numbers import Place, changed, names_of, places_of, present_places
@@ -151,7 +151,7 @@ class DesignSpace(eqx.Module):
         self.counts = counts
         for held in hold:
             if not isinstance(held, Held):
-                raise InputError("hold", f"has {held!r}; wrap quantities in optimize.hold(...)")
+                raise InputError("hold", f"has {quoted(held)}; wrap quantities in optimize.hold(...)")
         self.held = tuple(_with_value(held, scene) for held in hold)
         if len(self.held) >= self.size:
             raise InputError(
@@ -226,14 +226,14 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[Place, float, floa
         raise InputError(f"free.{name}", f'is a table; write the whole name in quotes, for example "{example}"')
     place = places_of(scene, name, "free")
     if not isinstance(bounds, (list, tuple)) or len(bounds) not in (2, 3):
-        raise InputError(f"free.{name}", f"is {bounds!r}; give the bounds as (low, high)")
+        raise InputError(f"free.{name}", f"is {quoted(bounds)}; give the bounds as (low, high)")
     low, high = (float(number(b, place.unit, f"free.{name}", low=0.0)) for b in bounds[:2])
     if not low < high:
         raise InputError(f"free.{name}", f"has bounds {low:g} and {high:g}; the first must be less than the second")
     log = low > 0.0 and high / low >= 10.0
     if len(bounds) == 3:
         if bounds[2] not in ("log", "even"):
-            raise InputError(f"free.{name}", f"has the scale {bounds[2]!r}; it must be 'log' or 'even'")
+            raise InputError(f"free.{name}", f"has the scale {quoted(bounds[2])}; it must be 'log' or 'even'")
         log = bounds[2] == "log"
         if log and not low > 0.0:
             raise InputError(f"free.{name}", "has the scale 'log' and a low bound of 0; give a low bound greater than 0")
@@ -246,7 +246,7 @@ def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict
     counts: tuple[int, ...] = ()
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
-            raise InputError(f"choices.{name}", f"is {values!r}; give a list of values")
+            raise InputError(f"choices.{name}", f"is {quoted(values)}; give a list of values")
         if name == "loads.count":
             counts = tuple(sorted({count(v, f"choices.{name}") for v in values}))
             continue
@@ -268,7 +268,7 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         pair = isinstance(given, (list, tuple)) and len(given) == 2
         source_name, factor = given if pair else (given, 1.0)
         if not isinstance(source_name, str):
-            raise InputError(f"ties.{name}", f"is {given!r}; give another number's name, or (name, factor)")
+            raise InputError(f"ties.{name}", f"is {quoted(given)}; give another number's name, or (name, factor)")
         source = places_of(scene, source_name, f"ties.{name}")
         if source.entries & target.entries:
             raise InputError(f"ties.{name}", "is tied to itself; name another number")
@@ -280,7 +280,7 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
         elif isinstance(factor, (int, float)) and not isinstance(factor, bool) and factor > 0.0:
             ratio = np.full(target.size, float(factor))
         else:
-            raise InputError(f"ties.{name}", f"has the factor {factor!r}; give a number greater than 0, or 'keep'")
+            raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number greater than 0, or 'keep'")
         if target.entry is None and target.leaf(scene).ndim > 0:  # what the machine does not have follows nothing
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from jaxvib.boundary import validated
 from optimize.wishes.quantity import Quantity, require_quantity
 
 __all__ = ["maximize", "minimize", "negative"]
 
 
+@validated
 def negative(quantity: Quantity) -> Quantity:
     """Minus a quantity: what a search makes small, to make the quantity large. The same as `-quantity`.
 
@@ -18,6 +20,7 @@ def negative(quantity: Quantity) -> Quantity:
     return -quantity
 
 
+@validated
 def minimize(quantity: Quantity) -> Quantity:
     """The quantity itself, which a search makes small: it says so where it is read.
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model, linear_model, natural_frequencies
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
@@ -107,7 +107,7 @@ class Answers:
         """The jam mode of that number, NaN where it does not exist."""
         most = 2 * self.scene.machine.structure().mass.shape[0] + 1
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
-            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
         key: Key = (self.path, ("jam", mode))
         if key not in self._jams:
             jam = self.modes.select(mode, throw=False) if self.known is None else follow_jam(self.jammed, mode, self.known[key])

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
@@ -153,6 +154,7 @@ class Robust(_OfPart):
         return self.parts[0].easy
 
 
+@validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
     """A quantity at another operating point or under another load: some numbers of the scene have other values.
 
@@ -168,7 +170,7 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     """
     require_quantity(quantity, "quantity")
     if not isinstance(changes, Mapping) or not changes:
-        raise InputError("changes", f"is {changes!r}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
+        raise InputError("changes", f"is {quoted(changes)}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
     values = tuple((key, value_of(key, value)) for key, value in changes.items())
     case = Changed(name, values)
     return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
@@ -177,10 +179,10 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
 def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, seed: int, how: str, level: float) -> Quantity:
     require_quantity(quantity, "quantity")
     if not isinstance(tolerances, Mapping) or not tolerances:
-        raise InputError("tolerances", f"is {tolerances!r}; give a dictionary such as {{'machine.stiffness': 0.05}}")
+        raise InputError("tolerances", f"is {quoted(tolerances)}; give a dictionary such as {{'machine.stiffness': 0.05}}")
     for name, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
-            raise InputError(f"tolerances.{name}", f"is {value!r}; give a share such as 0.05 for 5 %")
+            raise InputError(f"tolerances.{name}", f"is {quoted(value)}; give a share such as 0.05 for 5 %")
     case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), seed)
     words = how if how != "quantile" else f"{level:.0%} quantile of"
     return Robust(
@@ -188,6 +190,7 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
     )
 
 
+@validated
 def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
     """The mean of a quantity over machines whose numbers are off.
 
@@ -204,6 +207,7 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
     return _robust(quantity, tolerances, samples, seed, "expected", 0.0)
 
 
+@validated
 def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
     """The largest value of a quantity over machines whose numbers are off, see `expected`; of one that shall be large, take
     `-worst(-quantity, ...)`.
@@ -215,6 +219,7 @@ def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int =
     return _robust(quantity, tolerances, samples, seed, "worst", 0.0)
 
 
+@validated
 def quantile(
     quantity: Quantity, level: float, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0
 ) -> Quantity:
@@ -225,5 +230,5 @@ def quantile(
     '95% quantile of foundation force, mode 3'
     """
     if isinstance(level, bool) or not isinstance(level, (int, float)) or not 0.0 < level < 1.0 or math.isnan(level):
-        raise InputError("level", f"is {level!r}; it must be greater than 0 and less than 1")
+        raise InputError("level", f"is {quoted(level)}; it must be greater than 0 and less than 1")
     return _robust(quantity, tolerances, samples, seed, "quantile", float(level))

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.collected import light_friction
 from jaxvib.equations.linear import jammed_loads, peak_force
-from jaxvib.errors import InputError, shown
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
@@ -45,7 +46,7 @@ def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
         return platforms[0]
     if whole and len(platforms) == 2 and platforms[0] != platforms[1]:
         return platforms[0], platforms[1]
-    raise InputError("of", f"is {of!r}; give a platform or a pair of different platforms of 1 to {n}")
+    raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms of 1 to {n}")
 
 
 def _asking(
@@ -76,10 +77,11 @@ def _pair(of: Pair | list[int]) -> Pair:
     parts = of if isinstance(of, (list, tuple)) else (of,)
     whole = all(isinstance(part, (int, np.integer)) and not isinstance(part, bool) for part in parts)
     if of is not None and not (whole and len(parts) == (2 if parts is of else 1)):
-        raise InputError("of", f"is {shown(of)}; give a platform or a pair of different platforms")
+        raise InputError("of", f"is {quoted(of)}; give a platform or a pair of different platforms")
     return tuple(of) if isinstance(of, list) else of  # pyright: ignore[reportReturnType]
 
 
+@validated
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
 
@@ -111,6 +113,7 @@ def _amplitude(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
     return run.amplitude[chosen - 1] if isinstance(chosen, int) else relative_amplitude(run.window, *chosen)
 
 
+@validated
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
     """By how much two platforms are out of phase in a jam mode, rad: 0 in phase, pi in antiphase; of the exact motion that of
     their first harmonics.
@@ -125,7 +128,7 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     """
     pair = _pair(of)
     if not isinstance(pair, tuple) or len(pair) != 2:
-        raise InputError("of", f"is {of!r}; a phase is that between two platforms, give a pair such as (1, 2)")
+        raise InputError("of", f"is {quoted(of)}; a phase is that between two platforms, give a pair such as (1, 2)")
     text = f"phase between platforms {pair[0]} and {pair[1]}"
     return _asking("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 
@@ -142,6 +145,7 @@ def _phase(answers: Answers, tier: Tier, mode: int, of: tuple[int, int]) -> Arra
     return jnp.arctan2(jnp.abs(turned.imag), turned.real)
 
 
+@validated
 def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
     """Force of all supports on the bed in a jam mode, N zero to peak.
 
@@ -176,6 +180,7 @@ def _force(answers: Answers, tier: Tier, mode: int, harmonic: int | None) -> Arr
     return peak_force(orbit.force_harmonics[:, orbit.orders.index(harmonic)])
 
 
+@validated
 def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
     """Foundation force per amplitude in a jam mode, N/m; whose amplitude, and the tiers, as `amplitude`.
 
@@ -208,6 +213,7 @@ def _peaks_per_amplitude(answers: Answers, sign: float, tier: Tier, mode: int, o
     return _peaks(answers, sign, tier, mode, None) / _amplitude(answers, tier, mode, of)
 
 
+@validated
 def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Speed Omega at which the loads jam in a mode, rad/s.
 
@@ -229,6 +235,7 @@ def _frequency(answers: Answers, tier: Tier, mode: int) -> Array:
     return answers.orbit(mode).omega if tier == "exact" else answers.jam_run(mode).omega
 
 
+@validated
 def fold_margin(*, mode: int) -> Quantity:
     """By how much the rotor's speed may change, up or down, before a jam mode vanishes at a fold, rad/s, to leading order.
 
@@ -261,6 +268,7 @@ def _margins(answers: Answers, sign: float, tier: Tier, mode: int) -> Array:
     return -both if sign < 0.0 else jnp.minimum(both[0], both[1])[None]
 
 
+@validated
 def largest_multiplier(*, mode: int) -> Quantity:
     """The largest modulus of the non-trivial Floquet multipliers of the exact motion: below 1 it is stable.
 
@@ -277,6 +285,7 @@ def _multiplier(answers: Answers, tier: Tier, mode: int) -> Array:
     return answers.orbit(mode).multiplier
 
 
+@validated
 def power(*, mode: int, tier: Tier = "leading") -> Quantity:
     """Mean power that the loads take from the rotor in a jam mode, W: n sum_j b_W R^2 (n - Omega), and what dry friction takes.
 

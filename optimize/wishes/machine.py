@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import linear_model
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.units import FIELD_UNITS, Number, count
@@ -31,7 +32,7 @@ def _asking(name: str, unit: str, function: Callable[..., Array], text: str, *se
 
 def _platforms(scene: Scene, what: str) -> Platforms:
     if not isinstance(scene.machine, Platforms):
-        raise InputError("machine.kind", f"is {scene.machine.kind!r}; {what} is that of a machine of platforms")
+        raise InputError("machine.kind", f"is {quoted(scene.machine.kind)}; {what} is that of a machine of platforms")
     return scene.machine
 
 
@@ -60,7 +61,7 @@ def _budget(answers: Answers, tier: Tier) -> Array:
 def _entries(field: str, what: str) -> tuple[str, str, str, str]:
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
     if part not in ("machine", "loads") or name not in FIELD_UNITS:
-        raise InputError("field", f"is {field!r}; it must name numbers of a scene, for example 'machine.stiffness'")
+        raise InputError("field", f"is {quoted(field)}; it must name numbers of a scene, for example 'machine.stiffness'")
     return part, name, f"{what} {field}", f"all {_WORDS.get(field, field)}"
 
 
@@ -72,6 +73,7 @@ def _leaf(scene: Scene, part: str, name: str) -> Array:
     return jnp.broadcast_to(leaf, (scene.loads.count,)) if part == "loads" and leaf.ndim == 0 else leaf
 
 
+@validated
 def total(field: str) -> Quantity:
     """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries; a number that all loads share,
     such as "loads.mass", counts once for each load.
@@ -90,6 +92,7 @@ def _total(answers: Answers, tier: Tier, part: str, name: str) -> Array:
     return jnp.sum(_leaf(answers.scene, part, name))
 
 
+@validated
 def product(field: str) -> Quantity:
     """The product of an array of the scene, such as "machine.stiffness", see `total`; its unit, that of its entries' product,
     is left out.
@@ -139,6 +142,7 @@ def _mass(answers: Answers, tier: Tier) -> Array:
     return jnp.sum(machine.mass) + jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
 
 
+@validated
 def static_deflection(of: int | None = None) -> Quantity:
     """How far a platform sags under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
 
@@ -183,6 +187,7 @@ def _carried(machine: Platforms) -> Array:
     return jnp.any(joined & (machine.stiffness > 0.0)[None], axis=1)
 
 
+@validated
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
     """What the springs of supports and links cost, from a price list.
 

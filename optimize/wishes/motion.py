@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, count
 from optimize.wishes.answers import Answers
 from optimize.wishes.given import number_in
@@ -22,6 +23,7 @@ def _times(until: Number, spin_up: Number) -> tuple[float, float]:
     return end, up
 
 
+@validated
 def peak_force(*, until: Number, spin_up: Number) -> Quantity:
     """The largest foundation force while the rotor is brought up from rest, N: the full equations, integrated.
 
@@ -43,6 +45,7 @@ def _peak(answers: Answers, tier: Tier, until: float, spin_up: float) -> Array:
     return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
 
 
+@validated
 def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: int = 1) -> Quantity:
     """The time after which a platform's amplitude stays within a share of what it is in the end, s, when the rotor is brought
     up from rest: the full equations, integrated. The amplitude at a time is sqrt(y^2 + (y'/w)^2), w the loads' last speed.
@@ -58,7 +61,7 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
     """
     count(of, "of")
     if not 0.0 < (share := number_in(within, "", "within")) < 1.0:
-        raise InputError("within", f"is {within!r}; it must be greater than 0 and less than 1")
+        raise InputError("within", f"is {quoted(within)}; it must be greater than 0 and less than 1")
     text = f"time until platform {of} settles"
     settings = (*_times(until, spin_up), share, of)
     return Asking("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)

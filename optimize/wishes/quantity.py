@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of, shown
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
@@ -62,7 +63,7 @@ class Quantity:
     def __post_init__(self) -> None:
         if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
             problem = "give a function of a scene, or of a scene and its jam modes"
-            raise InputError(f"quantity {self.name!r}", f"has the function {self.function!r}; {problem}")
+            raise InputError(f"quantity {quoted(self.name)}", f"has the function {quoted(self.function)}; {problem}")
 
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
         """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
@@ -133,6 +134,8 @@ class Quantity:
         return Combined(f"negative {self.name}", self.unit, mode=self.mode, of=self.of, operation="neg", parts=(self,))
 
     def __pow__(self, power: float) -> Quantity:
+        if isinstance(power, str):
+            raise InputError(self.name, f"is raised to {quoted(power)}; give a plain number")
         power = number_in(power, "", f"the power of {self.words}")
         unit = f"({self.unit})**{power:g}" if self.unit else ""
         return _made("**", f"({self.words})^{power:g}", unit, self, _constant(power, ""))
@@ -161,7 +164,7 @@ class Asking(Quantity):
     def __post_init__(self) -> None:
         require_one_of(self.tier, TIERS, "tier")
         if self.tier not in self.tiers:
-            raise InputError("tier", f"is {self.tier!r}; {self.words} is computed as: {', '.join(self.tiers)}")
+            raise InputError("tier", f"is {quoted(self.tier)}; {self.words} is computed as: {', '.join(self.tiers)}")
 
     def read(self, answers: Answers) -> Array:
         assert self.function is not None
@@ -322,7 +325,7 @@ def _term(value: Operand, unit: str, name: str) -> Quantity:
 
 
 def _sum(sign: str, one: Operand, other: Operand) -> Quantity:
-    names = [x.words if isinstance(x, Quantity) else shown(x) for x in (one, other)]
+    names = [x.words if isinstance(x, Quantity) else quoted(x) for x in (one, other)]
     unit = next(x.unit for x in (one, other) if isinstance(x, Quantity))
     left, right = (_term(x, unit, name) for x, name in zip((one, other), names[::-1], strict=True))
     if not same_unit(left.unit, right.unit):
@@ -355,7 +358,7 @@ def _ratio(one: Operand, other: Operand) -> Quantity:
 
 def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
     if not quantities or not all(isinstance(q, Quantity) for q in quantities):
-        raise InputError(operation, f"has {quantities!r}; give one quantity or several")
+        raise InputError(operation, f"has {quoted(quantities)}; give one quantity or several")
     for each in quantities[1:]:
         if not same_unit(each.unit, quantities[0].unit):
             raise InputError(operation, f"puts together {quantities[0].unit or 'no unit'} and {each.unit or 'no unit'}")
@@ -363,6 +366,7 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
     return _made(operation, name, quantities[0].unit, *quantities)
 
 
+@validated
 def largest(*quantities: Quantity) -> Quantity:
     """The largest of some quantities of the same unit, for example of one quantity at several operating points.
 
@@ -374,6 +378,7 @@ def largest(*quantities: Quantity) -> Quantity:
     return _extreme("largest", quantities)
 
 
+@validated
 def least(*quantities: Quantity) -> Quantity:
     """The least of some quantities of the same unit, see `largest`."""
     return _extreme("least", quantities)
@@ -382,7 +387,7 @@ def least(*quantities: Quantity) -> Quantity:
 def require_quantity(value: object, field: str) -> None:
     """**Raises** `InputError` for what is no quantity."""
     if not isinstance(value, Quantity):
-        raise InputError(field, f"is {value!r}; it must be a Quantity, for example foundation_force(mode=3)")
+        raise InputError(field, f"is {quoted(value)}; it must be a Quantity, for example foundation_force(mode=3)")
 
 
 def walk(quantity: Quantity) -> Iterator[Quantity]:

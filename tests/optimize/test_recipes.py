@@ -177,7 +177,7 @@ def test_the_widest_range_is_that_of_the_whole_branch():
         (lambda: antiphase(3.0), "has no machine of platforms"),
         (lambda: widest_range(SCENE, mode=3, keep=2.0), "at most 1"),
         (lambda: lightest_exciter(scene("one_mass", "pendulums"), 0.01, mode=1), "differs from load to load"),
-        (lambda: pareto(None, None, None, points=1), "points is 1"),
+        (lambda: pareto(None, None, None, points=1), "space is None; it must be a DesignSpace"),
     ],
 )
 def test_wrong_recipes_are_said_in_one_sentence(make, says):

@@ -101,7 +101,7 @@ def test_units_are_those_of_the_fields():
 
 
 def test_wrong_input(tmp_path, capsys):
-    with pytest.raises(jv.InputError, match="result is a dict; give a result"):
+    with pytest.raises(jv.InputError, match=r"result is .*; it must be a Result"):
         jv.html_report({}, tmp_path / "r.html")
     run_ = stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)])
     with pytest.raises(jv.InputError, match="cannot be written"):

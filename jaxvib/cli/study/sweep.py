@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from jaxvib.sweeps.execute import Progress
@@ -40,7 +40,7 @@ def sweep(
 
     path = store or study.with_suffix(".zarr")
     if not resume and path.exists():
-        raise InputError("--no-resume", f"is given, and {str(path)!r} is there already; name another one with --store")
+        raise InputError("--no-resume", f"is given, and {quoted(str(path))} is there already; name another one with --store")
     asked = load_study(study)
     show = _Lines()
     try:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.loads import Loads, Pressing
 from jaxvib.units import Number, number
@@ -280,7 +280,7 @@ class Gravity(Effect):
         """Loads that move in gravity's direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) <= _AXES[self.along]:
             problem = f"goes with loads that move along the rotor's axis, which {loads.kind!r} do not; leave gravity out"
-            raise InputError("effects.gravity.along", f"is {self.along!r}; it {problem}")
+            raise InputError("effects.gravity.along", f"is {quoted(self.along)}; it {problem}")
 
     def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
         """m g p_up(u), or p_axis(u)."""
@@ -374,7 +374,7 @@ class MomentImbalance(Effect):
     def check(self, machine: Machine, loads: Loads) -> None:
         """A machine that can tilt."""
         if machine.carrier().tilt is None:
-            raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {machine.kind!r}")
+            raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {quoted(machine.kind)}")
 
 
 def _carried(machine: Machine) -> tuple[Array, Array | None]:

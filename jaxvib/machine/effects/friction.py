@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Friction, Typical
 from jaxvib.machine.loads import CircularLoads, Loads
@@ -98,7 +98,7 @@ class DryFriction(Effect):
     def check(self, machine: Machine, loads: Loads) -> None:
         """Loads on a circle that hang on bearings."""
         if not loads.circular:
-            raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {loads.kind!r}")
+            raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {quoted(loads.kind)}")
         if not loads.has_bearing:
             raise InputError(
                 "effects.dry_friction",

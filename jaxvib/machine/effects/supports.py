@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.loads import Loads
@@ -47,7 +47,7 @@ def _where(kind: str, platform: int | None, position: Number | None) -> tuple[in
     if platform is not None and position is not None:
         raise InputError(f"effects.{kind}", "names a platform and a position; a support has one place")
     if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
-        raise InputError(f"effects.{kind}.platform", f"is {platform!r}; it must be a whole number, at least 1")
+        raise InputError(f"effects.{kind}.platform", f"is {quoted(platform)}; it must be a whole number, at least 1")
     return platform, None if position is None else number(position, "m", f"effects.{kind}.position")
 
 
@@ -151,7 +151,7 @@ class Stop(_Support):
         """As every support's; a ring has no sides."""
         rows = super().place(carrier)
         if rows.shape[0] > 1 and self.side != "both":
-            raise InputError("effects.stop.side", f"is {self.side!r}; around a rotor's axis it must be 'both'")
+            raise InputError("effects.stop.side", f"is {quoted(self.side)}; around a rotor's axis it must be 'both'")
         return rows
 
     def support_potential(self, displacement: Array) -> Array:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
@@ -120,6 +121,7 @@ class Regime(Result):
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor.
 
@@ -130,6 +132,7 @@ class Regime(Result):
         return phase_circles([(self.label, np.asarray(self.phase))], ax=ax)
 
 
+@validated
 def regime(scene: Scene, stretch: Trajectory) -> Regime:
     """Names the motion over a stretch of a run of `scene`, such as `run.window`.
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Literal
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.results.fields import in_unit
@@ -64,6 +65,7 @@ class Spectrum(Result):
             [f"{self.time.size} pieces, strongest in the last one, zero to peak:", *(f"  {line}" for line in lines)]
         )
 
+    @validated
     def plot(
         self,
         *,
@@ -83,10 +85,10 @@ class Spectrum(Result):
         from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow to import: only who draws pays
 
         if show not in ("displacement", "force"):
-            raise InputError("show", f"is {show!r}; it must be 'displacement' or 'force'")
+            raise InputError("show", f"is {quoted(show)}; it must be 'displacement' or 'force'")
         if coordinate is not None and (show == "force" or coordinate not in self.coordinates):
             known = "a force has none" if show == "force" else f"there are {', '.join(self.coordinates)}"
-            raise InputError("coordinate", f"is {coordinate!r}; {known}")
+            raise InputError("coordinate", f"is {quoted(coordinate)}; {known}")
         series: dict[str, np.ndarray]
         if show == "force":
             names = ["force, N"] if self.force.shape[2] == 1 else ["force across, N", "force up, N"]

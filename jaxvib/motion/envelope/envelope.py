@@ -14,10 +14,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_growth, averaged_loads
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import estimated_frequencies
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
@@ -116,6 +117,7 @@ class _Units(eqx.Module):
         return Amplitudes((y0 + 1j * y1) * self.length, (v0 + 1j * v1) * speed, rate * self.speed, phase)
 
 
+@validated
 @refuse_former(tolerance=FORMER["tolerance"], controller=FORMER["controller"])
 @compiled_together
 def envelope(
@@ -174,7 +176,7 @@ def envelope(
     averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
-        raise InputError("save", f"is {save!r}; it must be 'all' or 'window'")
+        raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
     count(samples, "samples", low=2, each=1e3)
     count(turns, "turns")
     chosen = Tolerance(1e-4) if stepsize_controller is None else stepsize_controller

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured
@@ -96,6 +97,7 @@ class Envelope(AbstractMeasured, Result):
             ]
         )
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time; arguments as
         `Run.plot`.

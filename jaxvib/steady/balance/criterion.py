@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import circular_loads, require_one_point, turning
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
@@ -52,6 +53,7 @@ class Criterion(Result):
         """Undamped, (nd - 1,) rad/s."""
         return self.speeds.additional
 
+    @validated
     def balances(self, speed: Array) -> Array:
         """Whether the criterion calls auto-balancing stable at a rotor speed (any shape, rad/s)."""
         w = jnp.asarray(speed)
@@ -68,6 +70,7 @@ class Criterion(Result):
         lines += [f"{name + ' at':14s}{written(table[name])} rad/s" for name in ("balancing", "gathering")]
         return "\n".join(lines)
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Characteristic speeds with damping, and the intervals between them, in `unit`.
 
@@ -108,6 +111,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     return size**2 * omega**2 / 2.0 * receptance
 
 
+@validated
 def criterion(scene: Scene) -> Criterion:
     """Judges every rotor speed of a scene's machine: where its loads balance it, where they gather.
 

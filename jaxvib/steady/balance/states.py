@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
 from jaxvib.errors import InputError
@@ -75,6 +76,7 @@ class BalancedStates(Result):
         """Growth rate of its errors at rotor speeds, 1/s: stable where it is negative, see `balanced_growth`."""
         return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)
 
+    @validated
     def intervals(
         self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> list[list[float]]:
@@ -93,6 +95,7 @@ class BalancedStates(Result):
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
         return "\n".join([self.message, *rows, directions])
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """The arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
@@ -100,6 +103,7 @@ class BalancedStates(Result):
         return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
 
 
+@validated
 def balanced_states(scene: Scene) -> BalancedStates:
     """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`; ask each for its
     `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.

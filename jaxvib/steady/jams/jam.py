@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import magnitude
@@ -87,6 +88,7 @@ class Jam(AbstractJam):
             return "loads cannot stay together"
         return f"{'stable' if self.stable else 'unstable'} by slope"
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """The speed of the loads in `unit`, and the amplitudes; onto two axes `ax` if given. **Returns** a matplotlib
         figure.
@@ -116,6 +118,7 @@ class JamModes(AbstractJam):
         """The numbers of the modes that exist."""
         return [int(k) for k, name in zip(np.asarray(self.mode), status_names(self.status), strict=True) if name != "absent"]
 
+    @validated
     def row(self, mode: int, *, throw: bool = False) -> int:
         """Where the numbers of the jam mode of that number stand in the arrays, whether it exists or not.
 
@@ -123,7 +126,7 @@ class JamModes(AbstractJam):
         """
         most = self.mode.shape[0]
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
-            raise InputError("mode", f"is {mode!r}; this machine's jam modes are numbered 1 to {most}")
+            raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
         if throw and not traced(self.omega) and status_names(self.status)[int(mode) - 1] == "absent":
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
@@ -132,6 +135,7 @@ class JamModes(AbstractJam):
             )
         return int(mode) - 1
 
+    @validated
     def select(self, mode: int, *, throw: bool = True) -> Jam:
         """The jam mode of that number.
 
@@ -147,6 +151,7 @@ class JamModes(AbstractJam):
         lines[0] += ", ".join(f"{w:.6g}" for w in np.asarray(self.resonances)) + " rad/s"
         return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
         """Speeds of the loads in `unit` among the resonances, and amplitudes, by mode; onto two axes `ax` where they are given.
 
@@ -168,6 +173,7 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, a
     return modes_chart(mode, omega, stable, amplitude, among, names=jams.coordinates, unit=unit, ax=ax)
 
 
+@validated
 def jam_modes(scene: Scene) -> JamModes:
     """Every way in which light, collected loads can jam at the scene's rotor speed, held back by drag and dry friction.
 

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.averaged import averaged_growth
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -65,14 +66,16 @@ class PhaseJams(AbstractPhaseJam):
     starts: Array = eqx.field(metadata=in_unit("", "jam"))
     scene: Scene = eqx.field(metadata=SCENE)
 
+    @validated
     def select(self, index: int) -> PhaseJam:
         """The jam of that place, counted from 0. **Raises** `InputError` where there are not so many."""
         n = self.omega.shape[0]
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
-            raise InputError("index", f"is {index!r}; there are {n} jams, counted from 0")
+            raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
         fields = {name: getattr(self, name) for name in PhaseJam.__dataclass_fields__}
         return _selected(PhaseJam(**fields), np.asarray(index, np.uint32))
 
+    @validated
     def follow(self, index: int, omega: Array) -> PhaseBranch:
         """The phase pattern of the jam of that place over load speeds `omega` (n,) rad/s, see `phase_branch`."""
         return phase_branch(self.scene, self.select(index), omega)
@@ -81,6 +84,7 @@ class PhaseJams(AbstractPhaseJam):
         """A table a person can read; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
+    @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
         """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
         scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
@@ -107,14 +111,17 @@ class PhaseJams(AbstractPhaseJam):
         return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit, ax=ax)
 
 
+@validated
 @overload
 def phase_jams(scene: Scene, *, starts: int = 128, seed: int = 0) -> PhaseJams: ...
 
 
+@validated
 @overload
 def phase_jams(scene: Scene, *, near: tuple[Array, Array]) -> PhaseJam: ...
 
 
+@validated
 def phase_jams(
     scene: Scene, *, starts: int = 128, seed: int = 0, near: tuple[Array, Array] | None = None
 ) -> PhaseJams | PhaseJam:

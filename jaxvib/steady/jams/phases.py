@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
 from jaxvib.equations.linear import LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
 from jaxvib.errors import InputError
@@ -97,6 +98,7 @@ class PhaseJam(AbstractPhaseJam):
         stable = f"{'stable' if bool(self.stable) else 'unstable'} ({float(self.growth):.3g} 1/s)"
         return f"Omega {float(self.omega):.6g} rad/s, {stable}, {sentence(self.pattern)}: {phases} deg"
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Where the loads stand, on a circle.
 

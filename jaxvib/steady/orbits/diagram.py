@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
@@ -83,6 +84,7 @@ class ExactBranches(Result):
         """The ranges of the branch, its resonances and its special points, for a person to read."""
         return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
 
+    @validated
     def plot(
         self,
         *,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
@@ -48,6 +49,7 @@ _FAR = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 
+@validated
 @compiled_together
 def jam_orbit(
     scene: Scene,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.collected import CollectedModel
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
@@ -102,6 +103,7 @@ class Orbit(Result):
         """The highest harmonic of the carrier's motion that was used."""
         return self.orders[-1]
 
+    @validated
     def at(self, theta: Array) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
         """The motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',) rad/s.
 
@@ -110,6 +112,7 @@ class Orbit(Result):
         """
         return _at(self, theta if isinstance(theta, Array) else np.asarray(theta, self.offsets.dtype))
 
+    @validated
     def relative_amplitude(self, i: int, j: int) -> Array:
         """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period.
 
@@ -150,6 +153,7 @@ class Orbit(Result):
             f"{self.harmonics} harmonics leave an error of {float(self.error):.1e}, residual {float(self.residual):.1e}"
         )
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed; onto three
         axes `ax` where they are given. **Returns** a matplotlib figure, or the given `ax`."""

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxvib.boundary import validated
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -54,6 +55,7 @@ class Cost(Result):
     rows: list[CostRow] = eqx.field(metadata=in_unit("", "way", name="way"))
     left_out: tuple[str, ...] = ()
 
+    @validated
     def cheapest(self, error: float) -> CostRow | None:
         """The fastest way to that relative error; None if there is none here, or the reference is not good enough to tell."""
         if not self.reference_error < error:
@@ -70,6 +72,7 @@ class Cost(Result):
             lines.append(f"  to {wanted:.0e}: {way}")
         return "\n".join([*lines, *(f"  {reason}" for reason in self.left_out)])
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """Error against seconds, a line for each method; see `cost_figure`; onto axes `ax` if given. **Returns** a
         matplotlib figure, or the given `ax`.

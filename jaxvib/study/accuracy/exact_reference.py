@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.equations.linear import natural_frequencies
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
@@ -42,7 +42,7 @@ def exact_jam(scene: Scene, mode: int | None) -> ExactJam:
     **Raises** `InputError` for a drive whose speed is not constant, and where no mode is stable.
     """
     if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {scene.drive.kind!r}; a jam is one at a constant speed: use ConstantSpeed")
+        raise InputError("drive.kind", f"is {quoted(scene.drive.kind)}; a jam is one at a constant speed: use ConstantSpeed")
     mode = usual_mode(scene) if mode is None else mode
     return ExactJam(mode, *(jam_orbit(scene, mode=mode, points=collocation_points(scene, points)) for points in (32, 24)))
 

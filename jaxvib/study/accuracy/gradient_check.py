@@ -13,7 +13,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
@@ -110,6 +111,7 @@ class GradientCheck(Result):
             raise ComputationError(self.status_name, self.summary())
         return self
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Central differences against the first route over their step, a line for each number, and where they were best.
 
@@ -122,6 +124,7 @@ class GradientCheck(Result):
         return steps_chart(self.steps, off, self.step, best, self.tolerance, names=self.numbers, route=self.routes[0], ax=ax)
 
 
+@validated
 def check_gradients(
     scene: Scene,
     quantity: Callable[[Scene], ArrayLike],
@@ -172,9 +175,9 @@ def check_gradients(
         raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
     unknown = [route for route in routes if route not in _MODES]
     if unknown or not (routes or implicit):
-        raise InputError("routes", f"are {list(routes)!r}; name some of {', '.join(_MODES)}")
+        raise InputError("routes", f"are {quoted(list(routes))}; name some of {', '.join(_MODES)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
-        raise InputError("tolerance", f"is {tolerance!r}; it must be a number between 0 and 1, such as 1e-5")
+        raise InputError("tolerance", f"is {quoted(tolerance)}; it must be a number between 0 and 1, such as 1e-5")
     numbers, left_out, put = _numbers(scene, free)
     at = np.asarray([float(each.value) for each in numbers])
 
@@ -230,7 +233,7 @@ def _numbers(scene: Scene, free: Sequence[str] | None) -> tuple[list[_Number], t
     names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
     for name in free or ():
         if name not in names:
-            raise InputError("free", f"names {name!r}; this scene has: {', '.join(names)}")
+            raise InputError("free", f"names {quoted(name)}; this scene has: {', '.join(names)}")
     found, zero = [], []
     for k, (name, (_, leaf)) in enumerate(zip(names, leaves, strict=True)):
         if free is not None and name not in free:

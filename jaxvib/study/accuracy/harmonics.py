@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -62,6 +63,7 @@ class HarmonicConvergence(Result):
         return convergence_chart(self.harmonics, self.error, self.known, names=names, ax=ax)
 
 
+@validated
 def harmonic_convergence(
     scene: Scene, omega: Sequence[Number], *, points: Sequence[int] = (4, 6, 8, 10, 12, 16, 20, 24)
 ) -> HarmonicConvergence:
@@ -81,7 +83,7 @@ def harmonic_convergence(
     Source: ours, on `jam_orbit`.
     """
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
-        raise InputError("points", f"are {points!r}; give numbers of points in ascending order")
+        raise InputError("points", f"are {quoted(points)}; give numbers of points in ascending order")
     speeds = jnp.stack([number(w, "rad/s", "omega", low=0.0, open_low=True) for w in omega])
     half = has_half_turn(scene.effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]

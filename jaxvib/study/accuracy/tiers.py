@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
@@ -72,6 +73,7 @@ class Tiers(Result):
         return tiers_chart(self.mass, differences, self.exact.stable, ax=ax)
 
 
+@validated
 def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:
     """A jam mode by the leading order and exactly, for loads heavier and lighter than the scene's by the given factors.
 

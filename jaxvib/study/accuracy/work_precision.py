@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
@@ -52,6 +53,7 @@ _SINGLE = 2e-6
 """The smallest tolerance that single precision is asked for."""
 
 
+@validated
 def work_precision(
     scene: Scene,
     quantity: Quantity = "amplitude",
@@ -103,12 +105,12 @@ def work_precision(
     require_one_of(quantity, QUANTITIES, "quantity")
     unknown = [name for name in solvers if name not in SOLVERS]
     if unknown or not solvers:
-        raise InputError("solvers", f"are {list(solvers)!r}; name some of {', '.join(SOLVERS)}")
+        raise InputError("solvers", f"are {quoted(list(solvers))}; name some of {', '.join(SOLVERS)}")
     if not tolerances:
-        raise InputError("tolerances", f"are {tuple(tolerances)!r}; name one at least, such as 1e-6")
+        raise InputError("tolerances", f"are {quoted(tuple(tolerances))}; name one at least, such as 1e-6")
     count(repeats, "repeats")
     if not isinstance(scene, Scene):
-        raise InputError("scene", f"is {scene!r}; it must be a Scene, for example load_scene('machine.toml')")
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
     if scene.drive.speed.dtype.itemsize < 8:
         problem = "is in single precision; errors are measured against double: switch JAX to float64 before it is made"
         raise InputError("scene", problem)

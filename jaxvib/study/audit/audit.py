@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.scene import Scene
@@ -65,6 +66,7 @@ class Audit(Result):
     numbers: list[NumberRow] = eqx.field(metadata=in_unit("", "number", name="number"))
     coordinates: tuple[str, ...] = ()
 
+    @validated
     def advised(self, advice: str) -> list[str]:
         """The names of the effects with that `advice`."""
         return [row.effect for row in self.effects if row.advice == advice]
@@ -82,6 +84,7 @@ class Audit(Result):
             lines.append(f"  {found.name} = {found.value:.3g}: {found.advice}; {found.says}")
         return "\n".join(lines)
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """What each effect changes against the accuracy asked for, and what it costs, onto two axes `ax` if given.
         **Returns** a matplotlib figure, or the given `ax`.
@@ -96,6 +99,7 @@ class Audit(Result):
         return audit_chart(labels, changes, uncertainty, self.accuracy, added, ax=ax)
 
 
+@validated
 def audit(
     scene: Scene,
     *,
@@ -142,10 +146,10 @@ def audit(
     Source: ours.
     """
     if isinstance(accuracy, bool) or not isinstance(accuracy, (int, float)) or not 0.0 < accuracy < 1.0:
-        raise InputError("accuracy", f"is {accuracy!r}; it must be a number between 0 and 1, such as 0.01 for 1 %")
+        raise InputError("accuracy", f"is {quoted(accuracy)}; it must be a number between 0 and 1, such as 0.01 for 1 %")
     for k, effect in enumerate(possible or ()):
         if not isinstance(effect, Effect):
-            raise InputError(f"possible[{k}]", f"is {effect!r}; it must be an Effect, for example Gravity()")
+            raise InputError(f"possible[{k}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
     scene = checked(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
@@ -194,9 +198,9 @@ def _question(
     scene: Scene, mode: int | None, until: float | None, start: Literal["rest", "turning"] | State | None
 ) -> tuple[JamQuestion | RunQuestion, str]:
     if not (start is None or isinstance(start, State) or start in ("rest", "turning")):
-        raise InputError("start", f"is {start!r}; it must be 'rest', 'turning' or a State")
+        raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'turning' or a State")
     if mode is not None and start is not None:
-        raise InputError("mode", f"is {mode!r}, which goes without a start: a jam is asked for, or a run")
+        raise InputError("mode", f"is {quoted(mode)}, which goes without a start: a jam is asked for, or a run")
     if start is None and (scene.drive.constant or mode is not None):
         try:
             chosen = usual_mode(admitted(scene)) if mode is None else mode

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.errors import InputError
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -196,6 +197,7 @@ def _regular(t: np.ndarray, peaks: list[int]) -> list[int]:
     return peaks[cuts[longest] : cuts[longest + 1] + 1] if len(peaks) > 2 else peaks
 
 
+@validated
 def ten_periods(
     pendulum: BearingPendulum, record: Record, *, periods: int = 10, instrument: float = 0.0, turns: TurningPoints | None = None
 ) -> Decrement:

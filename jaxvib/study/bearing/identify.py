@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.study.bearing.decrement import (
@@ -101,6 +102,7 @@ class Identified(Result):
         lines.append(f"frequency {shown(self.frequency)} rad/s, noise {self.noise:.2g} rad; {self.message}")
         return "\n".join([*lines, *self.notes])
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """The record with the fit, and what the fit leaves; onto two axes `ax` if given."""
         from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
@@ -113,6 +115,7 @@ def shown(estimate: Estimate) -> str:
     return f"{estimate.value:.5g} ± {(estimate.high - estimate.low) / 2.0:.2g}"
 
 
+@validated
 def identify(
     pendulum: BearingPendulum, record: Record, *, dry: bool = False, instrument: float = 0.0, throw: bool = True
 ) -> Identified:
@@ -147,11 +150,11 @@ def identify(
     if not isinstance(record, Record):
         raise InputError("record", f"is {type(record).__name__}; it must be a Record(time, angle) or come from read_record")
     if not isinstance(pendulum, BearingPendulum):
-        raise InputError("pendulum", f"is {pendulum!r}; it must be a BearingPendulum(mass=..., length=...)")
+        raise InputError("pendulum", f"is {quoted(pendulum)}; it must be a BearingPendulum(mass=..., length=...)")
     if dry and pendulum.bearing is None:
         raise InputError("pendulum.bearing", "is missing; dry friction acts at the bearing's diameter, give it in m")
     if not isinstance(instrument, (int, float)) or not 0.0 <= instrument < 1.0:
-        raise InputError("instrument", f"is {instrument!r}; the relative uncertainty of J is at least 0 and less than 1")
+        raise InputError("instrument", f"is {quoted(instrument)}; the relative uncertainty of J is at least 0 and less than 1")
     turns = turning_points(record)
     half = float(np.median(np.diff(turns.time)))
     released = turns.time[0] - record.time[0] <= _AT_REST * half

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, called, closest, out_of_place
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
@@ -49,7 +49,7 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
         if name not in names:
             raise out_of_place(name, tables, "measurement", names)
         if not isinstance(table, Mapping):
-            raise InputError(name, f"is {table!r}; it must be a table, write [{name}]")
+            raise InputError(name, f"is {quoted(table)}; it must be a table, write [{name}]")
     pendulum = called(BearingPendulum, tables.get("pendulum", {}), "pendulum")
     asked = called(_asked, tables.get("identify", {}), "identify")
     part = tables.get("record", {})
@@ -64,13 +64,15 @@ def _record(
     file: object, columns: object = None, angle_unit: object = None, from_: Number | None = None, until: Number | None = None
 ) -> Callable[[Path], Record]:
     if not isinstance(file, str):
-        raise InputError("record.file", f"is {file!r}; write the path of a CSV file")
+        raise InputError("record.file", f"is {quoted(file)}; write the path of a CSV file")
     if angle_unit is not None and not isinstance(angle_unit, str):
-        raise InputError("record.angle_unit", f"is {angle_unit!r}; write 'rad', 'mrad', 'deg', 'gon' or 'turn'")
+        raise InputError("record.angle_unit", f"is {quoted(angle_unit)}; write 'rad', 'mrad', 'deg', 'gon' or 'turn'")
     if columns is not None and (
         not isinstance(columns, (list, tuple)) or len(columns) != 2 or not all(isinstance(name, str) for name in columns)
     ):
-        raise InputError("record.columns", f"is {columns!r}; write the names of two columns, time first, such as ['t', 'phi']")
+        raise InputError(
+            "record.columns", f"is {quoted(columns)}; write the names of two columns, time first, such as ['t', 'phi']"
+        )
 
     def read(folder: Path) -> Record:
         record = read_record(folder / file, columns=columns, angle_unit=angle_unit)
@@ -84,7 +86,7 @@ def _record(
 
 def _asked(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float]:
     if not isinstance(dry, bool):
-        raise InputError("identify.dry", f"is {dry!r}; write true or false")
+        raise InputError("identify.dry", f"is {quoted(dry)}; write true or false")
     return dry, float(number(instrument, "", "identify.instrument", low=0.0))
 
 

@@ -10,7 +10,8 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxvib.errors import InputError, read_text
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, read_text
 from jaxvib.results.fields import in_unit
 
 __all__ = ["Record", "read_record"]
@@ -63,6 +64,7 @@ class Record(eqx.Module):
     angle: np.ndarray = eqx.field(metadata=in_unit("rad", "time", name="recorded"))
     name: str = eqx.field(static=True)
 
+    @validated
     def __init__(self, time: ArrayLike, angle: ArrayLike, name: str = "record"):
         try:
             self.time, self.angle = (np.asarray(x, dtype=float) for x in (time, angle))
@@ -94,6 +96,7 @@ class Record(eqx.Module):
         """How many there are."""
         return self.time.size
 
+    @validated
     def between(self, start: float, stop: float) -> Record:
         """The part of the record from `start` to `stop`, s. **Raises** `InputError` where too little is left."""
         kept = (self.time >= start) & (self.time <= stop)
@@ -105,6 +108,7 @@ class Record(eqx.Module):
         return Record(self.time[kept], self.angle[kept], self.name)
 
 
+@validated
 def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle_unit: str | None = None) -> Record:
     """Reads a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
 
@@ -152,7 +156,7 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
             raise InputError(where, f"has {len(row)} columns; the lines above have {width}")
         for m, (place, what) in enumerate(zip(places, _NAMES, strict=True)):
             if not _is_number(row[place], mark):
-                raise InputError(where, f"has {row[place]!r} where the {what} should be; a finite number is needed")
+                raise InputError(where, f"has {quoted(row[place])} where the {what} should be; a finite number is needed")
             values[n, m] = float(row[place].replace(",", ".")) * factors[m]
         if n and values[n, 0] <= values[n - 1, 0]:
             raise InputError(where, f"has the time {values[n, 0]:g} s after {values[n - 1, 0]:g} s; times must ascend")
@@ -205,7 +209,9 @@ def _columns(
             factors.append(1.0)
         else:
             advice = f"write {what} ({'s' if what == 'time' else 'deg'})" + (" or give angle_unit" if what == "angle" else "")
-            raise InputError(str(path), f"has the column {heads[0][place]!r} for the {what}, whose unit is not known; {advice}")
+            raise InputError(
+                str(path), f"has the column {quoted(heads[0][place])} for the {what}, whose unit is not known; {advice}"
+            )
     return places, factors
 
 
@@ -223,7 +229,7 @@ def _parted(head: str, what: str) -> tuple[str, str]:
 def _factor(unit: str, what: str, field: str) -> float:
     factor = _UNITS[what].get(unit.strip().lower())
     if factor is None:
-        raise InputError(field, f"is {unit!r}, which is no unit of {what} here; write {_EXAMPLES[what]}")
+        raise InputError(field, f"is {quoted(unit)}, which is no unit of {what} here; write {_EXAMPLES[what]}")
     return factor
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import optimistix as optx
 from jax import Array
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.friction import dry_lever
 from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require
 from jaxvib.ode.types import RealScalarLike
@@ -56,6 +57,7 @@ class BearingPendulum(eqx.Module):
     bearing: Array | None
     g: Array
 
+    @validated
     def __init__(self, mass: Number, length: Number, inertia: Number = 0.0, bearing: Number | None = None, g: Number = 9.81):
         self.mass = number(mass, "kg", "pendulum.mass", low=0.0, open_low=True)
         self.length = number(length, "m", "pendulum.length", low=0.0, open_low=True)
@@ -112,6 +114,7 @@ class Swing(Result):
         first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
         return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"
 
+    @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
         """Angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
@@ -121,6 +124,7 @@ class Swing(Result):
         return signals_chart(np.asarray(self.time), signals, across="time, s", ax=ax)
 
 
+@validated
 @refuse_former(tolerance=FORMER["tolerance"])
 def swing(
     pendulum: BearingPendulum,
@@ -166,7 +170,7 @@ def swing(
     Source: Artyunin, Sumenkov 2019, equations (1)-(3).
     """
     if not isinstance(pendulum, BearingPendulum):
-        raise InputError("pendulum", f"is {pendulum!r}; it must be a BearingPendulum(mass=..., length=...)")
+        raise InputError("pendulum", f"is {quoted(pendulum)}; it must be a BearingPendulum(mass=..., length=...)")
     times = numbers(time, "s", "time", None)
     chosen = Tolerance(1e-9 if times.dtype.itemsize >= 8 else 1e-5) if stepsize_controller is None else stepsize_controller
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)

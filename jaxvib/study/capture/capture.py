@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
@@ -116,6 +117,7 @@ class Capture(Result):
         lone = f"; below it {100.0 * np.mean(below):.3g} % are captured all the same" if np.any(below > 0.0) else ""
         return f"{head}\n  {where}{lone}"
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """The share of starts captured over the initial speed, and the threshold; onto the axes `ax` where they are given.
 
@@ -147,6 +149,7 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     return State(still, still, (jnp.arange(loads.count) * beside + shift, zero), (turn + zero, zero))
 
 
+@validated
 def capture(
     scene: Scene,
     speeds: Sequence[float] | np.ndarray | None = None,
@@ -197,18 +200,20 @@ def capture(
     scene = checked(scene)
     in_torus(scene.loads, "capture")
     if not scene.drive.constant:
-        raise InputError("drive.kind", f"is {scene.drive.kind!r}; capture is asked for at a given speed: use ConstantSpeed")
+        raise InputError(
+            "drive.kind", f"is {quoted(scene.drive.kind)}; capture is asked for at a given speed: use ConstantSpeed"
+        )
     if resolution is not None and not 0.0 < resolution < 1.0:
-        raise InputError("resolution", f"is {resolution!r}; it must be between 0 and 1, such as 1e-3")
+        raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
     if turning not in get_args(Turning):
-        raise InputError("turning", f"is {turning!r}; it must be 'rolling' or 'still'")
+        raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
     if turning == "still" and not any(effect.slip_limit is not None for effect in scene.effects):
         problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (property slip_limit)"
         raise InputError("turning", problem)
     tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
     allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)
     if not allowed or tried[0] < -1.0 or tried[-1] > 0.0:
-        raise InputError("speeds", f"is {speeds!r}; ascending numbers from -1 to 0 are needed")
+        raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
     end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
     width = float(number(spread, "rad", "spread", low=0.0))
     shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.checked import made
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations
 from jaxvib.results.fields import in_unit
@@ -55,6 +57,7 @@ class ThresholdCurve(Result):
             lines.append(f"  {value:10.6g}  {found}" + ("" if np.isnan(least) else f"; the least {least:.4f}"))
         return "\n".join(lines)
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """Thresholds with their uncertainty over the values, and the least captured speeds.
 
@@ -65,6 +68,7 @@ class ThresholdCurve(Result):
         return curve_chart(self.value, self.threshold, self.uncertainty, self.least, ax=ax)
 
 
+@validated
 def threshold_curve(
     make: Callable[[float], Scene],
     values: Sequence[float] | np.ndarray,
@@ -95,10 +99,10 @@ def threshold_curve(
     """
     numbers = np.asarray(values, dtype=float)
     if numbers.ndim != 1 or numbers.size == 0 or not np.all(np.isfinite(numbers)):
-        raise InputError("values", f"is {values!r}; one finite number at least is needed, in a row")
+        raise InputError("values", f"is {quoted(values)}; one finite number at least is needed, in a row")
     found = [
         capture(
-            make(float(value)),
+            made(make, float(value)),
             speeds,
             turns=turns,
             starts=starts,

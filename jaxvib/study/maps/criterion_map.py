@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.equations.linear import circular_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -76,6 +77,7 @@ class CriterionMap(Result):
         return agreement_maps(self.speeds, self.mass_factor, self.predicted, maps, unit=unit, ax=ax)
 
 
+@validated
 def criterion_map(
     scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int | None = None
 ) -> CriterionMap:

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
@@ -97,6 +98,7 @@ def _span(values: np.ndarray) -> str:
     return f"{low:.4g}" if high - low < 1e-3 * high else f"{low:.4g} .. {high:.4g}"
 
 
+@validated
 @refuse_former(tolerance=FORMER["tolerance"])
 def run_ups(
     scene: Scene,
@@ -145,7 +147,7 @@ def run_ups(
     if not scene.loads.circular:
         raise InputError(
             "loads.kind",
-            f"is {scene.loads.kind!r}; run-ups vary the drag of loads on a circle; of balls in a torus ask capture",
+            f"is {quoted(scene.loads.kind)}; run-ups vary the drag of loads on a circle; of balls in a torus ask capture",
         )
     loads = cast(CircularLoads, scene.loads)
     given = loads.drag if drag is None else numbers(drag, "N s/m", "drag", None, low=0.0)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
-from jaxvib.errors import InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.checked import made
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -60,6 +62,7 @@ class StabilityMap(Result):
         )
 
 
+@validated
 def stability_map(
     make: Callable[[float], Scene], values: Sequence[float], *, omega: tuple[float, float], points: int = 300
 ) -> StabilityMap:
@@ -82,8 +85,8 @@ def stability_map(
     """
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
-        raise InputError("values", f"are {values!r}; give numbers in ascending order")
-    scenes = [make(float(v)) for v in x]
+        raise InputError("values", f"are {quoted(values)}; give numbers in ascending order")
+    scenes = [made(make, float(v)) for v in x]
 
     def diagram(k: int) -> ExactBranches:
         return exact_branches(scenes[k], points=points, least=omega[0], most=omega[1])
@@ -98,6 +101,7 @@ def stability_map(
     )
 
 
+@validated
 def stability_onset(
     make: Callable[[float], Scene],
     kind: str,
@@ -129,18 +133,18 @@ def stability_onset(
     """
 
     def there(x: float) -> bool:
-        diagram = exact_branches(make(x), points=points, least=omega[0], most=omega[1])
+        diagram = exact_branches(made(make, x), points=points, least=omega[0], most=omega[1])
         return any(point.kind == kind for point in diagram.special)
 
     low, high = between
     if not 0.0 < low < high:
-        raise InputError("between", f"is {between!r}; it must be two positive values, the lower one first")
+        raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
     for x, is_wanted in ((low, False), (high, True)):
         if there(x) != is_wanted:
             found, wanted = ("no", "a") if is_wanted else ("a", "no")
             raise InputError(
                 "between",
-                f"is {between!r}; at {x:g} the diagram has {found} {kind} and must have {wanted}: "
+                f"is {quoted(between)}; at {x:g} the diagram has {found} {kind} and must have {wanted}: "
                 f"{'raise' if is_wanted else 'lower'} this value (stability_map shows the special points)",
             )
     while high / low > 1.0 + accuracy:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 
+from jaxvib.boundary import validated
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -33,6 +34,7 @@ class Reproduced(Result):
     status: ReproducedStatus
     rows: list[PublishedRow] = eqx.field(metadata=in_unit("", "number", name="number"))
 
+    @validated
     def of(self, paper: str) -> list[PublishedRow]:
         """The rows of one paper."""
         return [row for row in self.rows if row.paper == paper]
@@ -60,6 +62,7 @@ class Reproduced(Result):
                     lines.append(f"  {row.quantity} ({row.place}): {_told(row)}")
         return "\n".join([*lines, self.message])
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """How far each number is from the printed one, relative, by verdict, on a logarithmic scale.
 

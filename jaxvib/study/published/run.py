@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from jaxvib.errors import InputError, require_one_of
+from jaxvib.boundary import validated
+from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.study.published.antiphase import antiphase_paper
 from jaxvib.study.published.bearing import bearing_paper
 from jaxvib.study.published.criterion import criterion_paper
@@ -37,6 +38,7 @@ _ASKED: dict[str, Callable[[bool], PaperAnswer]] = {
 }
 
 
+@validated
 def reproduce(
     papers: Sequence[str] = (),
     *,
@@ -69,7 +71,7 @@ def reproduce(
     Source: the papers that the rows name.
     """
     if isinstance(papers, str):
-        raise InputError("papers", f"is {papers!r}; give a list of names, such as [{papers!r}]")
+        raise InputError("papers", f"is {quoted(papers)}; give a list of names, such as [{quoted(papers)}]")
     for name in papers:
         require_one_of(name, PAPERS, "papers", "has")
     rows = []

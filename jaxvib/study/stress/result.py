@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
+from jaxvib.boundary import validated
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -47,6 +48,7 @@ class Stress(Result):
             lines.append(f"  {row.case}, {row.dtype}: {row.status}{known}")
         return "\n".join([*lines, self.message])
 
+    @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
         """True errors of all cases in both precisions on a logarithmic scale, the errors claimed, and the bounds.
 

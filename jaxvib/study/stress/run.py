@@ -13,7 +13,8 @@ from pathlib import Path
 import jax.numpy as jnp
 
 import jaxvib.study.stress
-from jaxvib.errors import ComputationError, InputError
+from jaxvib.boundary import validated
+from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.study.stress import bends, courses, resonances, sizes
 from jaxvib.study.stress.case import Answer, Case, Precision, StressRow, judged, rounded
 from jaxvib.study.stress.result import Stress, stress_of
@@ -28,6 +29,7 @@ PRECISIONS: tuple[Precision, ...] = ("float64", "float32")
 Report = Callable[[StressRow], None]
 
 
+@validated
 def stress(only: Sequence[str] = (), *, precisions: Sequence[Precision] = PRECISIONS, report: Report | None = None) -> Stress:
     """Asks hard questions and compares the answers with independent references: closed forms, SciPy, shooting, sharp laws.
 
@@ -54,7 +56,7 @@ def stress(only: Sequence[str] = (), *, precisions: Sequence[Precision] = PRECIS
     cases = chosen_cases(only)
     for precision in precisions:
         if precision not in PRECISIONS:
-            raise InputError("precisions", f"is {precision!r}; it must be 'float64' or 'float32'")
+            raise InputError("precisions", f"is {quoted(precision)}; it must be 'float64' or 'float32'")
     own = PRECISIONS[0] if _is_double() else PRECISIONS[1]
     tell = report or (lambda row: None)
     others = {precision: _child(precision, cases) for precision in precisions if precision != own}
@@ -77,7 +79,7 @@ def chosen_cases(only: Sequence[str]) -> list[Case]:
     """The cases whose names have one of these as a part, or all. **Raises** `InputError` for a part that none has."""
     for part in only:
         if not any(part in case.name for case in CATALOGUE):
-            raise InputError("only", f"is {part!r}, which is part of no case's name; there are: {_names()}")
+            raise InputError("only", f"is {quoted(part)}, which is part of no case's name; there are: {_names()}")
     return [case for case in CATALOGUE if not only or any(part in case.name for part in only)]
 
 

@@ -65,15 +65,15 @@ def test_a_case_is_a_quantity_of_another_scene():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: under(FIRST, "x", [("drive.speed", 3.0)]), "give a dictionary"),
+        (lambda: under(FIRST, "x", [("drive.speed", 3.0)]), "must be a dictionary, for example"),
         (lambda: worst(FIRST, {}), "give a dictionary"),
-        (lambda: worst(FIRST, [0.1]), "give a dictionary"),
-        (lambda: worst(FIRST, {"machine.stiffness": True}), "give a share"),
-        (lambda: worst(FIRST, {"machine.stiffness": "5 %"}), "give a share"),
+        (lambda: worst(FIRST, [0.1]), "must be a dictionary, for example"),
+        (lambda: worst(FIRST, {"machine.stiffness": True}), "stiffness is True; it must be a number"),
+        (lambda: worst(FIRST, {"machine.stiffness": "5 %"}), "must be a number"),
         (lambda: worst(FIRST, {"machine.stiffness": 0.0}), "give a share"),
         (lambda: worst(FIRST, {"machine.stiffness": 0.05}, samples=1), "samples is 1"),
-        (lambda: quantile(FIRST, True, {"machine.stiffness": 0.05}), "less than 1"),
-        (lambda: quantile(FIRST, "half", {"machine.stiffness": 0.05}), "less than 1"),
+        (lambda: quantile(FIRST, True, {"machine.stiffness": 0.05}), "level is True; it must be a number"),
+        (lambda: quantile(FIRST, "half", {"machine.stiffness": 0.05}), "must be a number"),
         (lambda: quantile(FIRST, 0.0, {"machine.stiffness": 0.05}), "less than 1"),
     ],
 )

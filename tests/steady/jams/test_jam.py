@@ -186,8 +186,11 @@ def test_loads_without_drag_are_refused():
 
 def test_select_says_what_is_wrong():
     modes = jv.jam_modes(published(speed=1.0).scene())
-    for wrong in (0, 6, -1, 2.0, "3", True):
+    for wrong in (0, 6, -1):
         with pytest.raises(jv.InputError, match="jam modes are numbered 1 to 5"):
+            modes.select(wrong)
+    for wrong in (2.0, "3", True, None):
+        with pytest.raises(jv.InputError, match="it must be a whole number"):
             modes.select(wrong)
     with pytest.raises(jv.ComputationError, match=r"jam mode 5 does not exist at rotor speed 1 rad/s; there: 3") as error:
         modes.select(5)

@@ -75,7 +75,7 @@ def test_all_papers_print_at_least_forty_numbers_and_none_surprises():
 def test_papers_that_there_are_not():
     with pytest.raises(jv.InputError, match=r"papers has 'gyro'; allowed: antiphase, criterion, rotor, torus, bearing"):
         jv.reproduce(["gyro"])
-    with pytest.raises(jv.InputError, match=r"give a list of names, such as \['rotor'\]"):
+    with pytest.raises(jv.InputError, match=r"papers is .*; it must be a list of texts"):
         jv.reproduce("rotor")
 
 

@@ -1,0 +1,290 @@
+"""Hostile Python calls: does every one end in one sentence about the input, a named status or a right answer?
+
+    python benchmarks/trials/hostile_calls.py --out out
+    python benchmarks/trials/hostile_calls.py --only simulate --list
+
+Every public function, every constructor that users call and every method of results is called once for each parameter and
+each hostile value, the other arguments valid. A call ends
+
+- refused: `InputError` or `ComputationError`, or Python's `TypeError` for a missing argument
+- answered: with a result whose numbers are finite or whose status says why they are not
+- raw: in any other error, or in a warning
+- hang: after more than `PATIENCE` seconds of the processor
+- silent: with numbers that are not finite and no status, or with a Boolean, a complex number, a date, bytes or masked values
+  taken for a number
+
+Each raw, hanging or silent call is printed as the line that repeats it; the exit code is their presence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import datetime
+import decimal
+import inspect
+import io
+import json
+import os
+import pathlib
+import random
+import re
+import signal
+import time
+import types
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from valid_calls import FOLDER, Call, calls
+
+import jaxvib as jv
+import optimize as op
+from jaxvib.errors import quoted
+
+PATIENCE = 20.0
+"""Seconds that no call may take, of the processor: others who use it do not count."""
+
+LONG = ("stress", "reproduce", "prepare_cpu", "use_cache")
+"""Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
+
+
+class Nothing:
+    """An object that is nothing that anybody asks for."""
+
+    def __repr__(self) -> str:
+        return "Nothing()"
+
+
+class Unprintable:
+    """An object whose representation fails."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no representation")
+
+
+HOSTILE: dict[str, Any] = {
+    "None": None,
+    "True": True,
+    "np.True_": np.True_,
+    "0": 0,
+    "-1": -1,
+    "0.5": 0.5,
+    "10**12": 10**12,
+    "10**400": 10**400,
+    "10**5000": 10**5000,
+    "1e308": 1e308,
+    "nan": float("nan"),
+    "inf": float("inf"),
+    "-inf": -float("inf"),
+    "1j": 1j,
+    "''": "",
+    "'nonsense'": "nonsense",
+    "'nan'": "nan",
+    "'1 ' + 'm' * 10**5": "1 " + "m" * 10**5,
+    "'1' * 400": "1" * 400,
+    "'a\\0b'": "a\0b",
+    "'\\ud800'": "\ud800",
+    "'../..'": "../..",
+    "b'12'": b"12",
+    "[]": [],
+    "()": (),
+    "{}": {},
+    "set()": set(),
+    "[1.0]": [1.0],
+    "[1, 2, 3, 4, 5, 6, 7]": [1, 2, 3, 4, 5, 6, 7],
+    "[[1], [2, 3]]": [[1], [2, 3]],
+    "[None]": [None],
+    "['a']": ["a"],
+    "{1: 2}": {1: 2},
+    "{'a': None}": {"a": None},
+    "(1, 2)": (1, 2),
+    "(1, 'a')": (1, "a"),
+    "object": Nothing(),
+    "unprintable": Unprintable(),
+    "int": int,
+    "lambda": lambda *_: None,
+    "generator": (each for each in (1.0, 2.0)),
+    "np.zeros(0)": np.zeros(0),
+    "np.zeros((2, 2))": np.zeros((2, 2)),
+    "np.asarray(nan)": np.asarray(float("nan")),
+    "np.ones(3) + 1j": np.ones(3) + 1j,
+    "jnp.asarray(True)": jnp.asarray(True),
+    "jnp.asarray(1j)": jnp.asarray(1j),
+    "np.asarray(['a'])": np.asarray(["a"]),
+    "np.asarray([None])": np.asarray([None]),
+    "np.ma.masked": np.ma.masked,
+    "masked array": np.ma.array([1.0, 2.0], mask=[False, True]),
+    "date": datetime.date(2020, 1, 1),
+    "datetime64": np.datetime64("2020-01-01"),
+    "timedelta64": np.timedelta64(3, "s"),
+    "Decimal nan": decimal.Decimal("NaN"),
+    "Path": pathlib.Path("/nonexistent/folder/file"),
+    "range(10**9)": range(10**9),
+    "NotImplemented": NotImplemented,
+    "module": types,
+}
+"""Values by the text that stands for them."""
+
+NO_NUMBERS = (
+    "True",
+    "np.True_",
+    "1j",
+    "b'12'",
+    "np.ones(3) + 1j",
+    "jnp.asarray(True)",
+    "jnp.asarray(1j)",
+    "np.ma.masked",
+    "masked array",
+    "date",
+    "datetime64",
+    "timedelta64",
+)
+"""Values that are no real numbers and must never be taken for one."""
+
+
+class Hanging(Exception):
+    """A call takes longer than anybody waits."""
+
+
+@contextlib.contextmanager
+def patience(seconds: float) -> Iterator[None]:
+    """Raise `Hanging` after so many seconds of the processor."""
+
+    def stop(*_: Any) -> None:
+        raise Hanging
+
+    former = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, former)
+
+
+def unsaid(answer: Any) -> bool:
+    """True if numbers of an answer are not finite and neither a status nor a mask of its own says so."""
+    if hasattr(answer, "status") or isinstance(answer, (jv.Result, op.Quantity, op.Demand)):
+        return False
+    leaves = [leaf for leaf in jax.tree.leaves(answer) if isinstance(leaf, (float, np.ndarray, jax.Array, np.generic))]
+    return any(np.asarray(leaf).dtype.kind == "f" and np.any(np.isnan(leaf)) for leaf in leaves)
+
+
+def takes_numbers(function: Callable[..., Any], name: str, valid: Any) -> bool:
+    """True if a parameter is a number, so that what is no number must be refused."""
+    if isinstance(valid, bool):
+        return False
+    number = isinstance(valid, (int, float)) or hasattr(valid, "dtype")
+    with contextlib.suppress(ValueError, TypeError):
+        kind = str(inspect.signature(function).parameters[name].annotation)
+        number |= bool(re.search(r"\b(Numbers?|float|int|Array|ndarray|ArrayLike)\b", kind)) and "Callable" not in kind
+    return number and not (isinstance(valid, str) and name in ("start", "value"))
+
+
+def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
+    """The kind of a call's end, and what is printed about it."""
+    value = HOSTILE[text]
+    if text == "generator":
+        value = (each for each in (1.0, 2.0))
+    began = time.process_time()
+    try:
+        with patience(PATIENCE), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("error")
+            with contextlib.chdir(FOLDER):
+                answer = call.function(**{**call.arguments, name: value})
+            answer = jax.block_until_ready(answer) if isinstance(answer, eqx.Module) else answer
+    except (jv.InputError, jv.ComputationError) as error:
+        taken = time.process_time() - began
+        said = str(error)
+        if len(said) > 2400 or not said.isprintable():
+            return "raw", f"a sentence of {len(said)} characters: {said[:80]!r}"
+        return ("hang", f"{taken:.0f} s, then {said[:80]}") if taken > PATIENCE else ("refused", said)
+    except Hanging:
+        return "hang", f"more than {PATIENCE:g} s"
+    except RecursionError:
+        return "raw", "RecursionError"
+    except Exception as error:
+        where = _place(error)
+        return "raw", f"{type(error).__name__} at {where}: {' '.join(_text(error).split())[:140]}"
+    finally:
+        import matplotlib.pyplot as plt
+
+        plt.close("all")
+    if text in NO_NUMBERS and takes_numbers(call.function, name, call.arguments[name]):
+        return "silent", f"takes {text} for a number"
+    if unsaid(answer) and not unsaid(value):
+        return "silent", f"is not finite: {quoted(answer)}"
+    return "answered", quoted(answer)
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:
+        return "no text"
+
+
+def _place(error: BaseException) -> str:
+    """The deepest line of the packages that an error went through."""
+    place, step = "?", error.__traceback__
+    while step is not None:
+        file = step.tb_frame.f_code.co_filename
+        if ("/jaxvib/" in file or "/optimize/" in file) and "site-packages" not in file and "boundary.py" not in file:
+            place = (
+                f"{file.rpartition('/jaxvib/')[2] if '/jaxvib/' in file else file.rpartition('/optimize/')[2]}:{step.tb_lineno}"
+            )
+        step = step.tb_next
+    return place
+
+
+def trials(only: str = "", part: tuple[int, int] = (0, 1), share: float = 1.0, seed: int = 0) -> Iterator[tuple[str, ...]]:
+    """(call, parameter, value, kind, text) of each hostile call."""
+    random_ = random.Random(seed)
+    for k, made in enumerate(calls()):
+        if (only and only != made.named) or (not only and k % part[1] != part[0]):  # pyright: ignore[reportFunctionMemberAccess]
+            continue
+        call = made()
+        for name, valid in call.arguments.items():
+            for text, value in HOSTILE.items():
+                if (value is None and valid is None) or (call.name in LONG and isinstance(value, (int, type(None)))):
+                    continue
+                if random_.random() < share:
+                    yield call.name, name, text, *outcome(call, name, text)
+
+
+def main() -> int:
+    """Run the trial and print what is not as it must be."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--only", default="", help="one call by its name")
+    parser.add_argument("--part", default="0/1", help="every n-th call from the k-th on, k/n")
+    parser.add_argument("--share", type=float, default=1.0, help="share of the hostile values, drawn by --seed")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--list", action="store_true", help="print every call")
+    parser.add_argument("--out", type=pathlib.Path, help="folder of the counts, JSON")
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    k, n = map(int, asked.part.split("/"))
+    counts: collections.Counter[str] = collections.Counter()
+    bad = []
+    for name, parameter, text, kind, said in trials(asked.only, (k, n), asked.share, asked.seed):
+        counts[kind] += 1
+        if kind in ("raw", "hang", "silent") or asked.list:
+            print(f"{kind}: {name}({parameter}={text}) {said}", flush=True)
+            bad += [] if kind in ("refused", "answered") else [[name, parameter, text, kind, said]]
+    print(dict(counts), flush=True)
+    if asked.out:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        (asked.out / f"hostile_calls_{k}_{n}.json").write_text(json.dumps({"counts": counts, "bad": bad}, indent=1))
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

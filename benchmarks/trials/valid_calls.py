@@ -1,0 +1,396 @@
+"""Valid calls of the whole public surface, which trials of hostile input start from."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+import tempfile
+import typing
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+import jaxvib as jv
+import optimize as op
+
+jv.prepare_cpu()
+
+FOLDER = pathlib.Path(tempfile.mkdtemp(prefix="hostile"))
+"""Folder of the files that valid calls read and write."""
+
+
+class Call(typing.NamedTuple):
+    """A valid call: its name, the function, its arguments by name, and those that are left as they are."""
+
+    name: str
+    function: Callable[..., Any]
+    arguments: dict[str, Any]
+    skipped: tuple[str, ...] = ()
+
+
+@functools.cache
+def scene() -> jv.Scene:
+    machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
+    return jv.Scene(machine, jv.balls(count=2, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0))
+
+
+@functools.cache
+def rotor_scene() -> jv.Scene:
+    machine = jv.rotor(
+        mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=400.0, position=(0.165, -0.155)
+    )
+    return jv.Scene(machine, jv.balls(count=2, mass=0.05, radius=0.1, drag=0.5), jv.ConstantSpeed(300.0))
+
+
+@functools.cache
+def torus_scene() -> jv.Scene:
+    loads = jv.torus_balls(count=2, mass=0.05, radius=0.1, tube=0.02, own_radius=0.01, drag=0.5)
+    return jv.Scene(jv.planar_rotor(mass=10.0, stiffness=1e5, damping=100.0), loads, jv.ConstantSpeed(200.0))
+
+
+@functools.cache
+def run() -> jv.Run:
+    return jv.simulate(scene(), 2.0, start="jam", mode=3, samples=16, turns=4)
+
+
+@functools.cache
+def orbit() -> jv.Orbit:
+    return jv.jam_orbit(scene(), mode=3)
+
+
+@functools.cache
+def record() -> jv.Record:
+    t = np.arange(0.0, 12.0, 0.04)
+    return jv.Record(t, 0.1 * np.exp(-0.02 * t) * np.cos(5.7 * t))
+
+
+def pendulum() -> jv.BearingPendulum:
+    return jv.BearingPendulum(mass=2.0, length=0.3, bearing=0.01)
+
+
+def space() -> op.DesignSpace:
+    return op.DesignSpace(scene(), free={"machine.stiffness[0]": (3e4, 8e4), "machine.stiffness[1]": (1e4, 6e4)})
+
+
+def make(value: float) -> jv.Scene:
+    return eqx.tree_at(lambda s: s.loads.drag, scene(), jnp.asarray(value))
+
+
+def case(values: Any) -> jv.Scene:
+    return eqx.tree_at(lambda s: s.loads.drag, scene(), values)
+
+
+def calls() -> Iterator[Callable[[], Call]]:
+    """Every valid call, made when it is needed."""
+
+    def call(name: str, of: Callable[[], Callable[..., Any]] | None = None, skip: tuple[str, ...] = (), /, **arguments: Any):
+        def made() -> Call:
+            function = of() if of else getattr(jv, name) if hasattr(jv, name) else getattr(op, name)
+            return Call(name, function, {k: v() if isinstance(v, functools.partial) else v for k, v in arguments.items()}, skip)
+
+        made.named = name  # pyright: ignore[reportFunctionMemberAccess]
+        return made
+
+    later = functools.partial
+    s, state = later(scene), later(lambda: jv.initial_state(scene()))
+    path = FOLDER / "file"
+    force = later(lambda: op.foundation_force(mode=3))
+    demand = later(lambda: (op.foundation_force(mode=3) < 1e5,))
+    plain = {"name": "x", "unit": "N"}
+    yield call("InputError", field="x", problem="is wrong")
+    yield call("ComputationError", status="bad", message="is bad")
+    yield call("prepare_cpu", devices=1)
+    yield call("use_cache", folder=str(path), only_if_unset=True)
+    # Parts of scenes
+    yield call("one_mass", mass=50.0, stiffness=4e4, damping=30.0)
+    two = dict(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0))
+    yield call("two_mass", **two, link_stiffness=2e5, link_damping=60.0, exciter=2)
+    three = dict(mass=(1.0, 2.0, 3.0), stiffness=(1e3, 2e3, 3e3), damping=(1.0, 1.0, 1.0))
+    yield call("three_mass", **three, link_stiffness=(1e3, 1e3, 1e3), link_damping=(1.0, 1.0, 1.0), exciter=2)
+    yield call("network", **two, links=[(1, 2)], link_stiffness=[2e5], link_damping=[60.0], exciter=2)
+    shaft = dict(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(6e5, 5e5), damping=400.0)
+    terms = dict(stiffness_terms=None, damping_terms=None)
+    yield call("rotor", **shaft, position=(0.165, -0.155), stations=0.0, **terms)
+    yield call("planar_rotor", mass=37.0, stiffness=6e5, damping=400.0)
+    numbers = dict(natural=(1 / 3, 1 / 3), damping=(0.01, 0.01), link_natural=2 / 3, link_damping=0.01, rho=1.0)
+    form = dict(form="antiphase", **numbers, eps=1e-3, beta=1.0, speed=3.0, count=1)
+    scales = dict(mass_scale=1.0, frequency_scale=1.0, radius=1.0, kappa=1.0)
+    yield call("Dimensionless", **form, **scales)
+    one = dict(omega=1.0, amplitude=1e-3, force=1.0)
+    yield call("Dimensionless.read", lambda: jv.Dimensionless(**form).read, **{k: jnp.asarray(v) for k, v in one.items()})
+    yield call("balls", count=2, mass=0.8, radius=0.12, drag=1.5, own_radius=0.01)
+    yield call("rollers", count=2, mass=0.8, radius=0.12, drag=1.5, own_radius=0.01)
+    yield call("pendulums", count=2, mass=0.8, radius=0.12, drag=1.5, inertia=0.01)
+    yield call("torus_balls", count=2, mass=0.05, radius=0.1, tube=0.02, own_radius=0.01, drag=0.5)
+    yield call("ConstantSpeed", speed=120.0)
+    yield call("SpinUp", speed=120.0, duration=2.0)
+    yield call("RunUp", speed=120.0, acceleration=20.0)
+    yield call("DCMotor", speed=120.0, stall_torque=2.0, inertia=0.1)
+    yield call("InductionMotor", speed=120.0, breakdown_torque=2.0, breakdown_slip=0.1, inertia=0.1)
+    yield call("Gravity", g=9.81, along="up")
+    yield call("DryFriction", coefficient=0.1, diameter=0.01, reaction="exact", width=0.01)
+    yield call("RollingFriction", coefficient=1e-4, direction="along", width=0.01)
+    yield call("Sliding", coefficient=0.1, width=0.2)
+    yield call("StaticImbalance", moment=0.01, angle=0.0)
+    yield call("MomentImbalance", moment=0.01, angle=0.0)
+    yield call("CubicSupport", stiffness=1e6, platform=1, position=None)
+    yield call("Stop", stiffness=1e6, gap=0.01, damping=0.0, side="both", platform=1, position=None)
+    yield call("LoadContact", stiffness=1e6, damping=0.0, restitution=None)
+    parts = {name: later(lambda name=name: getattr(scene(), name)) for name in ("machine", "loads", "drive")}
+    yield call("Scene", **parts, effects=(jv.Gravity(),))
+    toml = later(lambda: jv.scene_to_toml(scene()))
+    file = later(lambda: jv.save_scene(scene(), FOLDER / "scene.toml"))
+    yield call("load_scene", path=file)
+    yield call("save_scene", scene=s, path=path)
+    yield call("scene_from_toml", text=toml)
+    yield call("scene_to_toml", scene=s)
+    # Equations
+    yield call("vector_field", scene=s)
+    yield call("initial_state", scene=s, start="turning", mode=None, angles=None, apart=0.0, throw=True)
+    yield call("initial_state", scene=s, start="jam", mode=3, angles=(0.0, 1.0), apart=0.0, throw=False)
+    yield call("with_spin", scene=s, state=state, turning="rolling")
+    yield call("natural_frequencies", scene=s)
+    yield call("mode_shapes", scene=s)
+    yield call("energy", scene=s, state=state, t=0.0)
+    yield call("power", lambda: jv.power, scene=s, t=0.0, state=state)
+    yield call("foundation_force", lambda: jv.foundation_force, scene=s, state=state)
+    yield call("normal_force", scene=s, t=0.0, state=state)
+    # Jams
+    yield call("jam_modes", scene=s)
+    yield call("branches", scene=s, exact=False, points=50, most=None, least=None, accuracy=1e-8)
+    yield call("branches", scene=s, exact=True, points=8, most=20.0, least=10.0, accuracy=1e-6)
+    yield call("phase_jams", scene=s, starts=8, seed=0, near=None)
+    yield call("jam_orbit", scene=s, mode=3, omega=None, near=None, accuracy=None, points=None, throw=True)
+    yield call("stability_map", make=make, values=[1.0, 2.0], omega=(10.0, 15.0), points=8)
+    yield call("stability_onset", make=make, kind="Hopf", between=(1.0, 2.0), omega=(10.0, 15.0), points=8, accuracy=0.1)
+    # Balancing
+    r = later(rotor_scene)
+    yield call("criterion", scene=r)
+    yield call("criterion_map", scene=r, speeds=[200.0, 300.0], mass=[0.05], drag=[0.5], steps=16)
+    yield call("balanced_states", scene=r)
+    yield call("whirl", scene=r, rotor_speed=(100.0, 200.0), loads="fixed")
+    yield call("critical_speeds", scene=r, loads="fixed")
+    # Motion
+    motion = dict(start="rest", mode=None, apart=0.0, spin_up=None, save="all", samples=16, turns=4, estimate=False)
+    more = dict(solver=None, stepsize_controller=None, adjoint=None, max_steps=None, progress_meter=None, throw=True)
+    yield call("simulate", scene=s, until=0.5, **motion, **more)
+    slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, turns=4)
+    yield call(
+        "envelope", scene=s, until=0.5, **slow, **{k: v for k, v in more.items() if k != "progress_meter"} | {"max_steps": 999}
+    )
+    yield call(
+        "settle", scene=s, start="jam", mode=3, drift=0.05, periods=4, stretches=2, stepsize_controller=None, throw=False
+    )
+    drags = later(lambda: jnp.asarray([1.0, 2.0]))
+    fast = later(lambda: jv.EqualSteps(200))
+    lanes = dict(stepsize_controller=fast, estimate=False, lanes=2, equations=jv.vector_field)
+    yield call("ensemble", make=case, values=drags, until=0.2, **lanes)
+    ups = dict(drag=[1.0, 2.0], starts=2, seed=0, angles=None, stepsize_controller=fast, batch=4, max_steps=None)
+    yield call("run_ups", scene=s, until=0.2, **ups)
+    yield call("growth", scene=s, until=1.0, start="jam", mode=3, stretches=8)
+    yield call("regime", scene=s, stretch=later(lambda: run().window))
+    yield call("Tolerance", tolerance=1e-8)
+    yield call("Accuracy", error=1e-4)
+    yield call("EqualSteps", number=200)
+    for name, steps in (("Tolerance", "tolerance"), ("Accuracy", "error"), ("EqualSteps", "number")):
+        kind = {"tolerance": 1e-8, "error": 1e-4, "number": 200}[steps]
+        yield call(f"simulate by {name}", lambda name=name: _by_steps(name), value=kind)
+    # Accuracy
+    cost = dict(quantity="amplitude", mode=3, until=None, tolerances=(1e-3,), solvers=("default",), repeats=1)
+    yield call("work_precision", scene=s, **cost)
+    yield call("compare_tiers", scene=s, factors=[1.0], mode=3)
+    yield call("harmonic_convergence", scene=s, omega=[10.0], points=(4, 6))
+    gradients = dict(free=["machine.mass[0]"], routes=("forward",), implicit=None, tolerance=1e-5)
+    yield call("check_gradients", scene=s, quantity=lambda x: jv.natural_frequencies(x)[0], **gradients)
+    asked = dict(accuracy=0.1, mode=3, until=None, start=None, possible=(), tiers=False, repeats=0)
+    yield call("audit", scene=s, **asked)
+    yield call("stress", only=("nothing of this name",), precisions=("float64",), report=None)
+    yield call("reproduce", papers=("nothing of this name",), full=False, report=None, figure=None)
+    # Bearing
+    yield call("BearingPendulum", mass=2.0, length=0.3, inertia=0.0, bearing=0.01, g=9.81)
+    p, rec = later(pendulum), later(record)
+    given = dict(angle=0.1, rate=0.0, viscous=1e-3, dry=1e-3, width=None, stepsize_controller=None, solver=None, adjoint=None)
+    yield call("swing", pendulum=p, time=np.linspace(0.0, 2.0, 20), **given, max_steps=9999, throw=True)
+    t = np.arange(0.0, 2.0, 0.1)
+    yield call("Record", time=t, angle=0.1 * np.cos(6.0 * t), name="record")
+    csv = later(_csv)
+    yield call("read_record", path=csv, columns=("time (s)", "angle (rad)"), angle_unit="rad")
+    yield call("ten_periods", pendulum=p, record=rec, periods=4, instrument=0.0, turns=None)
+    yield call("identify", pendulum=p, record=rec, dry=False, instrument=0.0, throw=False)
+    # Capture
+    torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, turning="rolling")
+    fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)
+    yield call("capture", scene=later(torus_scene), speeds=[0.5, 0.9], **torus, **fewer)
+    yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[0.5], **torus, equations=jv.vector_field)
+    # Pictures, results
+    yield call("sketch", scene=s, ax=None)
+    film = dict(scene=s, begin=None, end=None, seconds=0.1, fps=5, magnify=None, width=2.0)
+    yield call("animate", motion=later(run), path=None, **film)
+    modes = later(lambda: jv.jam_modes(scene()))
+    yield call("load", path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
+    yield call("write_csv", result=later(run), axis="time", path=path)
+    yield call("html_report", result=modes, path=path, title="t", scene=s, figures=())
+    # Methods of results
+    yield call("Result.save", lambda: jv.jam_modes(scene()).save, path=path)
+    yield call("Result.load", lambda: jv.JamModes.load, path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
+    figure = dict(unit="Hz", ax=None)
+    panels = dict(most=None, show=("speed",))
+    yield call("Branches.plot", lambda: jv.branches(scene(), points=50).plot, **figure, **panels)
+    yield call("ExactBranches.plot", lambda: exact().plot, **figure, **panels)
+    yield call("JamModes.plot", lambda: jv.jam_modes(scene()).plot, **figure)
+    yield call("JamModes.row", lambda: jv.jam_modes(scene()).row, mode=3, throw=False)
+    yield call("JamModes.select", lambda: jv.jam_modes(scene()).select, mode=3, throw=False)
+    yield call("Jam.plot", lambda: jv.jam_modes(scene()).select(3).plot, **figure)
+    yield call("ModeShapes.plot", lambda: jv.mode_shapes(scene()).plot, **figure)
+    yield call("Orbit.at", lambda: orbit().at, theta=np.asarray([0.0, 1.0]))
+    yield call("Orbit.relative_amplitude", lambda: orbit().relative_amplitude, i=1, j=2)
+    yield call("Orbit.plot", lambda: orbit().plot, ax=None)
+    yield call("PhaseJams.select", lambda: phases().select, index=0)
+    yield call("PhaseJams.follow", lambda: phases().follow, index=0, omega=later(lambda: phases().omega[:1]))
+    yield call("PhaseJams.plot", lambda: phases().plot, **figure)
+    yield call("PhaseJam.plot", lambda: phases().select(0).plot, ax=None)
+    yield call("Run.plot", lambda: run().plot, **figure)
+    yield call("Run.spectrum", lambda: run().spectrum, parts=1)
+    yield call("Run.plot_path", lambda: run().plot_path, ax=None)
+    yield call("Spectrum.plot", lambda: run().spectrum().plot, show="displacement", coordinate=None, **figure)
+    yield call("Envelope.plot", lambda: jv.envelope(scene(), 0.5, samples=16).plot, **figure)
+    yield call("Regime.plot", lambda: run().regime.plot, ax=None)
+    yield call("Whirl.plot", lambda: jv.whirl(rotor_scene(), (100.0, 200.0)).plot, at=None, **figure)
+    yield call("Criterion.plot", lambda: jv.criterion(rotor_scene()).plot, **figure)
+    yield call("Criterion.balances", lambda: jv.criterion(rotor_scene()).balances, speed=jnp.asarray(100.0))
+    balanced = lambda: jv.balanced_states(rotor_scene())  # noqa: E731
+    yield call("BalancedStates.stability", lambda: balanced().stability, arrangement=0, steps=16)
+    yield call("BalancedStates.growth", lambda: balanced().growth, speeds=[200.0], arrangement=0, steps=16)
+    spans = dict(low=200.0, high=300.0, arrangement=0, points=4, steps=16)
+    yield call("BalancedStates.intervals", lambda: balanced().intervals, **spans)
+    yield call("BalancedStates.plot", lambda: balanced().plot, ax=None)
+    yield call("Record.between", lambda: record().between, start=1.0, stop=9.0)
+    yield call("Cost.cheapest", lambda: cost_of().cheapest, error=1e-3)
+    # Design
+    mode = dict(mode=3)
+    of = dict(of=1)
+    tier = dict(tier="leading")
+    yield call("amplitude", **mode, **of, **tier)
+    yield call("force_per_amplitude", **mode, **of, **tier)
+    yield call("foundation_force of a jam", lambda: op.foundation_force, **mode, harmonic=None, **tier)
+    yield call("jam_frequency", **mode, **tier)
+    yield call("phase", **mode, of=(1, 2), **tier)
+    yield call("power of a jam", lambda: op.power, **mode, **tier)
+    yield call("fold_margin", **mode)
+    yield call("largest_multiplier", **mode)
+    yield call("peak_force", until=1.0, spin_up=0.5)
+    yield call("settling_time", until=1.0, spin_up=0.5, within=0.05, of=1)
+    yield call("product", field="machine.mass")
+    yield call("total", field="machine.mass")
+    yield call("static_deflection", of=1)
+    yield call("spring_cost", prices=[(1e4, 10.0), (1e5, 20.0)], unit="EUR")
+    for name in ("maximize", "minimize", "negative"):
+        yield call(name, quantity=force)
+    for name in ("expected", "worst"):
+        yield call(name, quantity=force, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
+    yield call("quantile", quantity=force, level=0.9, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
+    yield call("under", quantity=force, name="slow", changes={"drive.speed": "1200 rpm"})
+    yield call("hold", quantity=force, value=10.0)
+    yield call("largest", lambda: lambda first: op.largest(first), first=force)
+    yield call("least", lambda: lambda first: op.least(first), first=force)
+    yield call("Quantity", **plain, function=lambda s: s.drive.speed, mode=None, of=None, parts=())
+    for sign in ("+", "-", "*", "/", "<", ">", "**"):
+        yield call(f"Quantity {sign}", lambda sign=sign: _operator(sign), other=2.0 if sign in "*/**" else "2 N")
+    yield call("Quantity.at_tier", lambda: op.foundation_force(mode=3).at_tier, tier="exact")
+    yield call("Quantity.named", lambda: op.foundation_force(mode=3).named, name="force")
+    yield call("Quantity()", lambda: op.foundation_force(mode=3), scene=s, modes=modes)
+    stiffness = {"machine.stiffness[0]": (3e4, 8e4)}
+    ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 0.5)}
+    yield call("DesignSpace", scene=s, free=stiffness, hold=(), ties=ties, choices={"machine.mass[0]": [100.0, 120.0]})
+    for name in ("free", "ties", "choices"):
+        yield call(f"DesignSpace by {name}", lambda name=name: _space(name), value=stiffness.get("x", (3e4, 8e4)))
+    for name in ("numbers", "at", "scene_of", "shares"):
+        yield call(f"DesignSpace.{name}", lambda name=name: getattr(space(), name), **_vector(name))
+    yield call("DesignSpace.where", lambda: space().where, scene=s)
+    yield call("DesignSpace.parameters", lambda: space().parameters, scene=s)
+    yield call("DesignSpace.within", lambda: space().within, low=np.asarray([3e4, 2e4]), high=np.asarray([5e4, 3e4]))
+    yield call("load_design", path=later(_design))
+    search = dict(starts=2, seed=0)
+    yield call("pareto", space=later(space), first=force, second=later(op.total_mass), points=2, subject_to=demand, **search)
+    ended = dict(
+        iterations=2, polishing=0, rate=0.05, searcher="gradients", begin=None, verify=False, throw=False, progress=None
+    )
+    yield call("synthesize", space=later(space), objective=force, subject_to=demand, **search, **ended)
+
+
+@functools.cache
+def exact() -> jv.ExactBranches:
+    found = jv.branches(scene(), exact=True, points=8, most=20.0, least=10.0, accuracy=1e-6)
+    assert isinstance(found, jv.ExactBranches)
+    return found
+
+
+@functools.cache
+def phases() -> jv.PhaseJams:
+    found = jv.phase_jams(scene(), starts=16)
+    assert isinstance(found, jv.PhaseJams)
+    return found
+
+
+@functools.cache
+def cost_of() -> jv.Cost:
+    return jv.work_precision(scene(), "amplitude", mode=3, tolerances=(1e-3,), solvers=("default",), repeats=1)
+
+
+def _by_steps(name: str) -> Callable[..., Any]:
+    def simulate(value: float) -> jv.Run:
+        return jv.simulate(scene(), 0.2, stepsize_controller=getattr(jv, name)(value), samples=16, max_steps=4096)
+
+    return simulate
+
+
+def _operator(sign: str) -> Callable[..., Any]:
+    force = op.foundation_force(mode=3)
+    signs: dict[str, Callable[[Any], Any]] = {
+        "+": lambda other: force + other,
+        "-": lambda other: force - other,
+        "*": lambda other: force * other,
+        "/": lambda other: force / other,
+        "<": lambda other: force < other,
+        ">": lambda other: force > other,
+        "**": lambda other: force**other,
+    }
+    return lambda other: signs[sign](other)
+
+
+def _space(name: str) -> Callable[..., Any]:
+    free: dict[str, Any] = {"machine.stiffness[0]": (3e4, 8e4)}
+    other = {"ties": "machine.stiffness[1]", "choices": "machine.mass[0]"}.get(name)
+
+    def built(value: Any) -> op.DesignSpace:
+        if other is None:
+            return op.DesignSpace(scene(), free={"machine.stiffness[0]": value})
+        return op.DesignSpace(scene(), free=free, **{name: {other: value}})
+
+    return built
+
+
+def _vector(name: str) -> dict[str, Any]:
+    return (
+        {"values": jnp.asarray([4e4, 3e4])}
+        if name == "scene_of"
+        else {"numbers" if name == "shares" else "z": jnp.asarray([0.5, 0.5])}
+    )
+
+
+def _csv() -> pathlib.Path:
+    path = FOLDER / "swing.csv"
+    lines = [f"{a:.3f},{b:.6f}" for a, b in zip(record().time, record().angle, strict=True)]
+    path.write_text("time (s),angle (rad)\n" + "\n".join(lines))
+    return path
+
+
+def _design() -> pathlib.Path:
+    jv.save_scene(scene(), FOLDER / "machine.toml")
+    objective = '[objective]\nquantity = "foundation_force"\nmode = 3\n'
+    text = f'scene = "machine.toml"\n[free]\n"machine.stiffness[0]" = [3e4, 8e4]\n{objective}'
+    (FOLDER / "design.toml").write_text(text)
+    return FOLDER / "design.toml"

@@ -1,0 +1,322 @@
+"""Arguments of public functions, checked against the types that their signatures name.
+
+One decorator stands at every public function and at the public methods of results, so that None in place of a scene, a word
+in place of a count or a list in place of a function ends in one sentence before anything is traced. What a type cannot say
+(bounds, units, names of numbers) the function itself checks.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import numbers
+import os
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from jaxvib.errors import InputError, quoted
+
+__all__ = ["is_real", "is_whole", "require_path", "validated"]
+
+_MAX_ENTRIES = 10**7
+"""The longest list whose entries are looked at one by one."""
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_EXAMPLES = {
+    "Machine": "for example two_mass(...)",
+    "Loads": "for example balls(...)",
+    "Drive": "for example ConstantSpeed('1500 rpm')",
+    "Effect": "for example Gravity()",
+    "Scene": "for example load_scene('machine.toml')",
+    "State": "for example initial_state(scene)",
+    "Quantity": "for example foundation_force(mode=3)",
+    "DesignSpace": "for example DesignSpace(scene, free={'machine.stiffness': (1e4, 1e5)})",
+    "BearingPendulum": "for example BearingPendulum(mass=2.0, length=0.3)",
+    "Record": "for example read_record('swing.csv')",
+    "Axes": "of matplotlib",
+    "tolerances": "for example {'machine.stiffness': 0.05}, a share of 5 %",
+    "changes": "for example {'drive.speed': '1200 rpm'}",
+}
+"""Examples of classes, and of arguments by their names."""
+
+_MAX_WHOLE = 2**63 - 1
+"""The largest whole number that an array holds."""
+
+
+def validated(function: F) -> F:
+    """Check the arguments of a public function by its annotations before it runs.
+
+    **Raises** `InputError` for an argument of another type; `TypeError`, as Python does, for a name that the function does not
+    have.
+
+    >>> from pathlib import Path
+    >>> @validated
+    ... def area(width: float, count: int = 1, path: str | Path | None = None) -> float:
+    ...     return width * count
+    >>> area(2.0, count=3)
+    6.0
+    >>> area(2.0, count="3")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: count is '3'; it must be a whole number
+    """
+    signature = inspect.signature(function)
+    checks: dict[str, Any] = {}
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        if not checks:
+            checks.update(_annotations(function, signature))
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError:  # the function itself says it, or knows the name as a former one
+            return function(*args, **kwargs)
+        for name, value in bound.arguments.items():
+            kind = checks[name]
+            if kind is not Any and value is not signature.parameters[name].default:
+                several = signature.parameters[name].kind
+                if several is inspect.Parameter.VAR_POSITIONAL:
+                    for index, each in enumerate(value):
+                        _require(each, kind, f"{name}[{index}]")
+                elif several is not inspect.Parameter.VAR_KEYWORD:
+                    _require(value, kind, name)
+                    if isinstance(value, (list, tuple, Decimal)) and _has_array(kind):
+                        bound.arguments[name] = np.asarray(value, dtype=float)
+        return function(*bound.args, **bound.kwargs)
+
+    return typing.cast(F, checked)
+
+
+def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, Any]:
+    """Return the annotations of the parameters; `Any` for those that only type checkers can resolve."""
+    found = {}
+    for name, parameter in signature.parameters.items():
+        kind = Any if parameter.annotation is parameter.empty else parameter.annotation
+        for _ in range(3):  # an alias may hold a text itself
+            if not isinstance(kind, str):
+                break
+            try:
+                kind = eval(kind, inspect.unwrap(function).__globals__)  # the package's own annotations
+            except (NameError, TypeError, AttributeError):
+                kind = _Named(kind.removesuffix("| None").strip()) if kind.split(" ")[0] == "Axes" else Any
+        found[name] = kind
+    return found
+
+
+class _Named:
+    """A class that is imported by type checkers only: its instances are known by its name."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+
+def is_real(value: object) -> bool:
+    """Return True for a real number or an array of real numbers, traced ones included; Booleans and dates are none."""
+    if type(value) is float or type(value) is int:
+        return True
+    kind = getattr(value, "dtype", None)
+    if kind is None or getattr(kind, "kind", "") == "O":
+        if kind is None and hasattr(value, "__jax_array__"):
+            return True
+        entries = value.ravel().tolist() if isinstance(value, np.ndarray) else (value,)
+        return all(isinstance(each, (numbers.Real, Decimal)) and not isinstance(each, (bool, np.bool_)) for each in entries)
+    return getattr(kind, "kind", "") in "iuf" or str(kind).startswith(("bfloat", "float8", "int", "uint"))
+
+
+def is_whole(value: object) -> bool:
+    """Return True for a whole number of Python or NumPy; Booleans and spans of time are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+
+
+def require_path(value: object, field: str) -> Path:
+    """Return a path. **Raises** `InputError` for what is none, for an empty one and for the character NUL.
+
+    >>> require_path(3, "path")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: path is 3; it must be the path of a file
+    """
+    if not isinstance(value, (str, os.PathLike)) or isinstance(os.fspath(value), bytes):
+        raise InputError(field, f"is {quoted(value)}; it must be the path of a file")
+    text = os.fspath(value)
+    if not text or "\0" in text or len(text) > 4096 or any("\ud800" <= character <= "\udfff" for character in text):
+        raise InputError(field, f"is {quoted(value)}; it must be the path of a file, without the character NUL")
+    return Path(value)
+
+
+def _require(value: Any, kind: Any, field: str) -> None:
+    """**Raises** `InputError` for a value that is not of that kind."""
+    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    if any(_is_number_with_unit(each) for each in kinds):
+        return
+    if any(each is Path or typing.get_origin(each) is os.PathLike for each in kinds) and not isinstance(
+        value, (type(None), *_other_classes(kinds))
+    ):
+        require_path(value, field)
+        return
+    problems = []
+    for each in kinds:
+        if _accepts_all(each):
+            return
+        problem = _problem(value, each)
+        if problem is None:
+            return
+        problems.append(problem)
+    inner = [problem for problem in problems if isinstance(problem, InputError)]
+    if inner:
+        raise InputError(f"{field}{inner[0].field}", inner[0].problem)
+    words = [problem for problem in problems if problem != "None"] or ["None"]
+    example = f", {_EXAMPLES[field]}" if field in _EXAMPLES else ""
+    raise InputError(field, f"is {quoted(value)}; it must be {' or '.join(dict.fromkeys(words))}{example}")
+
+
+def _other_classes(kinds: Sequence[Any]) -> tuple[type, ...]:
+    """Return the classes that a path may have in its place."""
+    return tuple(each for each in kinds if isinstance(each, type) and each not in (str, Path, os.PathLike, type(None)))
+
+
+def _is_number_with_unit(kind: Any) -> bool:
+    """Return True for a part of `jaxvib.units.Number`: the reader of units checks it."""
+    return getattr(kind, "__name__", "") == "Quantity" and getattr(kind, "_is_protocol", False)
+
+
+def _accepts_all(kind: Any) -> bool:
+    return kind is Any or kind is object or isinstance(kind, (TypeVar, str, typing.ForwardRef))
+
+
+def _problem(value: Any, kind: Any) -> str | InputError | None:
+    """Return None for a value of that kind, else the words for what is needed, or the problem with an entry."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if kind is None or kind is type(None):
+        return None if value is None else "None"
+    if origin is Literal:
+        if isinstance(value, tuple({type(each) for each in inner})):  # the function says which words it knows
+            return None
+        return " or ".join(map(quoted, inner)) if len(inner) < 3 else f"one of {', '.join(map(str, inner))}"
+    if isinstance(kind, _Named):
+        return None if any(each.__name__ == kind.name for each in type(value).__mro__) or value is None else _words(kind.name)
+    if kind is bool:
+        return None if isinstance(value, (bool, np.bool_)) else "True or False"
+    if kind is int:
+        whole = is_whole(value) and abs(value) <= _MAX_WHOLE
+        return None if whole or _is_traced(value) else "a whole number"
+    if kind is float:
+        return _problem_of_float(value)
+    if kind is complex or _is_array(kind):
+        return _problem_of_array(value)
+    if kind is str:
+        return None if isinstance(value, str) else "a text"
+    if origin is not None and isinstance(origin, type):
+        return _problem_of_container(value, origin, inner)
+    if isinstance(kind, type):
+        if getattr(kind, "_is_protocol", False):
+            return None if not getattr(kind, "_is_runtime_protocol", False) or isinstance(value, kind) else "another object"
+        if kind is Callable or kind is types.FunctionType:
+            return None if callable(value) else "a function"
+        return None if isinstance(value, kind) else _words(kind.__name__)
+    return None
+
+
+def _words(name: str) -> str:
+    article = "an" if name[0] in "AEIOU" else "a"
+    return f"{article} {name}" + (f", {_EXAMPLES[name]}" if name in _EXAMPLES else "")
+
+
+def _is_traced(value: Any) -> bool:
+    return isinstance(value, Tracer)
+
+
+def _has_array(kind: Any) -> bool:
+    """Return True if an array is the only list of numbers that is allowed."""
+    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    others = any(typing.get_origin(each) is not None or _is_number_with_unit(each) for each in kinds)
+    return any(map(_is_array, kinds)) and not others
+
+
+def _is_array(kind: Any) -> bool:
+    module, _, name = f"{getattr(kind, '__module__', '')}.{getattr(kind, '__name__', '')}".rpartition(".")
+    return module.startswith(("jax", "numpy")) and name in ("Array", "ndarray")
+
+
+def _problem_of_float(value: Any) -> str | None:
+    if not is_real(value) or np.ma.is_masked(value):
+        return "a number"
+    if _is_traced(value):
+        return None
+    if getattr(value, "ndim", 0):
+        return "a single number"
+    if isinstance(value, int) and abs(value).bit_length() > 1023:
+        return "a number below 1e308"
+    return "a number, not NaN" if value != value else None
+
+
+def _problem_of_array(value: Any) -> str | None:
+    if isinstance(value, (list, tuple)):
+        try:
+            value = np.asarray(value)
+        except (ValueError, TypeError):
+            return "an array of numbers"
+    if not is_real(value) or np.ma.is_masked(value):
+        return "an array of numbers"
+    return "an array of numbers below 1e308" if isinstance(value, int) and abs(value).bit_length() > 1023 else None
+
+
+def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> str | InputError | None:
+    if origin is Callable or issubclass(origin, typing.cast(type, Callable)):
+        return None if callable(value) else "a function"
+    if issubclass(origin, Mapping):
+        if not isinstance(value, Mapping):
+            return "a dictionary"
+        for key, each in value.items():
+            if not isinstance(key, str):
+                return f"a dictionary of names, not of {quoted(key)}"
+            problem = _problem_of_entries([(f".{quoted(key)[1:-1]}", each)], inner[-1:])
+            if problem is not None:
+                return problem
+        return None
+    if issubclass(origin, (Sequence, list, tuple)):
+        several = isinstance(value, (Sequence, np.ndarray, jax.Array))
+        if any(_is_number_with_unit(each) for kind in inner for each in (typing.get_args(kind) or (kind,))) and not isinstance(
+            value, Mapping
+        ):
+            return None if several or is_real(value) else "a list of numbers"
+        if isinstance(value, Sequence) and not isinstance(value, str) and len(value) > _MAX_ENTRIES:
+            return f"a list of at most {_MAX_ENTRIES} entries"
+        if not several or isinstance(value, (str, bytes, bytearray)) or getattr(value, "ndim", 1) == 0:
+            return f"a list of {_plural(inner)}"
+        if origin is tuple and inner and Ellipsis not in inner:
+            if len(value) != len(inner):
+                return f"{len(inner)} values"
+            for index, (each, kind) in enumerate(zip(value, inner, strict=True)):
+                problem = _problem_of_entries([(f"[{index}]", each)], (kind,))
+                if problem is not None:
+                    return problem
+            return None
+        if getattr(value, "dtype", None) is not None:
+            return _problem_of_array(value) if any(kind in (float, int) or _is_array(kind) for kind in inner) else None
+        return _problem_of_entries(((f"[{index}]", each) for index, each in enumerate(value)), inner[:1])
+    return None if isinstance(value, origin) else _words(origin.__name__)
+
+
+def _plural(inner: tuple[Any, ...]) -> str:
+    names = {float: "numbers", int: "whole numbers", str: "texts"}
+    return names.get(inner[0], "values") if inner else "values"
+
+
+def _problem_of_entries(entries: Any, kinds: tuple[Any, ...]) -> InputError | None:
+    for place, each in entries:
+        for kind in kinds:
+            try:
+                _require(each, kind, place)
+            except InputError as error:
+                return error
+    return None
