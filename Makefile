@@ -8,7 +8,7 @@ EXAMPLE = examples/antiphase
 
 .PHONY: demo test test-slow test-versions check docs bench-guard clean
 
-demo: $(VENV)/installed
+demo: $(VENV)/installed-demo
 	@echo "--- how the first drawing can jam"
 	@$(JAXVIB) modes $(EXAMPLE)/machine.toml --out $(OUT)/first
 	@echo "--- the supports that leave the foundation at rest"
@@ -28,7 +28,7 @@ test-slow: $(VENV)/installed
 LOWEST_PYTHON ?= python3.11
 HIGHEST_PYTHON ?= python3.13
 VERSION_TESTS = tests/runtime tests/numerics tests/machine tests/equations tests/ode tests/test_results.py \
-	tests/steady/jams tests/motion/test_endings.py
+	tests/steady/jams tests/motion/test_endings.py tests/cli tests/sweeps tests/explore tests/docs/test_commands.py
 
 test-versions:
 	$(MAKE) .venv-lowest/installed VENV=.venv-lowest PYTHON=$(LOWEST_PYTHON) PIP_CONSTRAINT=.ci/lowest.txt
@@ -49,6 +49,13 @@ docs: $(VENV)/installed-docs
 # Ratios of times beside recorded ones: fails where something became three times slower.
 bench-guard: $(VENV)/installed-bench
 	$(BIN)/python benchmarks/guard.py
+
+# What users install: without what the tests need.
+$(VENV)/installed-demo: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)

@@ -80,7 +80,7 @@ def synthesize(
     - `starts`, `seed`: how many random starts, and which; `iterations` of the descent with first step `rate` (in parts of a
       free number's range), then `polishing` steps of sequential quadratic programming
     - `searcher`: what comes before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which asks for values
-      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `jaxvib[cma]`); its few best designs
+      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `cma`); its few best designs
       are polished
     - `begin`: go on from where another search of this space ended, in place of random starts
     - `verify`: compute the exact motion of the best design and, if it is stable, integrate the full equations until they have

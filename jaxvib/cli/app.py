@@ -179,6 +179,10 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
+_NO_ARGUMENTS: type[click.UsageError] | tuple[()] = getattr(click.exceptions, "NoArgsIsHelpError", ())
+"""Raised where help is asked for by no argument; click below 8.2 prints it by itself."""
+
+
 def run(arguments: list[str]) -> int:
     """Runs a command line and gives its exit code: 0 done, 1 the computation failed, 2 bad input."""
     wants_json = "--json" in arguments
@@ -190,7 +194,7 @@ def run(arguments: list[str]) -> int:
         return _failed(wants_json, 2, {"kind": "input", "field": error.field, "message": message})
     except ComputationError as error:
         return _failed(wants_json, 1, {"kind": "computation", "status": error.status, "message": str(error)})
-    except click.exceptions.NoArgsIsHelpError as error:
+    except _NO_ARGUMENTS as error:
         click.echo(error.format_message())
         return 0
     except BrokenPipeError:

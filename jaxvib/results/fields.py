@@ -128,7 +128,7 @@ def _plain_fields(value: DataclassInstance) -> dict[str, Plain]:
 
 
 def to_xarray(result: eqx.Module) -> xarray.Dataset:
-    """The numbers of a result as a labelled dataset, units in the attribute "units" (needs the extra `jaxvib[xarray]`).
+    """The numbers of a result as a labelled dataset, units in the attribute "units" (needs the extra `xarray`).
 
     Axes that only an outer `vmap` made are called "batch", from the outermost one "batch_1", "batch_2" where there are several.
 
@@ -137,7 +137,7 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
     try:
         import xarray as xr
     except ImportError as error:
-        raise InputError("to_xarray", "needs xarray; install it with: pip install 'jaxvib[xarray]'") from error
+        raise InputError("to_xarray", "needs xarray; install it with: pip install '.[xarray]'") from error
     labels = labels_of(result)
     variables = {}
     for name, axes, value, unit in columns(result):

@@ -42,7 +42,7 @@ def on_a_cluster(
         from distributed import Client, LocalCluster, as_completed
         from distributed.scheduler import KilledWorker
     except ImportError as error:
-        raise InputError("workers", "need Dask; install it with: pip install 'jaxvib[cluster]'") from error
+        raise InputError("workers", "need Dask; install it with: pip install '.[cluster]'") from error
     if workers is not None and scheduler is not None:
         raise InputError("scheduler", "is given together with workers, which are processes of this machine; give one of them")
     seconds = float(number(timeout, "s", "timeout", low=0.0, open_low=True))

@@ -57,7 +57,7 @@ def require_zarr() -> ModuleType:
     try:
         import zarr
     except ImportError as error:
-        raise InputError("sweep", "needs zarr and xarray; install them with: pip install 'jaxvib[sweep]'") from error
+        raise InputError("sweep", "needs zarr and xarray; install them with: pip install '.[sweep]'") from error
     return zarr
 
 

@@ -73,7 +73,7 @@ class Sweep(Result):
         try:
             import xarray
         except ImportError as error:
-            raise InputError("data", "needs xarray; install it with: pip install 'jaxvib[sweep]'") from error
+            raise InputError("data", "needs xarray; install it with: pip install '.[sweep]'") from error
         Store(Path(self.store)).require_whole()
         return xarray.open_dataset(self.store, engine="zarr")
 
@@ -148,7 +148,7 @@ def sweep(
     - `samples`, `seed`, `sampling`: how many, and how they are drawn: "low_discrepancy" or "random"
     - `chunk`: cases that are computed and written together; it is part of the store's record
     - `workers`: so many processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
-      which has `timeout`, s, to answer. They need the extra `jaxvib[cluster]`
+      which has `timeout`, s, to answer. They need the extra `cluster`
     - `report`: is called with a `Progress` after each chunk
 
     **Returns** `Sweep`. A case that fails raises nothing: its status and its sentence are in the store.

@@ -51,7 +51,7 @@ class Evolved(NamedTuple):
 def require_cma() -> None:
     """**Raises** `InputError` where the package cma is not installed."""
     if importlib.util.find_spec("cma") is None:
-        raise InputError("searcher", "is 'cma', which needs the package cma; install it with: pip install 'jaxvib[cma]'")
+        raise InputError("searcher", "is 'cma', which needs the package cma; install it with: pip install '.[cma]'")
 
 
 @cached

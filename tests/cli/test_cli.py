@@ -311,3 +311,16 @@ def test_animate_and_sketch_write_a_film_and_a_drawing(typed, tmp_path):
 def test_films_that_cannot_be_made(typed, words, says):
     code, _, err = typed(*words)
     assert code == 2 and says in err
+
+
+def test_usage_errors_are_sentences_with_clicks_lowest_version(typed, monkeypatch):
+    """click below 8.2 has no error for a command without arguments: it prints the help by itself."""
+    monkeypatch.delattr("click.exceptions.NoArgsIsHelpError", raising=False)
+    monkeypatch.setattr("jaxvib.cli.app._NO_ARGUMENTS", ())
+    for words, says in (
+        (("modes",), "Missing argument 'SCENE'"),
+        (("modes", "m.toml", "--nope"), "No such option"),
+        (("no",), "No such command"),
+    ):
+        code, out, err = typed(*words)
+        assert code == 2 and says in err and "Traceback" not in err and out == ""
