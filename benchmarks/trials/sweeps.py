@@ -193,6 +193,8 @@ def cluster(folder: pathlib.Path, out: pathlib.Path) -> None:
 
     size, options, told = 128, dict(chunk=1024), folder / "told"
     here, there, hurt = folder / "here.zarr", folder / "there.zarr", folder / "hurt.zarr"
+    own = jaxvib.sweeps.cluster.versions()  # with what watches the workers, this process would have other sources than they
+    jaxvib.sweeps.cluster.versions = lambda: own
     jaxvib.sweeps.cluster._remote, plain = watched(str(told)), jaxvib.sweeps.cluster._remote
     for turn in range(3):
         for name, store, more in (("in this process", here, {}), ("two workers", there, {"workers": 2})):
