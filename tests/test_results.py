@@ -142,7 +142,7 @@ RESULTS = {
     "Decrement": lambda: RESULTS["Identified"]().decrement,
     "RunUps": run_ups,
     "Capture": lambda: _judged(
-        np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150
+        np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
     ),
     "TorusTables": lambda: TorusTables(
         *np.array([[0.1, 0.1], [0.005, 0.01], [4e-5, 4e-5], [2.7, 2.7], [-0.89, -0.639]]),
@@ -150,12 +150,14 @@ RESULTS = {
         *np.array([[[-0.9, -0.6], [-0.8, np.nan]], [[-0.7, -0.6], [-0.6, np.nan]], [[0.5, 1.0], [1.0, 0.0]]]),
         np.array([-1.0, -0.1]),
         np.ones((2, 2, 2), bool),
+        steps_per_turn=np.full((2, 2), 106.0),
+        moved=np.array([[[0.0, np.inf], [0.0, np.nan]]] * 2),
         resolution=np.asarray(0.02),
         starts=np.asarray(4),
         turns=np.asarray(2000),
     ),
     "ThresholdCurve": lambda: ThresholdCurve(
-        *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2]]), turns=np.asarray(2000)
+        *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2], [0.0, np.inf]]), turns=np.asarray(2000)
     ),
     "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
     "Stress": lambda: stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)]),
