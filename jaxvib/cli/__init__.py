@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import sys
 import warnings
 
@@ -18,7 +19,12 @@ def main() -> None:
 
     gc.freeze()  # modules stay: looking through them again and again, and at the end, takes a fifth of a short command
     gc.enable()
-    code = run(sys.argv[1:])
+    try:
+        code = run(sys.argv[1:])
+    except KeyboardInterrupt:  # a second one, while the first was answered
+        code = 1
+    # Python now waits for threads that still compile. Another Ctrl-C would end that, and XLA under their feet: a crash.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()
     sys.exit(code)
 

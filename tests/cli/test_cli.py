@@ -324,3 +324,29 @@ def test_usage_errors_are_sentences_with_clicks_lowest_version(typed, monkeypatc
     ):
         code, out, err = typed(*words)
         assert code == 2 and says in err and "Traceback" not in err and out == ""
+
+
+INTERRUPTED = """
+import signal, sys, threading, time
+import jaxvib.cli.app
+from jaxvib.cli import main
+
+def interrupted(arguments):
+    threading.Thread(target=compiling).start()
+    signal.raise_signal(signal.SIGINT)
+
+def compiling():
+    for _ in range(3):  # once the first is answered
+        time.sleep(0.2)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+    print("joined", flush=True)
+
+jaxvib.cli.app.run = interrupted
+sys.argv = ["jaxvib", "-h"]
+main()
+"""
+
+
+def test_interrupts_wait_for_threads_that_compile():
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (1, "joined", "")
