@@ -60,7 +60,7 @@ def collocation(scene: jv.Scene, omega: jax.Array, points: int, multipliers: boo
         if not multipliers:
             return motion.rotor_speed, ()
         return motion.rotor_speed, floquet(
-            model, grid, motion, harmonics, jnp.max(steps_for(model.linear, w, motion.rotor_speed))
+            model, grid, motion, harmonics, jnp.max(steps_for(model, w, motion.rotor_speed, implicit=False))
         ).roots
 
     return jax.lax.map(batch, omega.reshape(-1, 100))
