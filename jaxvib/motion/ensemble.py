@@ -23,10 +23,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.integrate import fastest_and_slowest, is_finite, wrap_angles
-from jaxvib.motion.lanes import LANES, advance
+from jaxvib.motion.lanes import LANES, advance, side_by_side, stretches
 from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
-from jaxvib.motion.system import PackedSystem
+from jaxvib.motion.stiffness import fastest_decay, is_unresolved, steps_of
 from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -58,6 +58,7 @@ class EnsembleStatus(eqx.Enumeration):
     done = "the run reached its end"
     detached = "the run reached its end, but on the way a load did not press on its track and was kept on it all the same"
     not_finite = "the motion grew beyond all bounds"
+    not_resolved = "the steps are too long for the decay of the loads by drag, or of the machine by damping: give more steps"
 
 
 class Ensemble(Result):
@@ -67,7 +68,8 @@ class Ensemble(Result):
     with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
     `error` (B,) estimated, as that of a `Run` but for the end state alone, each run's displacements relative to its own
     largest: NaN where no estimate was asked for or the motion did not stay finite, infinite where 4 steps or fewer leave no
-    larger ones to compare with; `finite` (B,) whether the motion stayed so; `detached` (B, count) whether a load's track, which
+    larger ones to compare with; `finite` (B,) whether the motion stayed so; `resolved` (B,) false
+    if explicit steps are too long for what decays fastest; `detached` (B, count) whether a load's track, which
     holds it by pressing alone, would have had to pull it at any stage of any step; `steps` each run took; `seconds` all of it
     took, compiling included where a program was new, NaN under a JAX transformation.
     """
@@ -76,6 +78,7 @@ class Ensemble(Result):
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
     finite: Array = eqx.field(metadata=in_unit("", "run"))
+    resolved: Array = eqx.field(metadata=in_unit("", "run"))
     detached: Array = eqx.field(metadata=in_unit("", "run", "load"))
     steps: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
@@ -84,11 +87,12 @@ class Ensemble(Result):
     def status(self) -> EnsembleStatus:
         """How each run ended, an `EnsembleStatus` for each."""
 
-        def one(finite: Array, detached: Array) -> EnsembleStatus:
+        def one(finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
             ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
-            return EnsembleStatus.where(finite, ended, EnsembleStatus.not_finite)
+            failed = EnsembleStatus.where(resolved, EnsembleStatus.not_finite, EnsembleStatus.not_resolved)
+            return EnsembleStatus.where(finite, ended, failed)
 
-        return jax.vmap(one)(self.finite, self.detached)
+        return jax.vmap(one)(self.finite, self.detached, self.resolved)
 
     def summary(self) -> str:
         """How the runs ended, at which speeds of their loads, with which errors, for a person to read."""
@@ -141,7 +145,8 @@ def ensemble(
     - `values`: an array with a leading axis over the runs, or a tree of them
     - `until`: end time, s or text, of all runs
     - `stepsize_controller`: `EqualSteps(n)`, how many each run takes, rounded up to a multiple of 4; the default is 4 for each
-      radian of what moves fastest
+      radian of what moves fastest, and more if loads decay by drag, or the carrier by damping, faster than these resolve: from
+      100 times as fast on all runs take implicit steps, 32 for each radian
     - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
     - `lanes`: how many runs advance together
     - `equations`: a function that gives a scene's equations of motion, a module that is called as `vector_field`'s; another one
@@ -178,20 +183,22 @@ def ensemble(
     own = [leaf for leaf, same in zip(leaves, shared, strict=True) if not same]
     common = [np.asarray(np.asarray(leaf)[0]) for leaf, same in zip(leaves, shared, strict=True) if same]
     require(stepsize_controller, EqualSteps)
-    if stepsize_controller is not None:
-        steps = stepsize_controller.number
-    elif not concrete:
+    if stepsize_controller is None and not concrete:
         raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
-    else:
-        steps = max(16, math.ceil(4.0 * float(end) * float(np.max(np.asarray(_fastest(made[0]))))))
-    each = -(-count(steps, "steps") // _PARTS)
+    (fastest, decay), implicit = _rates(made[0]), False
+    steps = 0 if stepsize_controller is None else count(stepsize_controller.number, "steps")
+    if concrete:
+        most = [float(np.max(np.asarray(x))) for x in (fastest, decay)]
+        step, implicit = steps_of(most[0], most[1], 4.0, float(end) / steps if steps else None)
+        steps = steps or max(16, math.ceil(float(end) / step - 1e-9))
+    each = -(-steps // _PARTS)
     coarse = -(-each // 2)
     # A run of one step in each part has no coarser one beside it.
     compared = estimate and coarse < each
     counts = np.asarray([each, coarse] if compared else [each], end.dtype)
 
     def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
-        return _together(own, common, end, counts, tuple(shared), form, equations)
+        return _together(own, common, end, counts, tuple(shared), form, equations, implicit)
 
     ends = in_chunks(lanes, together, own, shared=(common, end, counts))
     last, load_speed, apart, finite, detached, taken = ends
@@ -202,7 +209,8 @@ def ensemble(
     if compared:
         error = estimated_error(apart, share, made[0])
     unknown = np.asarray(np.nan, end.dtype)
-    found = Ensemble(*on_device((last, load_speed, error, finite, detached, taken[0], unknown)))
+    resolved = implicit | ~is_unresolved(decay, end / (_PARTS * each))
+    found = Ensemble(*on_device((last, load_speed, error, finite, resolved, detached, taken[0], unknown)))
     if not concrete:
         return found
     jax.block_until_ready(found)
@@ -226,8 +234,9 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
 
 
 @cached
-def _fastest(scenes: Scene) -> Array:
-    return jax.vmap(lambda scene: fastest_and_slowest(scene)[0])(scenes)
+def _rates(scenes: Scene) -> tuple[Array, Array]:
+    """The fastest of the motion, rad/s, and of the decay, 1/s, of each scene."""
+    return jax.vmap(lambda scene: (fastest_and_slowest(scene)[0], fastest_decay(scene)))(scenes)
 
 
 @cached
@@ -239,18 +248,19 @@ def _together(
     same: tuple[bool, ...],
     form: Skeleton,
     equations: Equations,
+    implicit: bool,
 ) -> _Ends:
     """Runs side by side: those of their numbers that are their `own` with a leading axis, and what they have in `common`."""
 
     def one(own: list[Array]) -> _Ends:
         mine, ours = iter(own), iter(common)
         scene, state = form.filled(next(ours) if shared else next(mine) for shared in same)
-        return _run(scene, state, end, counts, equations)
+        return _run(scene, state, end, counts, equations, implicit)
 
     return jax.vmap(one)(own)
 
 
-def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations) -> _Ends:
+def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equations, implicit: bool) -> _Ends:
     """A run in a few parts of so many equal steps each, and one for every further count of them, all by one program.
 
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
@@ -260,16 +270,16 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     watched = scene.loads.one_sided
     field = _Watching(equations(scene), scene) if watched else equations(scene)
     state = _watched(state, jnp.zeros_like(state.azimuth)) if watched else state
-    motion = PackedSystem(field, state, wrapped=single, together=together, lanes=True)
+    motion = side_by_side(field, state, single, together, implicit=implicit)
     length = end / _PARTS
 
-    def part(held: Y, begin: Array, step: Array) -> tuple[Y, tuple[Y, Array]]:
-        held, taken = advance(motion, held, begin, length, step)
+    def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
+        held, taken = advance(motion, held, *at, step, implicit=implicit)
         return held, (held, taken)
 
     def whole(steps: Array) -> tuple[Y, Array]:
-        times = length * jnp.arange(_PARTS)
-        _, (helds, taken) = jax.lax.scan(lambda held, begin: part(held, begin, length / steps), motion.pack(state), times)
+        held, begins, lengths = stretches(motion, motion.pack(state), length, length / steps, _PARTS, implicit=implicit)
+        _, (helds, taken) = jax.lax.scan(lambda held, at: part(held, at, length / steps), held, (begins, lengths))
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)

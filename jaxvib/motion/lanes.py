@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -16,10 +17,11 @@ from jaxvib.motion.analysis.regime import Regime, regime
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.system import PackedSystem
+from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as Held
 from jaxvib.runtime.compat import short_end
 
-__all__ = ["LANES", "PARTS", "Plan", "WatchedRun", "advance", "watched_run"]
+__all__ = ["LANES", "PARTS", "Plan", "WatchedRun", "advance", "side_by_side", "stretches", "watched_run"]
 
 LANES = 64
 """Cases side by side on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
@@ -28,12 +30,18 @@ PARTS = 64
 """Into so many equal parts a watched run is cut before its window; over each the loads' mean speeds are taken."""
 
 
+_DOUBLINGS = 40
+"""Implicit steps in the first one, each twice as long as that before it: the shortest is 1e-12 of it."""
+
+
 @short_end()
-def advance(motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array) -> tuple[Held, Array]:
-    """What the integrator holds a `length` of time after `begin`, by steps of the size `step`, and how many those were."""
+def advance(
+    motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array, *, implicit: bool = False
+) -> tuple[Held, Array]:
+    """State of the integrator a `length` of time after `begin`, by steps of the size `step`, and the number of steps."""
     solution = diffrax.diffeqsolve(
         motion.term,
-        motion.method(),
+        Rodas4() if implicit else motion.method(),
         t0=begin,
         t1=begin + length,
         dt0=step,
@@ -48,11 +56,41 @@ def advance(motion: PackedSystem, held: Held, begin: Array, length: Array, step:
     return jax.tree.map(lambda leaf: leaf[-1], solution.ys), solution.stats["num_steps"]
 
 
+def stretches(
+    motion: PackedSystem, held: Held, length: Array, step: Array, number: int, *, implicit: bool
+) -> tuple[Held, Array, Array]:
+    """Where so many stretches of the same `length` begin, s, how long each is, and the state of the integrator at the first.
+
+    Implicit steps do not resolve how loads are dragged along at the start: the first one is taken in steps that double.
+    """
+    begins, lengths = length * jnp.arange(number, dtype=length.dtype), jnp.full(number, length)
+    if not implicit:
+        return held, begins, lengths
+
+    def doubled(k: Array, held: Held) -> Held:
+        end = step * 2.0 ** (k - _DOUBLINGS)
+        begin = jnp.where(k == 0, 0.0, end / 2.0)
+        return advance(motion, held, begin, end - begin, end - begin, implicit=True)[0]
+
+    held = jax.lax.fori_loop(0, _DOUBLINGS + 1, doubled, held)
+    return held, begins.at[0].set(step), lengths.at[0].add(-step)
+
+
+def side_by_side(
+    field: Callable[[Array, State], State], state: State, single: bool, together: bool, *, implicit: bool
+) -> PackedSystem:
+    """The equations of many runs that advance together; an implicit method takes the numbers of each run as a vector."""
+    if implicit:
+        return PackedSystem(field, state, solver=Rodas4())
+    return PackedSystem(field, state, wrapped=single, together=together, lanes=True)
+
+
 class Plan(NamedTuple):
     """How watched runs advance, the same for all that go side by side.
 
     **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly
-    apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next.
+    apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next; `implicit` true if decay
+    is too fast for explicit steps.
     """
 
     until: float
@@ -60,6 +98,7 @@ class Plan(NamedTuple):
     samples: int
     each: int
     between: int
+    implicit: bool = False
 
 
 class WatchedRun(NamedTuple):
@@ -87,21 +126,23 @@ def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
     dtype = state.displacement.dtype
     single, together = wrap_angles(scene, dtype)
     field = vector_field(scene)
-    motion = PackedSystem(field, state, wrapped=single, together=together, lanes=True)
+    motion = side_by_side(field, state, single, together, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
 
-    def part(held: Held, k: Array) -> tuple[Held, Held]:
-        held, _ = advance(motion, held, k * length, jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype))
+    def part(held: Held, at: tuple[Array, Array]) -> tuple[Held, Held]:
+        held, _ = advance(motion, held, *at, jnp.asarray(length / plan.each, dtype), implicit=plan.implicit)
         return held, held
 
     def sample(held: Held, k: Array) -> tuple[Held, Held]:
         at, step = begin + k * spacing, jnp.asarray(spacing / plan.between, dtype)
-        moved, _ = advance(motion, held, at, jnp.asarray(spacing, dtype), step)
+        moved, _ = advance(motion, held, at, jnp.asarray(spacing, dtype), step, implicit=plan.implicit)
         return moved, moved
 
     first = motion.pack(state)
-    held, parts = jax.lax.scan(part, first, jnp.arange(PARTS, dtype=dtype))
+    sizes = jnp.asarray(length, dtype), jnp.asarray(length / plan.each, dtype)
+    held, begins, lengths = stretches(motion, first, *sizes, PARTS, implicit=plan.implicit)
+    held, parts = jax.lax.scan(part, held, (begins, lengths))
     _, later = jax.lax.scan(sample, held, jnp.arange(plan.samples - 1, dtype=dtype))
     before = jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, parts)
     azimuth = motion.unpack(before).azimuth

@@ -27,6 +27,7 @@ from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, 
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
+from jaxvib.motion.stiffness import advice, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
@@ -94,10 +95,10 @@ def simulate(
       precision 1e-5); `Accuracy(1e-4)` by the `error` that the result may have: the run is repeated with smaller tolerances
       until its estimated error is below it, 6 times at most, or fails as `not_accurate`; `EqualSteps(2000)` so many equal
       ones; or a step size controller of diffrax
-    - `solver`, `adjoint`: diffrax's, passed through; the defaults are Dormand and Prince's method of order 8 as
-      `UnrolledDopri8`, or where that takes too long to compile (large scenes, JAX transformations) as `LoopDopri8`, and reverse
-      derivatives of the very steps that were taken (over checkpoints). For forward derivatives give `diffrax.ForwardMode()`: up
-      to about ten parameters they take less time than reverse ones
+    - `solver`, `adjoint`: diffrax's, passed through; the defaults are `Rodas4` for known scenes whose loads (or carrier) decay
+      100 times as fast as anything moves, otherwise Dormand and Prince's method of order 8 as `UnrolledDopri8`, in large scenes
+      and JAX transformations `LoopDopri8`, and reverse derivatives of the very steps that were taken. Forward derivatives,
+      `diffrax.ForwardMode()`, take less time for up to about ten parameters
     - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
       transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
     - `progress_meter`: diffrax's, shows how much of the time is done
@@ -133,11 +134,10 @@ def simulate(
         whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     )
     fastest = functools.cache(lambda: fastest_and_slowest(scene)[0])
-    if max_steps is None:
-        max_steps = enough_steps(fastest(), end)
-
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
-    if solver is None and not concrete and end.dtype.itemsize >= 8:
+    stiff = stiff_solver(scene, state, fastest()) if solver is None and concrete else None
+    max_steps = enough_steps((1.0 if stiff is None else 16.0) * fastest(), end) if max_steps is None else max_steps
+    if (solver := stiff if solver is None else solver) is None and not concrete and end.dtype.itemsize >= 8:
         # Derivatives may be asked for; those of the written-out step take several times as long to compile.
         forward = isinstance(adjoint, diffrax.ForwardMode)
         solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
@@ -394,7 +394,7 @@ def _raise_if_failed(run: Run, max_steps: int, chosen: StepChoice | None) -> Non
     if name == "no_step":
         hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
-        hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run"
+        hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
     if isinstance(chosen, Accuracy) and name == "not_accurate":
         hint += f" ({float(run.error):.1e}, asked for {chosen.error:.1e}); give a larger accuracy, or a shorter run"
     raise failure(run.status, hint)

@@ -14,6 +14,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import fastest_and_slowest
 from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
 from jaxvib.motion.start import APART, Start, initial_state
+from jaxvib.motion.stiffness import fastest_decay, steps_of
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
 from jaxvib.sweeps.definition import CASE_STATUSES, Study
@@ -82,10 +83,10 @@ _cases = cached(_each)
 
 
 @cached
-def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array, Array, Array]:
-    def one(value: Array) -> tuple[Array, Array, Array]:
+def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array, Array, Array, Array]:
+    def one(value: Array) -> tuple[Array, Array, Array, Array]:
         this = put(scene, spots, value)
-        return (*fastest_and_slowest(this), this.drive.speed)
+        return (*fastest_and_slowest(this), fastest_decay(this), this.drive.speed)
 
     return jax.vmap(one)(values)
 
@@ -95,16 +96,18 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
 
     Frequencies grow with each stiffness and fall with each mass, so that no case between the corners is faster or slower.
     """
-    fastest, slowest, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
+    fastest, slowest, decay, rotor = (np.asarray(x) for x in _speeds(scene, jnp.asarray(corners), spots))
     most = 2.0 * np.pi * _SAMPLES / (_PER_TURN * float(np.max(rotor)))
     window = min(2.0 * np.pi * _SLOW_PERIODS / float(np.min(slowest)), most, until / 2.0)
-    step = 1.0 / float(np.max(fastest)) if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
+    given = None if steps is None else until / min(steps, 10 * int(_MAX_STEPS))
+    step, implicit = steps_of(float(np.max(fastest)), float(np.max(decay)), 1.0, given)
     if until / step > _MAX_STEPS:
         name = "until" if steps is None else "steps"
         raise InputError(name, f"asks for {until / step:.3g} steps of every run; take a shorter run or fewer steps")
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
     # a number that is whole but for rounding stays what it is
-    return Plan(until, window, _SAMPLES, *(int(np.ceil(x - 1e-9)) or 1 for x in (each, between)))
+    counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
+    return Plan(until, window, _SAMPLES, *counts, implicit=implicit)
 
 
 def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:

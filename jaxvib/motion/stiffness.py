@@ -1,0 +1,102 @@
+"""Decay that is faster than the motion: how fast it is, and which method and steps a run then takes."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.dynamics import State
+from jaxvib.equations.linear import linear_model
+from jaxvib.equations.sliding import kinematics
+from jaxvib.machine.scene import Scene
+from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.numerics.linalg import hermitian_modes, relative_to
+from jaxvib.ode.rodas4 import Rodas4
+from jaxvib.runtime.programs import cached
+
+__all__ = ["IMPLICIT_PER_RADIAN", "advice", "fastest_decay", "is_unresolved", "steps_of", "stiff_solver"]
+
+_RESOLVED = 3.0
+"""Decay in an explicit step that leaves the method accurate; from about 6 on it diverges."""
+
+_STIFF = 100.0
+"""Decay so many times as fast as the motion is left to the implicit method: explicit steps would cost more."""
+
+IMPLICIT_PER_RADIAN = 32.0
+"""Equal implicit steps in a radian of the fastest motion; order 4 then leaves about 1e-7."""
+
+_MAX_IMPLICIT = 64
+"""Numbers of a state up to which the implicit method's dense matrices are worth it."""
+
+
+@cached
+def fastest_decay(scene: Scene) -> Array:
+    """The fastest rate, 1/s, at which loads decay by their drag, or the carrier by its damping.
+
+        max_j(-Q'_j / H_j) / (1 - mu sum_j m_j / kappa_j),      the largest eigenvalue of M^-1 C
+
+    Q' is the derivative of a load's resistance by its rate, H its inertia, mu the trace of B M^-1 B^T: the carrier gives way to
+    the loads and so lessens their inertia. Explicit steps must resolve this rate, however slow the motion is.
+    """
+    scene = jax.lax.stop_gradient(scene)
+    linear, loads, speed = linear_model(scene), scene.loads, scene.drive.speed
+    angle = tuple(jnp.broadcast_to(jnp.asarray(x, speed.dtype), (loads.count,)) for x in loads.rest())
+    turning = tuple(jnp.full_like(x, speed) if i == 0 else jnp.zeros_like(x) for i, x in enumerate(angle))
+    kappa, metric = loads.inertia_factor(), kinematics(loads, angle, turning).metric
+
+    def own(i: int) -> Array:
+        along = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(angle))
+        slope = jax.jvp(lambda *rate: loads.resistance(angle, rate, speed)[i], turning, along)[1]
+        return jnp.max(-slope / (kappa * loads.mass * metric[i][i]))
+
+    damping, inverse = relative_to(linear.mass, linear.carrier.damping)
+    mobility = jnp.sum((linear.carrier.port @ inverse.T) ** 2)
+    share = mobility * jnp.sum(jnp.broadcast_to(loads.mass / kappa, (loads.count,)))
+    rate = functools.reduce(jnp.maximum, (own(i) for i in range(len(angle)))) / jnp.maximum(1.0 - share, 0.1)
+    return jnp.maximum(rate, jnp.max(hermitian_modes(damping)[0]))
+
+
+def stiff_solver(scene: Scene, state: State, fastest: Array) -> Rodas4 | None:
+    """The implicit method for a scene of known numbers that decays too fast for explicit steps, otherwise None."""
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
+    return Rodas4() if size <= _MAX_IMPLICIT and float(fastest_decay(scene)) > _STIFF * float(fastest) else None
+
+
+def steps_of(fastest: float, decay: float, per_radian: float, step: float | None = None) -> tuple[float, bool]:
+    """Length of equal steps, s, and True if they have to be implicit.
+
+    **Arguments**: `fastest` rate of the motion, rad/s, and of the `decay`, 1/s; explicit steps `per_radian` of the motion; the
+    length of a `step` that is prescribed.
+    """
+    if step is not None:
+        return step, decay * step > _RESOLVED
+    if decay > _STIFF * fastest:
+        return 1.0 / (IMPLICIT_PER_RADIAN * fastest), True
+    return 1.0 / max(per_radian * fastest, decay / _RESOLVED), False
+
+
+def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.ndarray:
+    """True if explicit steps of that length, s, diverge by the `decay`, 1/s."""
+    return decay * step > 2.0 * _RESOLVED
+
+
+def advice(scene: Scene) -> str:
+    """What makes steps of a run short, as the end of a sentence; empty if decay is no faster than the motion."""
+    decay, motion = float(fastest_decay(scene)), float(fastest_and_slowest(scene)[0])
+    if not decay > 10.0 * motion:
+        return ""
+    carrier = float(np.max(np.asarray(_carrier_decay(scene))))
+    name = "machine.damping makes the machine" if carrier >= decay else "loads.drag makes the loads"
+    return (
+        f"; {name} decay at {decay:.2g} 1/s, {decay / motion:.1g} times as fast as the motion: give less, or the default solver"
+    )
+
+
+@cached
+def _carrier_decay(scene: Scene) -> Array:
+    linear = linear_model(scene)
+    return hermitian_modes(relative_to(linear.mass, linear.carrier.damping)[0])[0]

@@ -1,0 +1,97 @@
+"""Loads that decay faster than anything moves: which steps are taken, and that they give what SciPy's implicit method gives."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.integrate import solve_ivp
+
+import jaxvib as jv
+from jaxvib.motion.stiffness import fastest_decay, is_unresolved, steps_of
+from jaxvib.ode.dopri8 import UnrolledDopri8
+from jaxvib.study.stress.plain import plain
+
+DRAGS = (300.0, 1e3, 1e5, 1e9)
+
+
+def dragged(drag, damping=100.0, count=1, effects=()):
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=damping)
+    loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=drag)
+    return jv.Scene(machine, loads, jv.ConstantSpeed(60.0), effects)
+
+
+def of_drag(drag):
+    return eqx.tree_at(lambda s: s.loads.drag, dragged(1.0), drag)
+
+
+def run_out(drag, until=5.0):
+    """SciPy's run from rest, its last second."""
+    p = plain(dragged(drag))
+    start = np.array([0.0, 0.0, -np.pi / 2.0, 0.0])
+    times = np.linspace(until - 1.0, until, 1001)
+    run = solve_ivp(p.field, (0.0, until), start, "Radau", times, jac=p.slopes, rtol=1e-8, atol=1e-10)
+    return run.y
+
+
+@pytest.mark.parametrize(("drag", "damping", "count"), [(1.0, 0.0, 1), (1e4, 0.0, 3), (1.0, 1e6, 2)])
+def test_fastest_decay_is_that_of_the_dense_damping_matrix(drag, damping, count):
+    """Of all angles, the port lessens the loads' inertia most where they move along it."""
+    scene = dragged(drag, damping, count)
+    p = plain(scene)
+    along = [p.forces(0.0, np.r_[np.zeros(2), np.full(count, a), np.zeros(count)])[0] for a in np.linspace(0.0, np.pi, 9)]
+    drags = np.diag([damping, *(p.drag * p.radius**2)])
+    right = max(np.max(scipy.linalg.eigh(drags, mass, eigvals_only=True)) for mass in along)
+    np.testing.assert_allclose(fastest_decay(scene), right, rtol=2e-2 if damping > 1e3 else 1e-9)
+
+
+def test_steps_resolve_decay_or_are_implicit():
+    assert steps_of(60.0, 20.0, 4.0) == (1.0 / 240.0, False)
+    assert steps_of(60.0, 3000.0, 4.0) == (1e-3, False)
+    assert steps_of(60.0, 6001.0, 4.0) == (1.0 / 1920.0, True)
+    assert steps_of(60.0, 20.0, 4.0, 1e-3) == (1e-3, False) and steps_of(60.0, 4000.0, 4.0, 1e-3) == (1e-3, True)
+    assert bool(is_unresolved(7000.0, 1e-3)) and not bool(is_unresolved(5000.0, 1e-3))
+
+
+def test_runs_of_any_drag_are_those_of_scipys_radau():
+    many = jv.ensemble(of_drag, jnp.asarray(DRAGS), 5.0)
+    assert bool(jnp.all(many.finite)) and float(jnp.max(many.error)) < 1e-6
+    for drag, end in zip(DRAGS, np.asarray(many.state.displacement), strict=True):
+        right = run_out(drag)
+        size = np.max(np.abs(right[0]))
+        run = jv.simulate(dragged(drag), 5.0, save="window")
+        np.testing.assert_allclose(run.window.state.displacement[-1], right[0, -1:], atol=1e-5 * size)
+        np.testing.assert_allclose(end, right[0, -1:], atol=1e-5 * size)
+
+
+def test_a_locked_load_is_an_imbalance():
+    """Of 1e-9 kg with drag / mass of 1e9 1/s on a rotor whose imbalance moves the machine."""
+    machine = jv.one_mass(mass=70.0, stiffness=3e4, damping=580.0)
+    loads = jv.pendulums(count=1, mass=1e-9, radius=1e-3, drag=1.0)
+    run = jv.simulate(jv.Scene(machine, loads, jv.ConstantSpeed(13.0), (jv.StaticImbalance(2.66),)), 8.0, save="window")
+    moved = 2.66 * 13.0**2 / abs(3e4 - 70.0 * 13.0**2 + 580.0j * 13.0)
+    np.testing.assert_allclose(run.amplitude, moved, rtol=1e-6)
+
+
+def test_a_run_out_of_steps_names_the_drag():
+    for scene, name in ((dragged(1e6), "loads.drag makes the loads decay"), (dragged(1.0, 1e8), "machine.damping makes the")):
+        with pytest.raises(jv.ComputationError, match=f"max_steps_reached.*{name}"):
+            jv.simulate(scene, 5.0, solver=UnrolledDopri8(), max_steps=1000, save="window")
+
+
+def test_unresolved_runs_are_named(monkeypatch):
+    """Where numbers are unknown the steps given are explicit."""
+    from jaxvib.motion import ensemble
+
+    monkeypatch.setattr(ensemble, "steps_of", lambda *_: (1.0, False))
+    many = jv.ensemble(of_drag, jnp.asarray([1.0, 1e5]), 5.0, stepsize_controller=jv.EqualSteps(1200))
+    assert [str(s) for s in np.asarray(many.resolved)] == ["True", "False"]
+    assert "too long for the decay of the loads by drag" in many.summary()
+
+
+def test_a_sweep_over_drag_is_answered(tmp_path):
+    found = jv.sweep(
+        dragged(300.0), {"loads.drag": [300.0, 1e5]}, measure=["run.amplitude"], until=5.0, store=tmp_path / "drag.zarr"
+    )
+    values = np.ravel(found.data["amplitude"].values)
+    np.testing.assert_allclose(values, [1.33755e-3, 1.33741e-3], rtol=1e-4)
