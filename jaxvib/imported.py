@@ -16,6 +16,7 @@ import functools
 import hashlib
 import importlib.abc
 import importlib.machinery
+import importlib.util
 import itertools
 import operator
 import os
@@ -23,7 +24,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 __all__ = ["CodeState", "code_state", "digest_of_sources", "forget_derived"]
@@ -213,10 +214,16 @@ _imports = _Imports()
 class _Loader(importlib.machinery.SourceFileLoader):
     """Python's own loader of source files, which notes what it imports."""
 
+    def get_code(self, fullname: str) -> CodeType | None:
+        """The code of the source, not of bytecode older than it, which Python takes if both are of the same second."""
+        if _is_older(importlib.util.cache_from_source(self.path), _stamp(self.path)):
+            return self.source_to_code(self.get_data(self.path), self.path)
+        return super().get_code(fullname)
+
     def exec_module(self, module: ModuleType) -> None:
         stamp = _stamp(self.path)
         super().exec_module(module)
-        _imports.note(module, None if _is_older(module.__cached__, stamp) else stamp)
+        _imports.note(module, stamp)
 
 
 class _Finder(importlib.abc.MetaPathFinder):
