@@ -19,7 +19,9 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
 
 import jax
+import jax.typing as jax_typing
 import numpy as np
+import numpy.typing as np_typing
 from jax.core import Tracer
 
 from jaxvib.errors import InputError, quoted
@@ -157,6 +159,11 @@ def _require(value: Any, kind: Any, field: str) -> None:
     """**Raises** `InputError` for a value that is not of that kind."""
     kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
     if any(_is_number_with_unit(each) for each in kinds):
+        return
+    if any(set(typing.get_args(alike)) <= set(kinds) for alike in (np_typing.ArrayLike, jax_typing.ArrayLike)):
+        problem = _problem_of_array(value)
+        if problem is not None and not (value is None and type(None) in kinds):
+            raise InputError(field, f"is {quoted(value)}; it must be {problem}")
         return
     if any(each is Path or typing.get_origin(each) is os.PathLike for each in kinds) and not isinstance(
         value, (type(None), *_other_classes(kinds))

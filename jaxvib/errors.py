@@ -183,7 +183,8 @@ class ComputationError(RuntimeError):
     status: str
 
     def __init__(self, status: str, message: str):
-        super().__init__(f"{legible(status)}: {legible(message)}")
+        lines = "\n".join(map(legible, message.split("\n"))) if isinstance(message, str) else quoted(message)
+        super().__init__(f"{legible(status)}: {lines}")
         self.status, self.message = status, message
 
     def __reduce__(self) -> tuple[type[ComputationError], tuple[str, str]]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
@@ -36,6 +37,7 @@ class Held(eqx.Module):
     value: float | np.ndarray | None
 
 
+@validated
 def hold(quantity: Quantity, value: Number | None = None) -> Held:
     """Holds a quantity at a value, or, without one, at what it is in the scene the search begins with.
 
@@ -124,6 +126,7 @@ class DesignSpace(eqx.Module):
         ties: Mapping[str, Source] | None = None,
         choices: Mapping[str, Sequence[Number]] | None = None,
     ):
+        _require_tables(scene, free, hold, ties, choices)
         chosen, counts = _chosen(scene, choices or {})
         if not free and not chosen:
             raise InputError("free", "is empty; name at least one number that may change, such as machine.stiffness")
@@ -218,6 +221,17 @@ class DesignSpace(eqx.Module):
         """By how much each held quantity is off, relative to the value it is held at (m,)."""
         off = [held.quantity.read(answers) / held.value - 1.0 for held in self.held if held.value is not None]
         return jnp.stack(off) if off else jnp.zeros((0,))
+
+
+def _require_tables(scene: object, free: object, hold: object, ties: object, choices: object) -> None:
+    """**Raises** `InputError` for what is no scene, and for arguments that are no dictionaries or lists."""
+    if not isinstance(scene, Scene):
+        raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
+    for field, table in (("free", free), ("ties", ties), ("choices", choices)):
+        if not isinstance(table, Mapping) and (table is not None or field == "free"):
+            raise InputError(field, f"is {quoted(table)}; it must be a dictionary of names such as 'machine.stiffness'")
+    if not isinstance(hold, (list, tuple)):
+        raise InputError("hold", f"is {quoted(hold)}; it must be a list of quantities in optimize.hold(...)")
 
 
 def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[Place, float, float, bool]:

@@ -14,7 +14,7 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
-from jaxvib.units import Number, in_own_unit
+from jaxvib.units import Number, count, in_own_unit
 from jaxvib.units import Quantity as UnitQuantity
 from optimize.wishes.answers import Answers
 from optimize.wishes.given import arguments, number_in, same_unit
@@ -61,6 +61,8 @@ class Quantity:
     """The quantities that it is made of."""
 
     def __post_init__(self) -> None:
+        if self.mode is not None:
+            count(self.mode, f"quantity {quoted(self.name)}.mode")
         if type(self) is Quantity and not (callable(self.function) and arguments(self.function) in (1, 2)):
             problem = "give a function of a scene, or of a scene and its jam modes"
             raise InputError(f"quantity {quoted(self.name)}", f"has the function {quoted(self.function)}; {problem}")

@@ -139,7 +139,7 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         (lambda run, orbit: jax.jit(lambda s: jv.sketch(s) and 0.0)(SCENE), "not known under a JAX transformation"),
         (lambda run, orbit: jv.animate(orbit), r"scene is missing; an Orbit does not have it"),
         (lambda run, orbit: jv.animate(run, scene=SCENE), "scene goes with an Orbit only"),
-        (lambda run, orbit: jv.animate(SCENE), "motion is a Scene; give a Run, or an Orbit"),
+        (lambda run, orbit: jv.animate(SCENE), "it must be a Run or an Orbit"),
         (lambda run, orbit: jv.animate(run, "a.mp4"), "path is 'a.mp4'; films are written as .gif or .html"),
         (lambda run, orbit: jv.animate(run, "no/such/folder.gif", begin=1.99), "cannot be written"),
         (lambda run, orbit: jv.animate(run, begin=1.0, end="0.5 s"), "end is 0.5 s; it must be after the beginning, 1 s"),

@@ -32,7 +32,6 @@ from jaxvib.steady.balance.monodromy import (
     monodromies,
 )
 from jaxvib.steady.balance.stability import BalancedStability
-from jaxvib.units import count
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -252,7 +251,6 @@ def balanced_stability(scene: Scene, angles: ArrayLike | None = None, *, steps: 
 
     Source: Floquet's theorem; Radau's method of Hairer, Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
-    count(steps, "steps", low=2)
     angles, neutral = _arrangement(scene, angles)
     matrix = fine_and_coarse(scene, angles, checked_steps(scene, scene.drive.speed, steps))
     fine = np.linalg.eigvals(np.asarray(matrix[0]))
@@ -283,7 +281,6 @@ def balanced_growth(
     >>> balanced_growth(scene, [20.0, 40.0]) < 0.0
     array([False,  True])
     """
-    count(steps, "steps", low=2)
     angles, neutral = _arrangement(scene, angles)
     flat = np.ravel(np.asarray(speeds, dtype=float))
     # Whole batches only, so that few shapes are compiled.

@@ -128,6 +128,8 @@ def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle
     >>> round(float(read_record(path).angle[0]), 6)
     0.174533
     """
+    if columns is not None and (len(columns) != 2 or not all(isinstance(name, str) for name in columns)):
+        raise InputError("columns", f"is {quoted(columns)}; give the names of two columns, time first, such as ['t', 'phi']")
     path = Path(path)
     lines = read_text(path, "a CSV file", most=_MAX_BYTES).splitlines()
     for k, line in enumerate(lines, 1):
