@@ -83,7 +83,7 @@ def test_wrong_records(tmp_path):
     t = np.arange(20.0)
     wrong = [
         ((t, t[:5]), r"has shapes time \(20,\), angle \(5,\)"),
-        ((t, ["a"] * 20), "has entries that are no numbers"),
+        ((t, ["a"] * 20), "it must be an array of numbers"),
         ((t, np.where(t == 3, np.inf, 0.0)), "has angle inf at sample 4"),
         ((np.where(t == 3, 1.0, t), t), "has the time 1 s after 2 s at sample 4"),
     ]
