@@ -6,6 +6,8 @@ Scenes are drawn from a few kinds, so that few programs are compiled, with numbe
 
 - `jam_modes`: torques balance by the dense complex algebra of `jaxvib.study.stress.plain`, to 1e-8
 - `jam_orbit` of the first mode there is: its state is carried over one turn by SciPy and comes back, to 1e-6
+- `multipliers` of that jam: the largest is that of SciPy's implicit method along the motion, to 1e-6
+- `balance` of two loads and more: the multipliers are those of SciPy's implicit method, to 1e-6
 - `simulate`: the state at the end agrees with SciPy's, to the claimed error and 1e-6
 - the gradient of the foundation force by the stiffnesses agrees with differences to one of two steps, to 1e-4
 
@@ -37,7 +39,7 @@ from jaxvib.machine.files import TEMPLATES
 from jaxvib.results.status import status_name
 from jaxvib.study.stress.asked import away, end_of_run, light_force_slope, state_of
 from jaxvib.study.stress.asked import compared_state as compared
-from jaxvib.study.stress.motions import run_out
+from jaxvib.study.stress.motions import multipliers, run_out
 from jaxvib.study.stress.plain import Plain, figure, light_modes, light_speed, plain
 
 jv.prepare_cpu()
@@ -133,7 +135,10 @@ def read_file(seed: int, folder: pathlib.Path, texts: dict[str, str]) -> str:
 
 
 def drawn(rng: np.random.Generator) -> jv.Scene:
-    """A random machine of one or two platforms with one to three equal loads."""
+    """A random machine of one or two platforms with one to three equal loads.
+
+    A fifth each have no damping, drag up to a billion times the usual one, and rotors down to a hundredth of the frequencies.
+    """
 
     def number(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -152,7 +157,14 @@ def drawn(rng: np.random.Generator) -> jv.Scene:
             link_damping=2.0 * ratio * size * natural,
         )
     mass, speed = size * number(1e-6, 0.1) / count, natural * number(0.5, 5.0)
-    loads = jv.balls(count=count, mass=mass, radius=number(1e-3, 1.0), drag=mass * natural * number(1e-4, 10.0))
+    radius, drag = number(1e-3, 1.0), mass * natural * number(1e-4, 10.0)
+    undamped, dragged, slow = rng.uniform(size=3) < 0.2
+    if undamped:
+        machine = eqx.tree_at(
+            lambda m: (m.damping, m.link_damping), machine, (0.0 * machine.damping, 0.0 * machine.link_damping)
+        )
+    drag, speed = drag * (number(1.0, 1e9) if dragged else 1.0), speed * (number(0.01, 1.0) if slow else 1.0)
+    loads = jv.balls(count=count, mass=mass, radius=radius, drag=drag)
     return jv.Scene(machine, loads, jv.ConstantSpeed(speed))
 
 
@@ -234,6 +246,43 @@ def ask_orbit(scene: jv.Scene, rng: np.random.Generator) -> str:
     return "right" if miss < 1e-6 else f"wrong: the motion comes back but for {miss:.1e}"
 
 
+def ask_multipliers(scene: jv.Scene, rng: np.random.Generator) -> str:
+    modes = jv.jam_modes(scene).mode_numbers()
+    if not modes:
+        return "named: no mode"
+    orbit = jv.jam_orbit(scene, mode=modes[-1], throw=False)
+    if status_name(orbit.status) != "found":
+        return f"named: {status_name(orbit.status)}"
+    w, n, nd = float(orbit.omega), scene.loads.count, len(orbit.units)
+    numbers = (orbit.displacement_harmonics, orbit.orders, orbit.deviation_harmonics, orbit.deviation_orders)
+    moved, k, ahead, j = (np.asarray(x) for x in numbers)
+
+    def motion(t: float) -> np.ndarray:
+        wave, lag = np.exp(1j * k * w * t), np.exp(1j * j * w * t)
+        phi, rate = w * t + (ahead @ lag).real, w * (1.0 + (ahead @ (1j * j * lag)).real)
+        return np.concatenate([(moved @ wave).real, w * (moved @ (1j * k * wave)).real, np.tile(phi, n), np.tile(rate, n)])
+
+    right = np.abs(multipliers(plain(scene), motion, 2.0 * np.pi / w))
+    right = np.delete(right, np.argmin(np.abs(right - 1.0)))
+    miss = abs(float(orbit.multiplier) - np.max(right)) / max(1.0, float(np.max(right)))
+    return "right" if miss < 1e-6 else f"wrong: multiplier {float(orbit.multiplier)}, SciPy {np.max(right)} (nd {nd})"
+
+
+def ask_balance(scene: jv.Scene, rng: np.random.Generator) -> str:
+    states = jv.balanced_states(scene)
+    if not len(states.angles):
+        return f"named: {status_name(states.status)}"
+    found, angles, speed = states.stability(), states.angles[0], float(scene.drive.speed)
+    nd = scene.machine.structure().mass.shape[0]
+
+    def motion(t: float) -> np.ndarray:
+        return np.concatenate([np.zeros(2 * nd), angles + speed * t, np.full(angles.size, speed)])
+
+    right = np.sort(np.abs(multipliers(plain(scene), motion, 2.0 * np.pi / speed)))[::-1]
+    miss = float(np.max(np.abs(np.abs(found.multipliers) - right))) / max(1.0, float(right[0]))
+    return "right" if miss < 1e-6 else f"wrong: multipliers {np.abs(found.multipliers)}, SciPy {right}"
+
+
 def ask_run(scene: jv.Scene, rng: np.random.Generator) -> str:
     p = fast(scene)
     fastest = max(float(scene.drive.speed), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
@@ -275,6 +324,8 @@ QUESTIONS: dict[str, Callable[[jv.Scene, np.random.Generator], str]] = {
     "modes": ask_modes,
     "gradient": ask_gradient,
     "orbit": ask_orbit,
+    "multipliers": ask_multipliers,
+    "balance": ask_balance,
     "run": ask_run,
 }
 

@@ -20,7 +20,6 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.many import in_parallel
 from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
-from jaxvib.units import count
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
@@ -105,7 +104,6 @@ def criterion_map(
             raise InputError(name, "must be a list of numbers greater than 0, ascending")
     grid, mass_factor, drag_factor = values.values()
 
-    count(steps, "steps", low=2)
     given = circular_loads(scene)
 
     def loaded(m: jax.Array, d: float = 1.0) -> Scene:
