@@ -103,13 +103,18 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
     found = {}
     for name, parameter in signature.parameters.items():
         kind = Any if parameter.annotation is parameter.empty else parameter.annotation
-        for _ in range(3):  # an alias may hold a text itself
+        names = dict(inspect.unwrap(function).__globals__)
+        for _ in range(6):  # an alias may hold a text itself, and some names are imported by type checkers only
             if not isinstance(kind, str):
                 break
             try:
-                kind = eval(kind, inspect.unwrap(function).__globals__)  # the package's own annotations
-            except (NameError, TypeError, AttributeError):
-                kind = _Named(kind.removesuffix("| None").strip()) if kind.split(" ")[0] == "Axes" else Any
+                kind = eval(kind, names)  # the package's own annotations
+            except NameError as error:
+                names[error.name] = Any
+                kind = _Named("Axes") if kind.split(" ")[0] == "Axes" else kind
+            except (TypeError, AttributeError):
+                kind = Any
+        kind = Any if isinstance(kind, str) else kind
         found[name] = kind
     return found
 

@@ -88,7 +88,7 @@ def speed_scale(unit: str) -> float:
     >>> round(speed_scale("rpm"), 3)
     9.549
     """
-    if unit not in _SCALES:
+    if not isinstance(unit, str) or unit not in _SCALES:
         raise InputError("unit", f"is {quoted(unit)}; it must be one of 'rad/s', 'rpm', 'Hz'")
     return _SCALES[unit]
 
