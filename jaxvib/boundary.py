@@ -13,7 +13,7 @@ import numbers
 import os
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union
@@ -26,7 +26,7 @@ from jax.core import Tracer
 
 from jaxvib.errors import InputError, quoted
 
-__all__ = ["is_real", "is_whole", "require_path", "validated"]
+__all__ = ["call_user", "is_real", "is_whole", "require_path", "validated"]
 
 _MAX_ENTRIES = 10**7
 """The longest list whose entries are looked at one by one."""
@@ -45,6 +45,7 @@ _EXAMPLES = {
     "BearingPendulum": "for example BearingPendulum(mass=2.0, length=0.3)",
     "Record": "for example read_record('swing.csv')",
     "Axes": "of matplotlib",
+    "Figure": "of matplotlib",
     "tolerances": "for example {'machine.stiffness': 0.05}, a share of 5 %",
     "changes": "for example {'drive.speed': '1200 rpm'}",
 }
@@ -93,6 +94,8 @@ def validated(function: F) -> F:
                     _require(value, kind, name)
                     if isinstance(value, (list, tuple, Decimal)) and _has_array(kind):
                         bound.arguments[name] = np.asarray(value, dtype=float)
+                    elif isinstance(value, (np.ndarray, jax.Array)) and not _is_traced(value) and _is_list(kind):
+                        bound.arguments[name] = np.asarray(value).tolist()
         return function(*bound.args, **bound.kwargs)
 
     return typing.cast(F, checked)
@@ -110,8 +113,7 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
             try:
                 kind = eval(kind, names)  # the package's own annotations
             except NameError as error:
-                names[error.name] = Any
-                kind = _Named("Axes") if kind.split(" ")[0] == "Axes" else kind
+                names[error.name or ""] = _DRAWN.get(error.name or "", Any)
             except (TypeError, AttributeError):
                 kind = Any
         kind = Any if isinstance(kind, str) else kind
@@ -119,11 +121,14 @@ def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> 
     return found
 
 
-class _Named:
-    """A class that is imported by type checkers only: its instances are known by its name."""
+class _ByName(type):
+    """Classes of matplotlib, which is imported when something is drawn: their instances are recognized by name."""
 
-    def __init__(self, name: str):
-        self.name = name
+    def __instancecheck__(cls, value: object) -> bool:
+        return any(each.__name__ == cls.__name__ for each in type(value).__mro__)
+
+
+_DRAWN = {name: _ByName(name, (), {}) for name in ("Axes", "Figure")}
 
 
 def is_real(value: object) -> bool:
@@ -137,6 +142,37 @@ def is_real(value: object) -> bool:
         entries = value.ravel().tolist() if isinstance(value, np.ndarray) else (value,)
         return all(isinstance(each, (numbers.Real, Decimal)) and not isinstance(each, (bool, np.bool_)) for each in entries)
     return getattr(kind, "kind", "") in "iuf" or str(kind).startswith(("bfloat", "float8", "int", "uint"))
+
+
+_NEEDS_VALUE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""Errors of JAX about code that needs the value of a traced number."""
+
+
+def call_user(function: Callable[..., Any], field: str, *arguments: object) -> Any:
+    """Return the result of a user's function.
+
+    **Raises** `InputError` for a function that cannot be called with these arguments, or needs the value of a number that JAX
+    traces. The function's own errors pass unchanged.
+
+    >>> call_user(lambda scene: scene, "make", 1.0, 2.0)
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: make cannot be called with 2 values (<lambda>() takes 1 positional argument but 2 were given)
+    """
+    try:
+        return function(*arguments)
+    except _NEEDS_VALUE as error:
+        raise InputError(field, "needs the value of a number that JAX traces; compute with jax.numpy in it") from error
+    except TypeError as error:
+        inside = error.__traceback__ and error.__traceback__.tb_next
+        if inside is not None:  # raised in the function, not by the call
+            raise
+        several = f"{len(arguments)} values" if len(arguments) != 1 else quoted(*arguments)
+        raise InputError(field, f"cannot be called with {several} ({error})") from error
 
 
 def is_whole(value: object) -> bool:
@@ -214,8 +250,6 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
         if isinstance(value, tuple({type(each) for each in inner})):  # the function says which words it knows
             return None
         return " or ".join(map(quoted, inner)) if len(inner) < 3 else f"one of {', '.join(map(str, inner))}"
-    if isinstance(kind, _Named):
-        return None if any(each.__name__ == kind.name for each in type(value).__mro__) or value is None else _words(kind.name)
     if kind is bool:
         return None if isinstance(value, (bool, np.bool_)) else "True or False"
     if kind is int:
@@ -234,6 +268,8 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
             return None if not getattr(kind, "_is_runtime_protocol", False) or isinstance(value, kind) else "another object"
         if kind is Callable or kind is types.FunctionType:
             return None if callable(value) else "a function"
+        if kind.__module__ == "jaxtyping":
+            return _problem_of_tree(value)
         return None if isinstance(value, kind) else _words(kind.__name__)
     return None
 
@@ -252,6 +288,16 @@ def _has_array(kind: Any) -> bool:
     kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
     others = any(typing.get_origin(each) is not None or _is_number_with_unit(each) for each in kinds)
     return any(map(_is_array, kinds)) and not others
+
+
+def _is_list(kind: Any) -> bool:
+    """Return True if lists and tuples are allowed and arrays are not."""
+    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    origins = [typing.get_origin(each) for each in kinds]
+    lists = any(isinstance(each, type) and issubclass(each, (Sequence, list, tuple)) for each in origins)
+    inner = [each for one in kinds for each in typing.get_args(one) or (one,)]
+    inner = [each for one in inner for each in typing.get_args(one) or (one,)]
+    return lists and not any(_is_array(each) or _is_number_with_unit(each) or _accepts_all(each) for each in inner)
 
 
 def _is_array(kind: Any) -> bool:
@@ -279,7 +325,15 @@ def _problem_of_array(value: Any) -> str | None:
             return "an array of numbers"
     if not is_real(value) or np.ma.is_masked(value):
         return "an array of numbers"
+    if isinstance(value, (float, Decimal)) and value != value:
+        return "a number or an array of numbers, not NaN"
     return "an array of numbers below 1e308" if isinstance(value, int) and abs(value).bit_length() > 1023 else None
+
+
+def _problem_of_tree(value: Any) -> str | None:
+    if isinstance(value, Iterator):  # JAX takes none for a tree
+        return "an array of numbers, or a tree of arrays"
+    return next(filter(None, map(_problem_of_array, jax.tree.leaves(value))), None)
 
 
 def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> str | InputError | None:
@@ -314,7 +368,9 @@ def _problem_of_container(value: Any, origin: type, inner: tuple[Any, ...]) -> s
                     return problem
             return None
         if getattr(value, "dtype", None) is not None:
-            return _problem_of_array(value) if any(kind in (float, int) or _is_array(kind) for kind in inner) else None
+            if _is_traced(value) or np.ma.is_masked(value) or any(map(_is_array, inner)):
+                return _problem_of_array(value)
+            value = np.asarray(value).tolist()
         return _problem_of_entries(((f"[{index}]", each) for index, each in enumerate(value)), inner[:1])
     return None if isinstance(value, origin) else _words(origin.__name__)
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, validated
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
@@ -108,7 +108,7 @@ def synthesize(
     """
     options = _options(starts, seed, iterations, polishing, rate, searcher)
     demands = _checked(space, objective, subject_to)
-    tell = progress or (lambda _what, _share: None)
+    tell: Tell = lambda what, share: None if progress is None else call_user(progress, "progress", what, share)  # noqa: E731
     if begin is not None:
         options = dataclasses.replace(options, begin=_begun(space, begin), starts=len(begin.designs))
     space, problem, found = _searched(space, objective, demands, options, tell)

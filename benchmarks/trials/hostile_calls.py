@@ -56,6 +56,10 @@ LONG = ("stress", "reproduce", "prepare_cpu", "use_cache")
 """Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
 
 
+ALL = ("None", "True", "np.True_", "0", "-1", "10**12", "10**400", "10**5000", "[]", "()", "{}", "set()", "np.zeros(0)")
+"""Values that are valid for these, or that select everything."""
+
+
 class Nothing:
     """An object that is nothing that anybody asks for."""
 
@@ -174,6 +178,8 @@ def unsaid(answer: Any) -> bool:
     """True if numbers of an answer are not finite and neither a status nor a mask of its own says so."""
     if hasattr(answer, "status") or isinstance(answer, (jv.Result, op.Quantity, op.Demand)):
         return False
+    if isinstance(answer, Iterator):  # no tree of JAX
+        return False
     leaves = [leaf for leaf in jax.tree.leaves(answer) if isinstance(leaf, (float, np.ndarray, jax.Array, np.generic))]
     return any(np.asarray(leaf).dtype.kind == "f" and np.any(np.isnan(leaf)) for leaf in leaves)
 
@@ -194,12 +200,27 @@ def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
     value = HOSTILE[text]
     if text == "generator":
         value = (each for each in (1.0, 2.0))
+    kind, said = judged(lambda: call.function(**{**call.arguments, name: value}), number=not unsaid(value))
+    if kind == "answered" and text in NO_NUMBERS and takes_numbers(call.function, name, call.arguments[name]):
+        return "silent", f"takes {text} for a number"
+    return kind, said
+
+
+def is_default(call: Call, name: str, valid: Any) -> bool:
+    """True if None is a valid value of a parameter."""
+    with contextlib.suppress(ValueError, TypeError, KeyError):
+        return inspect.signature(call.function).parameters[name].default is None
+    return valid is None
+
+
+def judged(ask: Callable[[], Any], *, number: bool = True) -> tuple[str, str]:
+    """The kind of a call's end, and what is printed about it; `number`: its arguments are numbers, so its result is one."""
     began = time.process_time()
     try:
         with patience(PATIENCE), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("error")
             with contextlib.chdir(FOLDER):
-                answer = call.function(**{**call.arguments, name: value})
+                answer = ask()
             answer = jax.block_until_ready(answer) if isinstance(answer, eqx.Module) else answer
     except (jv.InputError, jv.ComputationError) as error:
         taken = time.process_time() - began
@@ -218,9 +239,7 @@ def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
         import matplotlib.pyplot as plt
 
         plt.close("all")
-    if text in NO_NUMBERS and takes_numbers(call.function, name, call.arguments[name]):
-        return "silent", f"takes {text} for a number"
-    if unsaid(answer) and not unsaid(value):
+    if number and unsaid(answer):
         return "silent", f"is not finite: {quoted(answer)}"
     return "answered", quoted(answer)
 
@@ -252,9 +271,11 @@ def trials(only: str = "", part: tuple[int, int] = (0, 1), share: float = 1.0, s
         if (only and only != made.named) or (not only and k % part[1] != part[0]):  # pyright: ignore[reportFunctionMemberAccess]
             continue
         call = made()
+        if call.name not in LONG:
+            yield call.name, "", "", *judged(lambda call=call: call.function(**call.arguments))
         for name, valid in call.arguments.items():
             for text, value in HOSTILE.items():
-                if (value is None and valid is None) or (call.name in LONG and isinstance(value, (int, type(None)))):
+                if (value is None and is_default(call, name, valid)) or (call.name in LONG and text in ALL):
                     continue
                 if random_.random() < share:
                     yield call.name, name, text, *outcome(call, name, text)
@@ -275,6 +296,11 @@ def main() -> int:
     counts: collections.Counter[str] = collections.Counter()
     bad = []
     for name, parameter, text, kind, said in trials(asked.only, (k, n), asked.share, asked.seed):
+        if not parameter:  # the valid call itself
+            if kind != "answered":
+                print(f"raw: the valid call of {name} is {kind}: {said}", flush=True)
+                bad.append([name, parameter, text, kind, said])
+            continue
         counts[kind] += 1
         if kind in ("raw", "hang", "silent") or asked.list:
             print(f"{kind}: {name}({parameter}={text}) {said}", flush=True)

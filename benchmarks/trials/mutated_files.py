@@ -1,13 +1,17 @@
-"""Mutated study files, stores and saved results: does each end in one sentence, or in the right answer?
+"""Mutated files, stores and saved results: does each end in one sentence, or in the right answer?
 
     python benchmarks/trials/mutated_files.py studies --count 400
+    python benchmarks/trials/mutated_files.py scenes --count 2000
+    python benchmarks/trials/mutated_files.py designs --count 2000
+    python benchmarks/trials/mutated_files.py records --count 2000
     python benchmarks/trials/mutated_files.py stores --count 400
     python benchmarks/trials/mutated_files.py results --count 2000
 
-Each case is drawn by its seed, from `--first` on, and judged by `tests/helpers/mutations.py`. A study file is read; of a store
-one to three files are changed, then it is read, computed on and read again; a saved result is changed byte by byte, or prepared
-anew with odd parts and the right digest. Printed are the failures with their seeds and the counts; the exit code is 1 if there
-is a failure: a raw error, more than 60 s of the processor, a number that is not the right one.
+Each case is drawn by its seed, from `--first` on, and judged by `tests/helpers/mutations.py`. A study, scene, design or
+measurement file is read; of a store one to three files are changed, then it is read, computed on and read again; a saved result
+is changed byte by byte, or prepared anew with odd parts and the right digest. Printed are the failures with their seeds and the
+counts; the exit code is 1 if there is a failure: a raw error, more than 60 s of the processor, a number that is not the right
+one.
 """
 
 from __future__ import annotations
@@ -25,9 +29,12 @@ import jax
 import numpy as np
 
 import jaxvib as jv
+from jaxvib.machine.files import TEMPLATES
+from optimize.files import TEMPLATE, load_design
 
 sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / "helpers")]
 
+import file_texts  # noqa: E402
 import mutations  # noqa: E402
 
 jv.prepare_cpu()
@@ -45,7 +52,7 @@ def machine() -> jv.Scene:
 def studies(folder: pathlib.Path):
     jv.save_scene(machine(), folder / "machine.toml")
     originals = {}
-    for base in (mutations.STUDY, mutations.STUDY_OF_JAMS, mutations.STUDY_OF_RUNS):
+    for base in (file_texts.STUDY, file_texts.STUDY_OF_JAMS, file_texts.STUDY_OF_RUNS):
         (folder / "study.toml").write_text(base)
         originals[base] = mutations.load_study(folder / "study.toml")
 
@@ -56,9 +63,40 @@ def studies(folder: pathlib.Path):
     return one
 
 
+def scenes(folder: pathlib.Path):
+    def key(scene):
+        return jv.scene_to_toml(scene)
+
+    return _files(folder / "scene.toml", jv.load_scene, key, [jv.scene_to_toml(machine()), *TEMPLATES.values()])
+
+
+def designs(folder: pathlib.Path):
+    jv.save_scene(machine(), folder / "machine.toml")
+    return _files(folder / "design.toml", load_design, mutations.design_key, [file_texts.DESIGN, TEMPLATE])
+
+
+def records(folder: pathlib.Path):
+    texts = [file_texts.RECORD, file_texts.RECORD.replace("angle (deg)", "angle [mrad]").replace("# camera\n", "")]
+    return _files(folder / "record.csv", jv.read_record, mutations.record_key, texts, mutations.numbers_of_csv)
+
+
+def _files(path, read, key, texts, numbers=mutations.numbers_of_toml):
+    originals = {}
+    for text in texts:
+        path.write_text(text)
+        originals[text] = key(read(path))
+
+    def one(rng):
+        base = rng.choice(list(originals))
+        text = mutations.mutated_text(base, rng)
+        return mutations.file_outcome(path, text, read, key, (base, originals[base]), numbers)
+
+    return one
+
+
 def stores(folder: pathlib.Path):
     jv.save_scene(machine(), folder / "machine.toml")
-    (folder / "study.toml").write_text(mutations.STUDY)
+    (folder / "study.toml").write_text(file_texts.STUDY)
     asked = mutations.load_study(folder / "study.toml")
     whole = pathlib.Path(mutations.run_study(asked, folder / "whole.zarr").store)
     truth = jv.open_sweep(whole).data.load()
@@ -93,16 +131,19 @@ def results(folder: pathlib.Path):
     return one
 
 
+PARTS = {each.__name__: each for each in (studies, scenes, designs, records, stores, results)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=["studies", "stores", "results"])
+    parser.add_argument("part", choices=list(PARTS))
     parser.add_argument("--count", type=int, default=400)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=540.0, help="no further case is begun after so many")
     given = parser.parse_args()
     folder, begun, counts = pathlib.Path(tempfile.mkdtemp()), time.monotonic(), collections.Counter()
     try:
-        one = {"studies": studies, "stores": stores, "results": results}[given.part](folder)
+        one = PARTS[given.part](folder)
         for seed in range(given.first, given.first + given.count):
             if time.monotonic() - begun > given.seconds:
                 break

@@ -77,12 +77,13 @@ def space() -> op.DesignSpace:
     return op.DesignSpace(scene(), free={"machine.stiffness[0]": (3e4, 8e4), "machine.stiffness[1]": (1e4, 6e4)})
 
 
-def make(value: float) -> jv.Scene:
+def heavy(eps: float) -> jv.Scene:
+    links = dict(natural=1 / 3, damping=0.01, link_natural=2 / 3, link_damping=0.01)
+    return jv.Dimensionless("antiphase", **links | {"natural": [1 / 3, 1 / 3]}, rho=1.0, eps=eps, beta=1.0, speed=2.0).scene()
+
+
+def make(value: Any) -> jv.Scene:
     return eqx.tree_at(lambda s: s.loads.drag, scene(), jnp.asarray(value))
-
-
-def case(values: Any) -> jv.Scene:
-    return eqx.tree_at(lambda s: s.loads.drag, scene(), values)
 
 
 def calls() -> Iterator[Callable[[], Call]]:
@@ -151,7 +152,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("scene_to_toml", scene=s)
     # Equations
     yield call("vector_field", scene=s)
-    yield call("initial_state", scene=s, start="turning", mode=None, angles=None, apart=0.0, throw=True)
+    yield call("initial_state", scene=s, start="rest", mode=None, angles=None, apart=0.0, throw=True)
     yield call("initial_state", scene=s, start="jam", mode=3, angles=(0.0, 1.0), apart=0.0, throw=False)
     yield call("with_spin", scene=s, state=state, turning="rolling")
     yield call("natural_frequencies", scene=s)
@@ -167,7 +168,8 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("phase_jams", scene=s, starts=8, seed=0, near=None)
     yield call("jam_orbit", scene=s, mode=3, omega=None, near=None, accuracy=None, points=None, throw=True)
     yield call("stability_map", make=make, values=[1.0, 2.0], omega=(10.0, 15.0), points=8)
-    yield call("stability_onset", make=make, kind="Hopf", between=(1.0, 2.0), omega=(10.0, 15.0), points=8, accuracy=0.1)
+    ends = dict(between=(0.02, 0.05), omega=(0.36, 0.5))
+    yield call("stability_onset", make=heavy, kind="torus", **ends, points=60, accuracy=0.9)
     # Balancing
     r = later(rotor_scene)
     yield call("criterion", scene=r)
@@ -189,7 +191,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     drags = later(lambda: jnp.asarray([1.0, 2.0]))
     fast = later(lambda: jv.EqualSteps(200))
     lanes = dict(stepsize_controller=fast, estimate=False, lanes=2, equations=jv.vector_field)
-    yield call("ensemble", make=case, values=drags, until=0.2, **lanes)
+    yield call("ensemble", make=make, values=drags, until=0.2, **lanes)
     ups = dict(drag=[1.0, 2.0], starts=2, seed=0, angles=None, stepsize_controller=fast, batch=4, max_steps=None)
     yield call("run_ups", scene=s, until=0.2, **ups)
     yield call("growth", scene=s, until=1.0, start="jam", mode=3, stretches=8)
@@ -205,7 +207,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("work_precision", scene=s, **cost)
     yield call("compare_tiers", scene=s, factors=[1.0], mode=3)
     yield call("harmonic_convergence", scene=s, omega=[10.0], points=(4, 6))
-    gradients = dict(free=["machine.mass[0]"], routes=("forward",), implicit=None, tolerance=1e-5)
+    gradients = dict(free=["machine.mass"], routes=("forward",), implicit=None, tolerance=1e-5)
     yield call("check_gradients", scene=s, quantity=lambda x: jv.natural_frequencies(x)[0], **gradients)
     asked = dict(accuracy=0.1, mode=3, until=None, start=None, possible=(), tiers=False, repeats=0)
     yield call("audit", scene=s, **asked)
@@ -225,11 +227,11 @@ def calls() -> Iterator[Callable[[], Call]]:
     # Capture
     torus = dict(turns=2, starts=1, spread=1e-3, seed=0, resolution=None, turning="rolling")
     fewer = dict(stepsize_controller=later(lambda: jv.EqualSteps(100)), equations=jv.vector_field)
-    yield call("capture", scene=later(torus_scene), speeds=[0.5, 0.9], **torus, **fewer)
-    yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[0.5], **torus, equations=jv.vector_field)
+    yield call("capture", scene=later(torus_scene), speeds=[-0.9, -0.5], **torus, **fewer)
+    yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[-0.5], **torus, equations=jv.vector_field)
     # Pictures, results
     yield call("sketch", scene=s, ax=None)
-    film = dict(scene=s, begin=None, end=None, seconds=0.1, fps=5, magnify=None, width=2.0)
+    film = dict(scene=None, begin=None, end=None, seconds=0.1, fps=5, magnify=None, width=2.0)
     yield call("animate", motion=later(run), path=None, **film)
     modes = later(lambda: jv.jam_modes(scene()))
     yield call("load", path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))
@@ -247,7 +249,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("JamModes.select", lambda: jv.jam_modes(scene()).select, mode=3, throw=False)
     yield call("Jam.plot", lambda: jv.jam_modes(scene()).select(3).plot, **figure)
     yield call("ModeShapes.plot", lambda: jv.mode_shapes(scene()).plot, **figure)
-    yield call("Orbit.at", lambda: orbit().at, theta=np.asarray([0.0, 1.0]))
+    yield call("Orbit.at", lambda: orbit().at, theta=1.0)
     yield call("Orbit.relative_amplitude", lambda: orbit().relative_amplitude, i=1, j=2)
     yield call("Orbit.plot", lambda: orbit().plot, ax=None)
     yield call("PhaseJams.select", lambda: phases().select, index=0)
@@ -256,7 +258,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("PhaseJam.plot", lambda: phases().select(0).plot, ax=None)
     yield call("Run.plot", lambda: run().plot, **figure)
     yield call("Run.spectrum", lambda: run().spectrum, parts=1)
-    yield call("Run.plot_path", lambda: run().plot_path, ax=None)
+    yield call("Run.plot_path", lambda: jv.simulate(rotor_scene(), 0.1, samples=16).plot_path, ax=None)
     yield call("Spectrum.plot", lambda: run().spectrum().plot, show="displacement", coordinate=None, **figure)
     yield call("Envelope.plot", lambda: jv.envelope(scene(), 0.5, samples=16).plot, **figure)
     yield call("Regime.plot", lambda: run().regime.plot, ax=None)
@@ -307,8 +309,8 @@ def calls() -> Iterator[Callable[[], Call]]:
     stiffness = {"machine.stiffness[0]": (3e4, 8e4)}
     ties = {"machine.stiffness[1]": ("machine.stiffness[0]", 0.5)}
     yield call("DesignSpace", scene=s, free=stiffness, hold=(), ties=ties, choices={"machine.mass[0]": [100.0, 120.0]})
-    for name in ("free", "ties", "choices"):
-        yield call(f"DesignSpace by {name}", lambda name=name: _space(name), value=stiffness.get("x", (3e4, 8e4)))
+    for name, value in (("free", (3e4, 8e4)), ("ties", ("machine.stiffness[0]", 0.5)), ("choices", [100.0, 120.0])):
+        yield call(f"DesignSpace by {name}", lambda name=name: _space(name), value=value)
     for name in ("numbers", "at", "scene_of", "shares"):
         yield call(f"DesignSpace.{name}", lambda name=name: getattr(space(), name), **_vector(name))
     yield call("DesignSpace.where", lambda: space().where, scene=s)

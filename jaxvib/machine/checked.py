@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxvib.boundary import call_user
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import rebuilt
 from jaxvib.machine.scene import Scene, require_comparable
@@ -108,7 +109,7 @@ def made(make: Callable[..., Scene], *values: object) -> Scene:
         ...
     jaxvib.errors.InputError: make(1.0) is None; it must return a Scene
     """
-    scene = make(*values)
+    scene = call_user(make, "make", *values)
     if not isinstance(scene, Scene):
         call = f"make({', '.join(map(quoted, values))})"
         raise InputError(call, f"is {quoted(scene)}; it must return a Scene")

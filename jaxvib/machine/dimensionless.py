@@ -166,7 +166,8 @@ class Dimensionless(eqx.Module):
     ) -> dict[str, Array]:
         """Results in SI as the paper's numbers; any of them may be given.
 
-        **Arguments**: `omega` rad/s, any shape; `amplitude` m, last axis over the platforms; `force` N, any shape.
+        **Arguments**: `omega` rad/s, any shape; `amplitude` m, last axis over the platforms; `force` N, any shape. NaN in an
+        array, of modes that do not exist, stays NaN.
 
         **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
         """

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, validated
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
@@ -50,6 +50,14 @@ _PARTS = 4
 """Into so many parts a run is cut; over the last one mean speeds are taken."""
 
 Equations = Callable[[Scene], Callable[[Array, State], State]]
+
+
+def field_of(equations: Equations, scene: Scene) -> Callable[[Array, State], State]:
+    """Return the equations of motion of a scene. **Raises** `InputError` for a function that does not return a function."""
+    field: Callable[[Array, State], State] = call_user(equations, "equations", scene)
+    if callable(field):
+        return field
+    raise InputError("equations", f"gives {quoted(field)}; it must give a function of a time and a State")
 
 
 class EnsembleStatus(eqx.Enumeration):
@@ -166,6 +174,7 @@ def ensemble(
     ((5, 1), True, True)
     """
     begun = time.perf_counter()
+    values = jax.tree.map(jnp.asarray, values)
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
     if len(sizes) != 1 or sizes & {(), (0,)}:
         raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
@@ -222,7 +231,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
     """The scenes and the states they start from, all with a leading axis over the runs."""
 
     def one(value: PyTree[Array]) -> tuple[Scene, State]:
-        given = make(value)
+        given = call_user(make, "make", value)
         if isinstance(given, Scene):
             return given, initial_state(given)
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
@@ -268,7 +277,8 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     """
     single, together = wrap_angles(scene, state.displacement.dtype)
     watched = scene.loads.one_sided
-    field = _Watching(equations(scene), scene) if watched else equations(scene)
+    field = field_of(equations, scene)
+    field = _Watching(field, scene) if watched else field
     state = _watched(state, jnp.zeros_like(state.azimuth)) if watched else state
     motion = side_by_side(field, state, single, together, implicit=implicit)
     length = end / _PARTS

@@ -16,9 +16,9 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
-from jaxvib.motion.integrate import wrap_angles
+from jaxvib.motion.integrate import whole_turns, wrap_angles
 from jaxvib.motion.run import Run
-from jaxvib.motion.simulate import last_state, simulate, whole_turns
+from jaxvib.motion.simulate import last_state, simulate
 from jaxvib.motion.start import Start, initial_state, whole_state
 from jaxvib.motion.steps import Tolerance, require_known
 from jaxvib.results.fields import in_unit

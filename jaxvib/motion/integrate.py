@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import diffrax
@@ -14,6 +15,7 @@ from jax import Array
 
 from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -23,7 +25,7 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite"]
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite", "whole_turns"]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -218,3 +220,18 @@ def _stages(solver: diffrax.AbstractSolver) -> int:
 def is_finite(state: Any) -> Array:
     """Whether every number of a state is, or of another tree."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
+
+
+_MAX_TURNS = 1e15
+"""Turns that are counted one by one in double precision."""
+
+
+def whole_turns(scene: Scene, stretch: float) -> float:
+    """The longest time within `stretch`, s, after which a rotor of constant speed is where it was; a turn at least."""
+    turn = 2.0 * math.pi / float(scene.drive.speed)
+    turns = stretch / turn
+    if turns > _MAX_TURNS:
+        raise InputError(
+            "until", f"gives stretches of {turns:.3g} turns of the rotor; they must be shorter than {_MAX_TURNS:.0e}"
+        )
+    return max(math.floor(turns), 1) * turn

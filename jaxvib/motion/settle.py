@@ -15,9 +15,9 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import fastest_and_slowest, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
-from jaxvib.motion.simulate import last_state, simulate, whole_turns
+from jaxvib.motion.simulate import last_state, simulate
 from jaxvib.motion.start import APART, Start, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former, require_known
 from jaxvib.results.status import member, status_name

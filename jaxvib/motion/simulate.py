@@ -23,7 +23,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
-from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, wrap_angles
+from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, whole_turns, wrap_angles
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
@@ -339,12 +339,6 @@ def _in_stretches(
     found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
     found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
     return _with(found, together=together)
-
-
-def whole_turns(scene: Scene, stretch: float) -> float:
-    """The longest time within `stretch`, s, after which a rotor of constant speed is where it was; a turn at least."""
-    turn = 2.0 * math.pi / float(scene.drive.speed)
-    return max(math.floor(stretch / turn), 1) * turn
 
 
 def last_state(scene: Scene, run: Run) -> State:

@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
-from jaxvib.units import traced
+from jaxvib.units import require_real, traced
 
 __all__ = [
     "FORMER",
@@ -46,6 +46,9 @@ class Tolerance:
 
     tolerance: float
 
+    def __post_init__(self) -> None:
+        require_real(self.tolerance, "", "tolerance")
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -58,6 +61,9 @@ class Accuracy:
 
     error: float
 
+    def __post_init__(self) -> None:
+        require_real(self.error, "", "error")
+
 
 @dataclass(frozen=True)
 class EqualSteps:
@@ -69,6 +75,9 @@ class EqualSteps:
     """
 
     number: int
+
+    def __post_init__(self) -> None:
+        require_real(self.number, "", "steps")
 
 
 StepChoice = Tolerance | Accuracy | EqualSteps | diffrax.AbstractStepSizeController

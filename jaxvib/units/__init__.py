@@ -31,6 +31,7 @@ __all__ = [
     "known_number",
     "number",
     "numbers",
+    "random_numbers",
     "require_real",
     "to_float",
     "traced",
@@ -82,6 +83,11 @@ def _checked(value: Array | np.ndarray, field: str, unit: str, low: float, open_
         shown = f"{entry:g} {unit}".strip()
         if not np.isfinite(entry):
             raise InputError(name, f"is {shown}; a finite number is needed")
+        if unit == "rad" and abs(entry) * np.finfo(flat.dtype).eps > 1.0:
+            most = 1.0 / np.finfo(flat.dtype).eps
+            raise InputError(
+                name, f"is {shown}; it must be below {most:.1e} rad, above which angles have no digits within a turn"
+            )
         if entry < low or (open_low and entry == low):
             raise InputError(name, f"is {shown}; it must be {'greater than' if open_low else 'at least'} {low:g}")
 
@@ -150,6 +156,8 @@ def numbers(
             return scalar
         known = not isinstance(magnitude, jax.Array)
         return jnp.asarray(np.full(length, magnitude), dtype=float) if known else jnp.broadcast_to(scalar, (length,))
+    if np.size(magnitude) == 0 and length is None:
+        raise InputError(field, "is an empty array; at least 1 value is needed")
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
         raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
     return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)
@@ -203,3 +211,14 @@ def count(value: object, field: str, *, low: int = 1, each: float = 0.0) -> int:
     if value > _MAX_COUNT:
         raise InputError(field, f"is {quoted(value)}; it must be a whole number from {low} to {_MAX_COUNT}")
     return int(value)
+
+
+def random_numbers(seed: object) -> np.random.Generator:
+    """Return the generator of random numbers that belongs to a seed, a whole number of at least 0.
+
+    >>> random_numbers(-1)
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: seed is -1; it must be a whole number, at least 0
+    """
+    return np.random.default_rng(count(seed, "seed", low=0))

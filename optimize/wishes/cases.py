@@ -183,7 +183,9 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
     for name, value in tolerances.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
             raise InputError(f"tolerances.{name}", f"is {quoted(value)}; give a share such as 0.05 for 5 %")
-    case = Sampled(tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), seed)
+    case = Sampled(
+        tuple((k, float(v)) for k, v in tolerances.items()), count(samples, "samples", low=2), count(seed, "seed", low=0)
+    )
     words = how if how != "quantile" else f"{level:.0%} quantile of"
     return Robust(
         f"{words} {quantity.words}", quantity.unit, of=quantity.of, case=case, parts=(quantity,), statistic=how, level=level

@@ -1,4 +1,4 @@
-"""Mutated study files, stores and saved results, and what becomes of them.
+"""Mutated study, scene, design and measurement files, stores and saved results, and what becomes of them.
 
 An outcome is "refused" (one sentence), "accepted", or a failure: "raw" (any other error), "hang", "silent" (an answer that is
 not that of the input).
@@ -8,13 +8,16 @@ import contextlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import tomllib
 import warnings
 import zipfile
 
+import equinox
 import numpy as np
+from file_texts import STUDY
 
 import jaxvib as jv
 from jaxvib.results.files import _digest
@@ -23,64 +26,6 @@ from jaxvib.sweeps.sweep import run_study
 
 PATIENCE = 60
 """Seconds of the processor that no input may take."""
-
-STUDY = """
-scene = "machine.toml"
-samples = 12
-seed = 3
-chunk = 8
-[axes]
-"drive.speed" = { from = "200 rpm", to = "900 rpm", count = 5 }
-"loads.drag" = [0.5, "1.0 N s/m"]
-"machine.damping" = { from = 30.0, to = 50.0, scale = "log" }
-[[measure]]
-quantity = "total"
-field = "machine.mass"
-name = "mass"
-[[measure]]
-quantity = "spring_cost"
-prices = [["10 N/mm", 20.0], ["100 N/mm", 55.0]]
-unit = "EUR"
-[[measure]]
-quantity = "static_deflection"
-of = 1
-"""
-
-STUDY_OF_JAMS = """
-scene = "machine.toml"
-tier = "leading"
-[axes]
-"drive.speed" = ["600 rpm", "900 rpm"]
-[[measure]]
-quantity = "amplitude"
-mode = 3
-of = [1, 2]
-name = "a"
-[[measure]]
-quantity = "jam_frequency"
-mode = 3
-tolerances = { "machine.stiffness" = 0.05, "machine.damping" = 0.3 }
-statistic = "worst"
-samples = 4
-[[measure]]
-quantity = "phase"
-mode = 1
-"""
-
-STUDY_OF_RUNS = """
-scene = "machine.toml"
-[axes]
-"drive.speed" = { from = "200 rpm", to = "900 rpm", count = 3 }
-"start.rate" = [0.0, "300 rpm"]
-[run]
-until = "0.5 s"
-start = "rest"
-steps = 400
-[[measure]]
-quantity = "run.regime"
-[[measure]]
-quantity = "run.load_speed"
-"""
 
 WORDS = [
     "nan", "inf", "-1", "0", "1e400", "1" * 400, "1" * 5000, "true", '""', '"x"', "[]", "[2]", '["a"]', "[[1, 2], 3]", "{}",
@@ -167,23 +112,50 @@ def leaves(value):
     return [value]
 
 
-def study_outcome(folder, text, original, base=STUDY):
-    """Of a study file mutated from `base`: refused, or accepted with another identity if a number is another one."""
-    (folder / "study.toml").write_text(text, encoding="utf-8", errors="surrogateescape")
+def numbers_of_toml(text):
+    """The entries of a TOML text; `chunk`, how many cases are computed together, changes no number."""
+    tables = tomllib.loads(text)
+    tables.pop("chunk", None)
+    return leaves(tables)
+
+
+def numbers_of_csv(text):
+    """The numbers of a table of text, below its comments and its header."""
+    cells = [cell.strip() for line in text.splitlines() if not line.startswith("#") for cell in line.split(",")]
+    return [float(cell) for cell in cells if re.fullmatch(r"-?\d+(\.\d*)?", cell)]
+
+
+def file_outcome(path, text, read, key, base, numbers=numbers_of_toml):
+    """Of a file mutated from `base`: refused, or accepted with another `key` if a number is another one.
+
+    `base` is the original text and its key.
+    """
+    path.write_text(text, encoding="utf-8", errors="surrogateescape")
 
     def ask():
-        found = load_study(folder / "study.toml")
-        tables = tomllib.loads(text)
-        for each in (tables, before := tomllib.loads(base)):
-            each.pop("chunk", None)  # how many cases are computed together changes no number
-        mine, its = leaves(tables), leaves(before)
+        found = key(read(path))
+        mine, its = numbers(text), numbers(base[0])
         changed = len(mine) == len(its) and any(
             isinstance(a, (int, float)) and isinstance(b, (int, float)) and a != b for a, b in zip(mine, its, strict=True)
         )
-        assert not changed or found.key != original.key, "another number, and the same identity"
-        return found.key
+        assert not changed or found != base[1], "another number, and the same identity"
+        return found
 
     return outcome(ask)
+
+
+def study_outcome(folder, text, original, base=STUDY):
+    """Of a study file mutated from `base`, see `file_outcome`."""
+    return file_outcome(folder / "study.toml", text, load_study, lambda study: study.key, (base, original.key))
+
+
+def design_key(design):
+    """A text with every number of a design."""
+    return equinox.tree_pformat(design, short_arrays=False)
+
+
+def record_key(record):
+    return record.time.tolist(), record.angle.tolist()
 
 
 def mutated_bytes(content, rng):

@@ -137,7 +137,12 @@ def test_angles_that_are_kept_within_a_turn_are_compared_across_its_end(monkeypa
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [(dict(stretches=4), "at least 8 are needed"), (dict(start="jam"), "mode is missing"), (dict(until=0.0), "greater than 0")],
+    [
+        (dict(stretches=4), "at least 8 are needed"),
+        (dict(start="jam"), "mode is missing"),
+        (dict(until=0.0), "greater than 0"),
+        (dict(until=1e308), "turns of the rotor"),
+    ],
 )
 def test_what_is_refused(arguments, says):
     scene = jv.Scene(

@@ -11,8 +11,9 @@ from scenes import published, scene
 from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
+from jaxvib.motion.integrate import whole_turns
 from jaxvib.motion.settle import _distance, _slowest_decay, _steady_in_the_mean
-from jaxvib.motion.simulate import last_state, whole_turns
+from jaxvib.motion.simulate import last_state
 
 
 def test_settle_names_a_motion_that_left_its_mode():

@@ -78,7 +78,6 @@ def test_a_sample_takes_what_is_kept_of_it(s):
     ("change", "says"),
     [
         (dict(start="spin_up", spin_up=5.0), "longer than the run"),
-        (dict(stepsize_controller=jv.Tolerance("small")), "tolerance is 'small'"),
         (dict(until=1e308), "run shorter stretches"),
     ],
 )

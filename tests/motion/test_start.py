@@ -73,3 +73,18 @@ def test_starts_that_cannot_be_say_what_else_to_start_from():
     with pytest.raises(jv.InputError, match=r"apart is 0\.1, which goes with named starts"):
         jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), apart=0.1)
     np.testing.assert_allclose(jv.initial_state(scene(), apart="3 deg").azimuth, -np.pi / 2 + np.deg2rad([-3.0, 0.0, 3.0]))
+
+
+@pytest.mark.parametrize("angle", [1e16, -1e308, float("inf"), float("nan")])
+def test_angles_without_digits_in_a_turn_are_refused(angle):
+    s, says = scene(), r"is .*; (it must be (below 4\.5e\+15 rad|a number)|a finite number)"
+    for start in (dict(start="rest"), dict(start="jam", mode=3)):
+        with pytest.raises(jv.InputError, match=f"^angles {says}"):
+            jv.initial_state(s, **start, angles=angle)
+    with pytest.raises(jv.InputError, match=f"^theta {says}"):
+        jv.jam_orbit(s, mode=3, points=16).at(angle)
+
+
+def test_the_motion_at_an_angle_takes_one_angle():
+    with pytest.raises(jv.InputError, match=r"^theta has shape \(2,\); one number in rad is needed"):
+        jv.jam_orbit(scene(), mode=3, points=16).at([0.0, 1.0])

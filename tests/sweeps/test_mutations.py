@@ -4,7 +4,8 @@ import pathlib
 import shutil
 
 import pytest
-from mutations import STUDY, mutate_store, mutated_text, seeded, store_outcome, study_outcome
+from file_texts import STUDY
+from mutations import mutate_store, mutated_text, seeded, store_outcome, study_outcome
 from scenes import scene
 
 import jaxvib as jv

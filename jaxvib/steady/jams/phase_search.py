@@ -35,7 +35,7 @@ from jaxvib.steady.jams.phases import (
     parts_of,
     phase_jam,
 )
-from jaxvib.units import count
+from jaxvib.units import count, random_numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,8 +137,8 @@ def phase_jams(
     the foundation force are the loads' alone. Where both count, ask `simulate`.
 
     **Arguments**: `starts`: random sets of phases at each load speed; `seed` which. Stable jams are found with a few; unstable
-    ones close to where patterns part from each other take many. `near`: a speed (rad/s) and phases (count,) rad of the loads,
-    from which Newton's method finds one jam, see `phase_jam`; `jit`, `vmap` and `grad` go through it then.
+    ones close to where patterns part from each other take many. `near`: (omega, phase), a speed rad/s and the phases (count,)
+    rad of the loads, from which Newton's method finds one jam, see `phase_jam`; `jit`, `vmap` and `grad` go through it then.
 
     **Returns** `PhaseJams`, or `PhaseJam` with `near`. **Raises** `InputError` for loads without drag, drives without a given
     speed, and effects that this theory leaves out.
@@ -158,7 +158,7 @@ def phase_jams(
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
     parts = _parts(scene)
-    rng = np.random.default_rng(count(seed, "seed", low=0))
+    rng = random_numbers(seed)
     return _jams_near(scene, parts, *starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count))))
 
 

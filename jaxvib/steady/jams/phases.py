@@ -26,6 +26,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
 from jaxvib.steady.refused import REFUSED, refuse_unknowns
+from jaxvib.units import number, numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,10 +212,10 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     Source: Artyunin 2013, section V, for phases that are equal or opposite.
     """
     loads = loads_with_drag(scene)
-    phase = jnp.asarray(phase)
-    if phase.shape != (loads.count,):
-        raise InputError("phase", f"has shape {phase.shape}; one phase for each load is needed, ({loads.count},)")
-    return refuse_unknowns(scene, jam_from(scene, jnp.asarray(omega, dtype=phase.dtype), phase), PhaseStatus.refused)
+    if np.shape(phase) != (loads.count,):
+        raise InputError("phase", f"has shape {np.shape(phase)}; one phase for each load is needed, ({loads.count},)")
+    speed, phases = number(omega, "rad/s", "omega", low=0.0, open_low=True), numbers(phase, "rad", "phase", loads.count)
+    return refuse_unknowns(scene, jam_from(scene, speed, phases), PhaseStatus.refused)
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:

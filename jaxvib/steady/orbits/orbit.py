@@ -29,7 +29,7 @@ from jaxvib.steady.orbits.collocation import (
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
 from jaxvib.steady.refused import REFUSED
-from jaxvib.units import count
+from jaxvib.units import count, known_number
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -108,9 +108,10 @@ class Orbit(Result):
         """The motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',) rad/s.
 
         Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
-        the motion.
+        the motion. For many angles use `jax.vmap(orbit.at)`. **Raises** `InputError` for an angle that is not finite, or so
+        large that its digits within a turn are lost.
         """
-        return _at(self, theta if isinstance(theta, Array) else np.asarray(theta, self.offsets.dtype))
+        return _at(self, known_number(theta, "rad", "theta"))
 
     @validated
     def relative_amplitude(self, i: int, j: int) -> Array:

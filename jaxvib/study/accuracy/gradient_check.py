@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
@@ -183,7 +183,10 @@ def check_gradients(
 
     def by(shares: Array) -> Array:
         """The quantity where each number is moved by that share of itself."""
-        return jnp.asarray(quantity(put(shares)))
+        given = call_user(quantity, "quantity", put(shares))
+        if not is_real(given):
+            raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
+        return jnp.asarray(given)
 
     nothing = jnp.zeros(len(numbers))
     value = by(nothing)

@@ -25,7 +25,7 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
-from jaxvib.units import Number, number
+from jaxvib.units import Number, numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,7 +84,7 @@ def harmonic_convergence(
     """
     if len(points) == 0 or any(b <= a for a, b in itertools.pairwise(points)):
         raise InputError("points", f"are {quoted(points)}; give numbers of points in ascending order")
-    speeds = jnp.stack([number(w, "rad/s", "omega", low=0.0, open_low=True) for w in omega])
+    speeds = jnp.atleast_1d(numbers(omega, "rad/s", "omega", None, low=0.0, open_low=True))
     half = has_half_turn(scene.effects)
     rows = [_errors(scene, speeds, grid_of(m, half).theta.size) for m in (*points, 2 * points[-1])]
     n, known = (np.stack([np.asarray(row[k]) for row in rows]) for k in range(2))

@@ -18,6 +18,7 @@ from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import Jam, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.units import numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +94,7 @@ def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers
 
     Source: the leading order is the antiphase paper's, see `jam_modes`; the comparison is ours.
     """
-    loads = jammed_loads(scene)
+    loads, factors = jammed_loads(scene), np.atleast_1d(numbers(factors, "", "factors", None, low=0.0, open_low=True)).tolist()
     answers: list[tuple[Jam, Orbit]] = []
     for factor in factors:
         heavier = eqx.tree_at(

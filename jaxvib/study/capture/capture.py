@@ -25,7 +25,7 @@ from jaxvib.motion.steps import EqualSteps
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
-from jaxvib.units import Number, count, number
+from jaxvib.units import Number, count, number, random_numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -216,7 +216,7 @@ def capture(
         raise InputError("speeds", f"is {quoted(speeds)}; ascending numbers from -1 to 0 are needed")
     end = 2.0 * np.pi * count(turns, "turns") / float(scene.drive.speed)
     width = float(number(spread, "rad", "spread", low=0.0))
-    shifts = np.random.default_rng(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
+    shifts = random_numbers(seed).uniform(-width, width, (count(starts, "starts"), scene.loads.count))
     shifts[0] = 0.0
     given, most = stepsize_controller, count(doublings, "doublings", low=0)
     first = given.number if given is not None else max(16, math.ceil(end * steps_per_second(scene, equations)))

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.ensemble import Equations
+from jaxvib.motion.ensemble import Equations, field_of
 from jaxvib.motion.integrate import added_rate
 from jaxvib.motion.start import with_spin
 from jaxvib.runtime.programs import cached
@@ -109,7 +109,7 @@ def _jacobian(scene: Scene, equations: Equations) -> Array:
     zero, still = jnp.zeros_like(around), jnp.zeros(scene.machine.structure().mass.shape[:1], around.dtype)
     angle, rate = (around + scene.loads.offsets(), across), (zero + scene.drive.speed, zero)
     flat, unravel = ravel_pytree(with_spin(scene, State(still, still, angle, rate)))
-    field = equations(scene)
+    field = field_of(equations, scene)
 
     def change(flat: Array) -> Array:
         return ravel_pytree(field(jnp.zeros((), flat.dtype), unravel(flat)))[0]

@@ -33,7 +33,7 @@ from jaxvib.study.capture.published_torus import (
     published_scene,
 )
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
-from jaxvib.units import count
+from jaxvib.units import count, random_numbers
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -255,7 +255,7 @@ def published_tables(
         [(row.damping, row.stiffness, row.friction, *pair) for row in rows for pair in zip(row.gap, row.speed, strict=True)]
     )
     damping, stiffness, friction, gap, paper = points.T
-    shifts = np.random.default_rng(seed).uniform(-spread, spread, (count(starts, "starts"), 2))
+    shifts = random_numbers(seed).uniform(-spread, spread, (count(starts, "starts"), 2))
     shifts[0] = 0.0
     most, length = count(doublings, "doublings", low=0), count(turns, "turns")
 

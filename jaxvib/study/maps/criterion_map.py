@@ -100,8 +100,9 @@ def criterion_map(
     axes = {"speeds": speeds, "mass": mass, "drag": drag}
     values = {name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in axes.items()}
     for name, value in values.items():
-        if value.ndim != 1 or not np.all(np.isfinite(value)) or np.any(value <= 0.0) or np.any(np.diff(value) <= 0.0):
-            raise InputError(name, "must be a list of numbers greater than 0, ascending")
+        bad = value.ndim != 1 or not value.size or not np.all(np.isfinite(value)) or np.any(value <= 0.0)
+        if bad or np.any(np.diff(value) <= 0.0):
+            raise InputError(name, "must be a list of numbers greater than 0, one at least, ascending")
     grid, mass_factor, drag_factor = values.values()
 
     given = circular_loads(scene)

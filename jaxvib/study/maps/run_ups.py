@@ -26,7 +26,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.units import Number, count, number, numbers
+from jaxvib.units import Number, count, number, numbers, random_numbers
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
@@ -162,7 +162,7 @@ def run_ups(
         if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
             raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
     elif starts is not None:
-        sets = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
+        sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
         if any(effect.couples_loads for effect in scene.effects):
             sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:

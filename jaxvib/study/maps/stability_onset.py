@@ -18,6 +18,7 @@ from jaxvib.results.status import Computed
 from jaxvib.runtime.many import in_parallel
 from jaxvib.steady.jams.picture import MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
+from jaxvib.units import number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,6 +137,9 @@ def stability_onset(
         diagram = exact_branches(made(make, x), points=points, least=omega[0], most=omega[1])
         return any(point.kind == kind for point in diagram.special)
 
+    number(accuracy, "", "accuracy", low=0.0, open_low=True)
+    if kind not in MARKS:
+        raise InputError("kind", f"is {quoted(kind)}; it must be one of {', '.join(MARKS)}")
     low, high = between
     if not 0.0 < low < high:
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")

@@ -256,6 +256,12 @@ def test_wrong_questions():
         jv.phase_jams(planar(0.0))
     with pytest.raises(jv.InputError, match=r"phase has shape \(3,\); one phase for each load is needed, \(2,\)"):
         phase_jam(planar(), 100.0, jnp.zeros(3))
+    starts = ((np.ones(2), np.zeros(2)), (-1.0, np.zeros(2)), (1.0, 0.0))
+    for near, says in zip(starts, ("omega has shape", "omega is -1", "phase has shape"), strict=True):
+        with pytest.raises(jv.InputError, match=says):
+            jv.phase_jams(planar(), near=near)
+    with pytest.raises(jv.InputError, match=r"phase\[1\] is nan rad; a finite number is needed"):
+        jv.phase_jams(planar(), near=(100.0, np.asarray([0.0, np.nan])))
     with pytest.raises(jv.InputError, match="starts is 0"):
         jv.phase_jams(planar(), starts=0)
     jams = jv.phase_jams(planar(), starts=8)

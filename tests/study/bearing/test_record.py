@@ -4,6 +4,8 @@ import os
 
 import numpy as np
 import pytest
+from file_texts import RECORD
+from mutations import file_outcome, mutated_text, numbers_of_csv, record_key, seeded
 from swings import ROD
 
 import jaxvib as jv
@@ -114,3 +116,15 @@ def test_records_in_one_line_and_pipes_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     with pytest.raises(jv.InputError, match="a pipe or a device"):
         jv.read_record(tmp_path / "pipe.csv")
+
+
+def test_mutated_records_are_refused_or_other_numbers(tmp_path):
+    path = tmp_path / "record.csv"
+    path.write_text(RECORD)
+    base = RECORD, record_key(jv.read_record(path))
+    found = [
+        file_outcome(path, mutated_text(RECORD, seeded(seed)), jv.read_record, record_key, base, numbers_of_csv)
+        for seed in range(300)
+    ]
+    assert [(seed, each) for seed, each in enumerate(found) if each[0] not in ("refused", "accepted")] == []
+    assert sum(kind == "refused" for kind, _ in found) > 100

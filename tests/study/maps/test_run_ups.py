@@ -81,6 +81,9 @@ def test_run_ups_name_each_lane():
         assert all(f"{50 * np.sum(kinds == kind)} % {kind}" in line for kind in kinds)
     with pytest.raises(jv.InputError, match=r"angles has shape \(1, 3\)"):
         jv.run_ups(s, 5.0, angles=[[0.0, 0.1, 0.2]])
+    for more, says in ((dict(drag=np.zeros(0)), "drag is an empty array"), (dict(starts=2, seed=-1), "seed is -1")):
+        with pytest.raises(jv.InputError, match=says):
+            jv.run_ups(s, 5.0, **more)
     with pytest.raises(jv.InputError, match="goes without angles"):
         jv.run_ups(s, 5.0, starts=3, angles=[[0.0, 0.1]])
 
