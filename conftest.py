@@ -121,7 +121,7 @@ class _Patch(pytest.MonkeyPatch):
 @pytest.fixture
 def unwatched():
     """What a test replaces in the package keeps no program from being stored: it is about storing, not about physics."""
-    with unittest.mock.patch.object(imported._imports, "definitions", {}):
+    with unittest.mock.patch.object(imported._code, "differences", list):
         yield
 
 

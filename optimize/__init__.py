@@ -1,6 +1,12 @@
 """Design: what may change, what is wanted, who searches."""
+# ruff: noqa: E402
 
-import jaxvib  # noqa: F401  before all other modules, which it watches
+import sys
+
+from jaxvib.imported import watch
+
+watch(sys.modules[__name__])  # before all other imports, which it then watches too
+
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto
 from optimize.space import DesignSpace, Held, hold

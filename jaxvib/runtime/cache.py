@@ -29,7 +29,8 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
     version of jaxvib or JAX, or in the processor are kept apart. The folder may be deleted at any time.
 
     A program that calls back into Python, such as a progress meter's, cannot be stored. No program is stored or read while a
-    function of the package is replaced (by a mock, for example) or after a source file was edited before it was imported.
+    function or a constant of the package is replaced (by a mock, for example) or after a source file was edited in the
+    course of this process.
 
     **Arguments**: `folder`, made where it does not exist; None: the one that JAX caches in already, else
     `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`; `only_if_unset` leaves a folder that was chosen before.

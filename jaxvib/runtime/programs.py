@@ -245,13 +245,14 @@ def _pullback(question: _Question, active: tuple[bool, ...], arrays: Sequence[Ar
     form = Skeleton.of(*jax.tree.flatten(pullback)), tuple(map(zero_of, numbers))
     with _noting:
         _pullbacks[code_state(), question, active, _types(arrays)] = form
-        while len(_pullbacks) > _MOST:
+        while len(_pullbacks) > MAX_PULLBACK_FORMS:
             _pullbacks.popitem(last=False)
     return found, pullback
 
 
-_MOST = 64
-"""So many forms of reverse derivatives are held: they are needed where a program of one is traced, soon after or never."""
+MAX_PULLBACK_FORMS = 64
+"""Largest number of forms of reverse derivatives in memory, some 1 MB each. They are needed when a program of one is traced,
+which is soon after or never."""
 
 _pullbacks: collections.OrderedDict[Hashable, tuple[Skeleton, tuple[Any, ...]]] = collections.OrderedDict()
 _noting = threading.Lock()

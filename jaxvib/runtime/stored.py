@@ -29,7 +29,7 @@ import numpy as np
 from jax import Array, export
 from jax.sharding import Sharding, SingleDeviceSharding
 
-from jaxvib.imported import CodeState, code_state, digest_of_sources, forget_derived
+from jaxvib.imported import CodeState, clear_derived, code_state, digest_of_sources
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, no_places
 from jaxvib.runtime.cpu import processor
@@ -48,9 +48,20 @@ _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promo
 """JAX's options that a traced program depends on."""
 
 
-_MOST = 512
-"""So many programs are held in memory, those that were used last. XLA maps each into some dozens of areas of memory: a process
-with some thousand programs has no areas left (65530 on Linux), and ends within the compiler without a word."""
+MAX_PROGRAMS_IN_MEMORY = 512
+"""Largest number of programs in memory. XLA maps each into 10 to 400 areas of memory: a process with some thousand programs has
+no areas left (65530 on Linux) and crashes inside the compiler without a message."""
+
+MAX_PROGRAM_MEMORY = 768 * 2**20
+"""Largest estimated memory, bytes, of all programs in memory: with the process itself less than 1.5 GB."""
+
+MEMORY_PER_PROGRAM, MEMORY_PER_STORED_BYTE = 2**20, 300
+"""Estimated memory, bytes, of a program: this, and this much for each byte of its stored form. XLA does not report the memory
+of programs on the CPU. Measured growth of the resident memory: natural frequencies 2.0 MB (stored 4.3 kB), jam modes 13.6 MB
+(32 kB), branches 11 to 16 MB (40 kB), an exact jam 38 MB (146 kB), a run 29 to 46 MB (280 kB)."""
+
+UNKNOWN_STORED_SIZE = 100_000
+"""Assumed stored size, bytes, of programs that cannot be stored: those with host callbacks, mostly runs with a progress bar."""
 
 _clock = itertools.count()
 _functions: weakref.WeakSet[StoredFunction] = weakref.WeakSet()
@@ -61,8 +72,8 @@ class StoredFunction(Generic[T]):
     """A function of trees of arrays and of what can be hashed, compiled, whose programs are stored on disk.
 
     The key of a program on disk holds all that it depends on: the shapes and types of arrays, the static parts of the
-    arguments, JAX's options, the versions, the sources, and the processor. The 512 programs that were used
-    last are held in memory, others are read or traced again.
+    arguments, JAX's options, the versions, the sources, and the processor. The programs used last are held in memory,
+    at most `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`; others are read or traced again.
 
     Some programs are not stored, but traced in each process: those with arguments of a class from outside
     (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices. In a
@@ -96,7 +107,7 @@ class StoredFunction(Generic[T]):
                 program = self.ready.get(asked, _UNKNOWN)
                 if program is _UNKNOWN:
                     program = self.ready[asked] = self._program(folder, arrays_on_device(leaves), treedef, home)
-            _forget_oldest()
+            _evict_least_recently_used()
         if program is None:
             if is_rehearsing():
                 raise Unstored
@@ -154,7 +165,8 @@ class StoredFunction(Generic[T]):
             if not structure:  # the function's own error
                 raise
             return _Program.of(jitted, structure[0])
-        program = _Program.of(_compiled(path, exported, home), structure[0], exported, is_new=True)
+        exported = export.deserialize(bytearray(stored))  # the first one holds its trace, 1 to 3 MB
+        program = _Program.of(_compiled(path, exported, home), structure[0], exported, size=len(stored), is_new=True)
         if code_state(look=True) != state:  # it changed while it was traced
             return program
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
@@ -165,12 +177,16 @@ class StoredFunction(Generic[T]):
 
 @dataclasses.dataclass
 class _Program:
-    """A function of all arrays of the arguments, compiled by `jax.jit`, what its arrays are put into, and when it was used;
-    types of the arguments and results of one that is stored, whether it was traced in this process and has not been run, and
-    whether it has; and the thread that compiles it."""
+    """A function of all arrays of the arguments, compiled by `jax.jit`.
+
+    `result` is the structure of its result, `memory` its estimated memory in bytes, `arguments` and `results` the types of the
+    arrays of a stored program; `is_new` is True if it was traced in this process and has not been run; `used` is the time of
+    the last use, `compiling` the thread that compiles it.
+    """
 
     run: Callable[..., list[Array]]
     result: Skeleton
+    memory: int = 0
     arguments: Sequence[jax.ShapeDtypeStruct] = ()
     results: Sequence[jax.ShapeDtypeStruct] | None = None
     is_new: bool = False
@@ -185,15 +201,18 @@ class _Program:
         structure: Description,
         exported: export.Exported | None = None,
         *,
+        size: int = UNKNOWN_STORED_SIZE,
         is_new: bool = False,
     ) -> _Program:
         places = itertools.count()
         result = Skeleton(rebuild(structure, map(Slot, places)))
         if result.size != next(places):
             raise Undescribable("an array of the result is in a static field")
+        memory = MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * size
         if exported is None:
-            return cls(run, result)
-        return cls(run, result, list(map(_type_of, exported.in_avals)), list(map(_type_of, exported.out_avals)), is_new)
+            return cls(run, result, memory)
+        arguments, results = (list(map(_type_of, avals)) for avals in (exported.in_avals, exported.out_avals))
+        return cls(run, result, memory, arguments, results, is_new)
 
     def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
         compiling, self.compiling, self.is_new = self.compiling, None, False
@@ -250,14 +269,18 @@ _ARRAYS = (jax.Array, np.ndarray)  # NumPy's go to the device with the call, in 
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 
 
-def _forget_oldest() -> None:
-    """Frees the programs beyond `_MOST` that were not used for longest."""
+def _evict_least_recently_used() -> None:
+    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`, all but the last one."""
     with _listing:
         functions = list(_functions)
-    held = [(p.used, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None]
-    for _, function, asked in sorted(held, key=lambda each: each[0])[: max(len(held) - _MOST, 0)]:
-        program = function.ready.pop(asked, None)
-        if program is not None:
+    held = [
+        (p.used, p, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None
+    ]
+    held.sort(key=lambda each: each[0], reverse=True)
+    memory = itertools.accumulate(program.memory for _, program, _, _ in held)
+    beyond = [each for k, each in enumerate(held) if next(memory) > MAX_PROGRAM_MEMORY or k >= MAX_PROGRAMS_IN_MEMORY]
+    for _, program, function, asked in beyond if len(beyond) < len(held) else beyond[1:]:
+        if function.ready.pop(asked, None) is not None:
             program.run.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
 
 
@@ -286,7 +309,7 @@ def _read(path: Path, home: Sharding) -> _Program | None:
         exported = export.deserialize(bytearray(stored))
     except (OSError, ImportError):
         return None
-    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], exported)
+    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], exported, size=len(stored))
 
 
 def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:
@@ -346,11 +369,8 @@ def _current_code(*, look: bool = False) -> CodeState:
     if state != _coded[0]:
         with _coding:
             if state != _coded[0]:
-                forget_derived()
+                clear_derived()
                 eqx.clear_caches()
                 jax.clear_caches()
                 _coded[0] = state
     return state
-
-
-_sources()  # before the modules that are imported after this one can change

@@ -165,7 +165,7 @@ def test_a_reverse_derivative_that_was_not_asked_for_before(asked):
 @pytest.mark.parametrize("asked", [None], indirect=True)
 def test_forms_of_reverse_derivatives_do_not_pile_up(asked, monkeypatch):
     function, _ = asked
-    monkeypatch.setattr(programs, "_MOST", 2)
+    monkeypatch.setattr(programs, "MAX_PULLBACK_FORMS", 2)
     for size in range(2, 6):
         jax.grad(lambda x: jnp.sum(function(x).values))(jnp.arange(float(size)))
     assert len(programs._pullbacks) == 2
