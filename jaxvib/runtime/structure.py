@@ -172,6 +172,9 @@ def _named(name: str) -> object:
     if module.partition(".")[0] not in KNOWN_PACKAGES:
         raise Undescribable(f"{name} is not of a known package")
     try:
-        return functools.reduce(getattr, path.split("."), importlib.import_module(module))
+        found = functools.reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError) as error:
         raise Undescribable(f"{name} cannot be found") from error
+    if (getattr(found, "__module__", None), getattr(found, "__qualname__", None)) != (module, path):
+        raise Undescribable(f"{name} is not defined in {module}")  # a module that this one imports, and all within it
+    return found
