@@ -18,6 +18,7 @@ from jaxtyping import PyTree
 from jaxvib.boundary import call_user, validated
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.checked import allowed_unknowns, checked
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
@@ -34,6 +35,7 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
+from jaxvib.steady.refused import REFUSED, without_numbers
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
@@ -66,6 +68,7 @@ class EnsembleStatus(eqx.Enumeration):
     done = "the run reached its end"
     detached = "the run reached its end, but on the way a load did not press on its track and was kept on it all the same"
     not_finite = "the motion grew beyond all bounds"
+    refused = REFUSED
     not_resolved = "the steps are too long for the decay of the loads by drag, or of the machine by damping: give more steps"
 
 
@@ -76,7 +79,8 @@ class Ensemble(Result):
     with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
     `error` (B,) estimated, as that of a `Run` but for the end state alone, each run's displacements relative to its own
     largest: NaN where no estimate was asked for or the motion did not stay finite, infinite where 4 steps or fewer leave no
-    larger ones to compare with; `finite` (B,) whether the motion stayed so; `resolved` (B,) false
+    larger ones to compare with; `allowed` (B,) false if `make` put a number into a scene that its constructor would not take;
+    `finite` (B,) whether the motion stayed so; `resolved` (B,) false
     if explicit steps are too long for what decays fastest; `detached` (B, count) whether a load's track, which
     holds it by pressing alone, would have had to pull it at any stage of any step; `steps` each run took; `seconds` all of it
     took, compiling included where a program was new, NaN under a JAX transformation.
@@ -85,6 +89,7 @@ class Ensemble(Result):
     state: State = eqx.field(metadata=part("run", fields=STATE))
     load_speed: Array = eqx.field(metadata=in_unit("rad/s", "run", "load"))
     error: Array = eqx.field(metadata=in_unit("", "run"))
+    allowed: Array = eqx.field(metadata=in_unit("", "run"))
     finite: Array = eqx.field(metadata=in_unit("", "run"))
     resolved: Array = eqx.field(metadata=in_unit("", "run"))
     detached: Array = eqx.field(metadata=in_unit("", "run", "load"))
@@ -95,12 +100,12 @@ class Ensemble(Result):
     def status(self) -> EnsembleStatus:
         """How each run ended, an `EnsembleStatus` for each."""
 
-        def one(finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
+        def one(allowed: Array, finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
             ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
             failed = EnsembleStatus.where(resolved, EnsembleStatus.not_finite, EnsembleStatus.not_resolved)
-            return EnsembleStatus.where(finite, ended, failed)
+            return EnsembleStatus.where(allowed, EnsembleStatus.where(finite, ended, failed), EnsembleStatus.refused)
 
-        return jax.vmap(one)(self.finite, self.detached, self.resolved)
+        return jax.vmap(one)(self.allowed, self.finite, self.detached, self.resolved)
 
     def summary(self) -> str:
         """How the runs ended, at which speeds of their loads, with which errors, for a person to read."""
@@ -181,7 +186,7 @@ def ensemble(
     ((runs,),) = sizes
     end = number(until, "s", "until", low=0.0, open_low=True)
     lanes = min(count(lanes, "lanes"), runs)
-    made = _made(make, values)
+    *made, allowed = _made(make, values)
     require_start(made[0], made[1].angle)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.
@@ -197,7 +202,9 @@ def ensemble(
     (fastest, decay), implicit = _rates(made[0]), False
     steps = 0 if stepsize_controller is None else count(stepsize_controller.number, "steps")
     if concrete:
-        most = [float(np.max(np.asarray(x))) for x in (fastest, decay)]
+        # Runs that are refused do not decide the steps of the others.
+        most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
+        most = most if bool(np.any(allowed)) else [1.0, 0.0]
         step, implicit = steps_of(most[0], most[1], 4.0, float(end) / steps if steps else None)
         steps = steps or max(16, math.ceil(float(end) / step - 1e-9))
     each = -(-steps // _PARTS)
@@ -219,7 +226,10 @@ def ensemble(
         error = estimated_error(apart, share, made[0])
     unknown = np.asarray(np.nan, end.dtype)
     resolved = implicit | ~is_unresolved(decay, end / (_PARTS * each))
-    found = Ensemble(*on_device((last, load_speed, error, finite, resolved, detached, taken[0], unknown)))
+    if traced(allowed) or not bool(np.all(allowed)):
+        numbers = last, load_speed, error, finite, resolved, detached
+        last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(allowed, numbers)
+    found = Ensemble(*on_device((last, load_speed, error, allowed, finite, resolved, detached, taken[0], unknown)))
     if not concrete:
         return found
     jax.block_until_ready(found)
@@ -227,17 +237,19 @@ def ensemble(
 
 
 @eqx.filter_jit
-def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State]:
-    """The scenes and the states they start from, all with a leading axis over the runs."""
+def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
+    """The scenes, the states they start from, and whether their numbers are allowed, with a leading axis over the runs."""
 
-    def one(value: PyTree[Array]) -> tuple[Scene, State]:
+    def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
         given = call_user(make, "make", value)
         if isinstance(given, Scene):
-            return given, initial_state(given)
+            given = given, initial_state(given)
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
             raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
-        return scene, with_spin(scene, state)
+        scene = checked(scene)
+        allowed = allowed_unknowns(scene)
+        return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
 
     return eqx.filter_vmap(one)(values)
 

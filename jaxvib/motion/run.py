@@ -24,6 +24,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.refused import REFUSED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,6 +52,7 @@ class RunStatus(eqx.Enumeration):
     no_start = "the state to start from does not exist or is not finite"
     beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
     would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
+    refused = REFUSED
 
 
 class Run(AbstractMeasured, Result):

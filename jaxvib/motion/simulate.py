@@ -34,6 +34,7 @@ from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
+from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, known_number, traced
 
 __all__ = ["enough_steps", "simulate"]
@@ -128,7 +129,7 @@ def simulate(
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
-    scene = brought_up(scene, end, start, spin_up)
+    asked, scene = scene, brought_up(scene, end, start, spin_up)
     given = isinstance(start, State)
     state = (
         whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
@@ -171,7 +172,7 @@ def simulate(
         found, coarse = in_threads(lambda k: both[k](), 2) if progress_meter is None else [each() for each in both]
         estimated = _compared(scene, fastest(), found, coarse, control, coarser, coarse.evaluations)
     if traced(found.steps):
-        return dataclasses.replace(found, **estimated)
+        return refuse_unknowns(asked, dataclasses.replace(found, **estimated), RunStatus.refused)
     jax.block_until_ready((found.steps, estimated))
     found = _with(found, seconds=time.perf_counter() - begun, **estimated)
     if throw:
@@ -324,8 +325,7 @@ def _in_stretches(
         controller = StepControl(steps=np.asarray(np.ceil(controller.steps / number), controller.steps.dtype))
     length = whole_turns(scene, float(end) / number)
     last = float(end) - (number - 1) * length
-    taken, rejected, evaluations, together = 0, 0, 0, True
-    found = None
+    taken, rejected, evaluations, together, found = 0, 0, 0, True, None
     for k in range(number):
         span = jnp.asarray(length if k < number - 1 else last, end.dtype)
         found = integrated(span, state, controller, k == number - 1)

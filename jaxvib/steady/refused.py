@@ -13,7 +13,7 @@ from jaxvib.machine.checked import allowed_unknowns
 from jaxvib.machine.scene import Scene
 from jaxvib.results.result import Result
 
-__all__ = ["REFUSED", "refuse_unknowns"]
+__all__ = ["REFUSED", "refuse_unknowns", "without_numbers"]
 
 REFUSED = "a number that was not known while the program was built is not allowed in a scene: build the scene outside to see it"
 """Sentence of the status `refused`."""
@@ -27,13 +27,19 @@ def refuse_unknowns(scene: Scene, found: Found, refused: eqx.Enumeration) -> Fou
     allowed = allowed_unknowns(scene)
     if allowed is None:
         return found
+    status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), found.status, refused)
+    return eqx.tree_at(lambda result: result.status, without_numbers(allowed, found), status)
+
+
+def without_numbers(allowed: Array, found: Any) -> Any:
+    """The tree with NaN and False in place of its numbers unless `allowed`; a scene in it stays as it is."""
 
     def kept(value: Any) -> Any:
         if not isinstance(value, Array):
             return value
         if jnp.issubdtype(value.dtype, jnp.inexact):
-            return jnp.where(allowed, value, jnp.nan)
+            # `jnp.where` would broadcast the condition for each of the arrays.
+            return jax.lax.select(allowed, value, jnp.full_like(value, jnp.nan))
         return value & allowed if value.dtype == bool else value
 
-    status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), found.status, refused)
-    return eqx.tree_at(lambda result: result.status, jax.tree.map(kept, found), status)
+    return jax.tree.map(kept, found, is_leaf=lambda value: isinstance(value, Scene))

@@ -39,6 +39,7 @@ from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
 from jaxvib.steady.balance.monodromy import at_constant_speed
+from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["envelope"]
@@ -183,7 +184,7 @@ def envelope(
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
-    scene = brought_up(scene, end, start, spin_up)
+    asked, scene = scene, brought_up(scene, end, start, spin_up)
     if isinstance(start, State):
         state = whole_state(scene, start, mode)
     else:
@@ -193,9 +194,11 @@ def envelope(
     run = _run(
         scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )
-    if throw and not traced(run.steps):
+    if traced(run.steps):
+        return refuse_unknowns(asked, run, EnvelopeStatus.refused)
+    if throw:
         _raise_if_failed(run, max_steps)
-    if not traced(run.steps) and not is_rehearsing() and bool(run.settled) and status_name(run.status) == "done":
+    if not is_rehearsing() and bool(run.settled) and status_name(run.status) == "done":
         return _judged_by_separation(run)
     return run
 

@@ -15,6 +15,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
+from jaxvib.steady.refused import REFUSED
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
@@ -31,6 +32,7 @@ class EnvelopeStatus(eqx.Enumeration):
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the state to start from does not exist or is not finite"
     would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
+    refused = REFUSED
     not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
 
 
