@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -51,6 +53,9 @@ class RunStatus(eqx.Enumeration):
     not_accurate = "the run reached its end, but its estimated error is larger than the accuracy that was asked for"
     no_start = "the state to start from does not exist or is not finite"
     beating = "the motion does not repeat itself; it beats or wanders about means that no longer change"
+    creeping = (
+        "the loads balance the rotor, and creep from one arrangement that does so to the next: what is left changes slowly"
+    )
     would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
     refused = REFUSED
 
@@ -92,7 +97,8 @@ class Run(AbstractMeasured, Result):
     @property
     def finished(self) -> Array:
         """True if the run reached its end, settled or not."""
-        return (self.status == RunStatus.done) | (self.status == RunStatus.beating) | (self.status == RunStatus.would_separate)
+        ends = RunStatus.done, RunStatus.beating, RunStatus.creeping, RunStatus.would_separate
+        return functools.reduce(operator.or_, (self.status == end for end in ends))
 
     def summary(self) -> str:
         """What happened, for a person to read; amplitudes zero to peak."""
@@ -100,6 +106,7 @@ class Run(AbstractMeasured, Result):
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
         state = "steady in the mean" if bool(self.status == RunStatus.beating) else state
+        state = "balanced" if bool(self.status == RunStatus.creeping) else state
         unstable, first = bool(self.status == RunStatus.would_separate), []
         if unstable:
             first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"

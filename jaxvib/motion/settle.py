@@ -15,6 +15,7 @@ from jaxvib.equations.linear import linear_model
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.integrate import fastest_and_slowest, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, simulate
@@ -37,6 +38,16 @@ _SCATTER = 3.6
 
 _AWAY = 10.0
 """A settled motion may still be so many drifts away from its end."""
+
+_CREEPS = 4
+"""Stretches by which loads that creep along balanced arrangements are judged."""
+
+_EVENLY = 0.05
+"""The angles by which loads creep in two of these differ by less, relative to the largest."""
+
+_NEUTRAL = 0.01
+"""Change of the residual unbalance, relative to that of the angles in rad, below which loads creep along balanced arrangements:
+in any other direction it is 1 divided by the number of loads, or more."""
 
 _FALLS = -3.0
 """A drift whose logarithm falls by so many standard errors of its slope is not there to stay."""
@@ -64,14 +75,19 @@ def settle(
     force and speed over each quarter of them differ by no more than their scatter explains, or by half the `drift` that is
     told, and the drift shows no fall. Its status is then `beating`.
 
+    Four loads or more, or three with an imbalance, balance the rotor in a whole family of arrangements (`balanced_states`), and
+    nothing but small disturbances such as gravity moves them along it, for hours. If they balance the rotor, free vibrations
+    of the carrier have decayed, and over four stretches the loads creep evenly while their unbalance does not change, the
+    status is `creeping`.
+
     **Arguments**
 
     - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
     - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
     - `drift`: the change that counts as none, see `Measured`; if it is given the motion must come to less. The default is 1e-6,
-      in single precision 1e-3, and a motion that is steady in the mean has settled too. What the motion is still away from
-      its end, estimated from the slowest decay of the carrier or from how the drift falls, must be below ten times as much:
-      with little damping a motion changes slowly long before it has settled
+      in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too. What the motion is still away
+      from its end, estimated from the slowest decay of the carrier or from how the drift falls, must be below ten times as
+      much: with little damping a motion changes slowly long before it has settled
     - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
     - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
@@ -114,6 +130,7 @@ def settle(
     remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
     decay = _slowest_decay(scene)
     seen: list[list[float]] = []
+    regimes: list[Regime] = []
     run, together, ended = None, True, False
     for _ in range(count(stretches, "stretches")):
         run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
@@ -128,10 +145,15 @@ def settle(
         if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
             run = judged_by_separation(dataclasses.replace(run, status=member(RunStatus, "beating")))
             break
+        if in_the_mean and bool(run.settled) and decay * stretch * len(seen) > -math.log(usual):
+            regimes.append(run.regime)
+            if _is_creeping(regimes[-_CREEPS:]):
+                run = judged_by_separation(dataclasses.replace(run, status=member(RunStatus, "creeping")))
+                break
         state = last_state(scene, run)
     assert run is not None
     run = dataclasses.replace(run, together=on_device(np.asarray(together)))
-    if throw and not (ended or status_name(run.status) in ("beating", "would_separate")):
+    if throw and not (ended or status_name(run.status) in ("beating", "creeping", "would_separate")):
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
@@ -192,6 +214,18 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
     size = np.abs(means).mean(axis=0)
     size[2:] = size[2:].max()  # a drift is relative to the largest amplitude
     return bool(np.all(apart <= np.maximum(_SCATTER * error, 0.5 * np.median(drift) * size)))
+
+
+def _is_creeping(regimes: Sequence[Regime]) -> bool:
+    """True if loads balance the rotor in each of some stretches, and creep evenly along arrangements that do so."""
+    if len(regimes) < _CREEPS or not all(bool(regime.name == RegimeName.balanced) for regime in regimes):
+        return False
+    phase = np.array([np.asarray(regime.phase) for regime in regimes])
+    unbalance = np.array([float(regime.unbalance) for regime in regimes])
+    steps = np.angle(np.exp(1j * np.diff(phase, axis=0)))
+    size = float(np.max(np.abs(steps)))
+    even = float(np.max(np.ptp(steps, axis=0))) < _EVENLY * size
+    return even and float(np.ptp(unbalance)) < _NEUTRAL * size
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:

@@ -12,7 +12,7 @@ from small_machine import small_machine, small_run, small_start
 
 import jaxvib as jv
 from jaxvib.motion.integrate import whole_turns
-from jaxvib.motion.settle import _distance, _slowest_decay, _steady_in_the_mean
+from jaxvib.motion.settle import _distance, _is_creeping, _slowest_decay, _steady_in_the_mean
 from jaxvib.motion.simulate import last_state
 
 
@@ -250,3 +250,50 @@ def test_the_distance_from_the_end_follows_from_decays():
     falling = [1e-2, 5e-3, 1e-3, 1e-4, 2e-5, 1e-5]
     np.testing.assert_allclose(far(falling, 0.0), 1e-4 / (1.0 - 100.0 ** (-1.0 / 30.0)), rtol=1e-12)
     assert far(falling[::-1], 0.0) == far(falling[:5], 0.0) == np.inf and far([0.0], 0.0) == 0.0
+
+
+def test_loads_that_creep_along_balanced_arrangements_settle(monkeypatch):
+    """Three balls and an imbalance have one free direction of balanced arrangements; gravity moves them along it for hours."""
+    machine = jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0)
+    loads = jv.balls(count=3, mass=0.04, radius=0.1, drag=2.0)
+    s = jv.Scene(machine, loads, jv.ConstantSpeed(314.0), (jv.Gravity(), jv.StaticImbalance("6 g m")))
+    runs, ask = [], jv.simulate
+    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *args, **given: runs.append(ask(*args, **given)) or runs[-1])
+    start = jv.initial_state(s, angles=np.radians([89.8, 188.2, 239.1]))
+    found = jv.settle(s, start=start, periods=40)
+    assert found.status_name == "creeping" and bool(found.settled) and bool(found.finished) and len(runs) < 12
+    assert found.regime.label == "balanced" and float(found.foundation_force) < 1e-3 * 0.012 * 314.0**2
+    # Independently of the residual unbalance that was measured: the angles change as no unbalance does to first order.
+    before, after = (np.asarray(run.regime.phase) for run in runs[-2:])
+    change = np.angle(np.exp(1j * (after - before)))
+    assert np.max(np.abs(change)) > 1e-6
+    assert abs(np.sum(np.exp(1j * after) * change)) < 0.02 * np.sum(np.abs(change))
+    with pytest.raises(jv.ComputationError) as caught:
+        jv.settle(s, start=start, periods=40, drift=1e-6, stretches=8)
+    assert caught.value.status == "not_settled"
+
+
+def balanced(phase, unbalance, name=jv.RegimeName.balanced):
+    return SimpleNamespace(name=name, phase=np.array(phase), unbalance=unbalance)
+
+
+@pytest.mark.parametrize(
+    ("change", "creeping"),
+    [
+        ({}, True),
+        ({"phase": lambda k: 1e-4 * 0.8**k}, False),  # comes to rest
+        ({"phase": lambda k: 1e-4 * 1.2**k}, False),  # leaves, faster and faster
+        ({"unbalance": lambda k: 1e-5 + 3e-5 * k}, False),  # leaves balance, or comes to it
+        ({"phase": lambda k: 0.0}, False),
+        ({"name": jv.RegimeName.unbalanced}, False),
+    ],
+)
+def test_creeping_loads_move_evenly_and_stay_balanced(change, creeping):
+    phase, unbalance = change.get("phase", lambda k: 1e-4 * k), change.get("unbalance", lambda k: 1e-5)
+    name = change.get("name", jv.RegimeName.balanced)
+    # One load passes half a turn, where its angle jumps.
+    regimes = [balanced([3.14150 + phase(k), 1.0 - phase(k)], unbalance(k), name) for k in range(4)]
+    for regime in regimes:
+        regime.phase = np.angle(np.exp(1j * regime.phase))
+    assert _is_creeping(regimes) is creeping
+    assert not _is_creeping(regimes[:3])
