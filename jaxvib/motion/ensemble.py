@@ -186,7 +186,8 @@ def ensemble(
     ((runs,),) = sizes
     end = number(until, "s", "until", low=0.0, open_low=True)
     lanes = min(count(lanes, "lanes"), runs)
-    *made, allowed = _made(make, values)
+    scenes, states, allowed = _made(make, values)
+    made = scenes, states
     require_start(made[0], made[1].angle)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
     # What all runs share stays one number: it is not read anew for each.

@@ -96,7 +96,13 @@ class Growth(Result):
 
 @validated
 def growth(
-    scene: Scene, until: Number, *, start: Start | State = "rest", mode: int | None = None, stretches: int = 40
+    scene: Scene,
+    until: Number,
+    *,
+    start: Start | State = "rest",
+    mode: int | None = None,
+    apart: Number | None = None,
+    stretches: int = 40,
 ) -> Growth:
     """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions separate that begin close together.
 
@@ -119,7 +125,8 @@ def growth(
     motion that it has come to.
 
     **Arguments**: `until` s or text, about how long all stretches are together; each is a whole number of turns of the rotor;
-    `start`, `mode` as `simulate`; `stretches`, 8 at least: so many that motions a rounding apart are not far apart after one.
+    `start`, `mode`, `apart` as `simulate`; `stretches`, 8 at least: so many that motions a rounding apart are not far apart
+    after one.
 
     **Returns** `Growth`. **Raises** `InputError` for a drive whose speed changes; `ComputationError` for a run that fails.
 
@@ -141,10 +148,11 @@ def growth(
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
-    state = whole_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    given = isinstance(start, State)
+    state = whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart)
     stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
-    apart, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
+    separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
 
     def run_on(begin: State) -> Run:
         run = simulate(scene, stretch, start=begin, save="window", stepsize_controller=steps, estimate=False, throw=False)
@@ -157,7 +165,7 @@ def growth(
         if other is None:  # not along the motion, where nothing grows
             scale = error_scale(jax.tree.map(lambda x: x[None], state), unit)
             noise = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state)
-            other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, apart)
+            other = _at_distance(state, jax.tree.map(jnp.add, state, noise), scale, separation)
         if k in (stretches // 2, 3 * stretches // 4):
             quarters.append(state)
         first, second = run_on(state), run_on(other)
@@ -165,9 +173,9 @@ def growth(
         ours, theirs = (jax.tree.map(lambda x: x[-1], run.window.state) for run in (first, second))
         if wrap_angles(scene, ours.displacement.dtype)[0]:
             theirs = turned(theirs, ours)
-        rates.append(math.log(max(_distance(ours, theirs, scale), 1e-300) / apart) / stretch)
+        rates.append(math.log(max(_distance(ours, theirs, scale), 1e-300) / separation) / stretch)
         state, gone = last_state(scene, first), jax.tree.map(lambda x, y: y - x, ours, theirs)
-        other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, apart)
+        other = _at_distance(state, jax.tree.map(jnp.add, state, gone), scale, separation)
     late = np.array(rates[stretches // 2 :])
     exponent, uncertainty = float(np.mean(late)), _sum_error(late) / late.size
     name = _judged(late * stretch)

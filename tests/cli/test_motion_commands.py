@@ -80,6 +80,20 @@ def test_settle_and_growth_ask_what_is_typed(typed, tmp_path, monkeypatch):
     assert code == 2 and "--start is 'spin_up'" in err
 
 
+@pytest.mark.parametrize("command", ["simulate", "settle", "envelope", "growth", "run-ups"])
+def test_loads_start_apart_as_typed_in_every_command(typed, monkeypatch, command):
+    asked = []
+
+    def noted(scene, *positional, **named):
+        asked.append(named["apart"])
+        raise jv.ComputationError("stopped", "no more is needed")
+
+    monkeypatch.setattr(f"jaxvib.{command.replace('-', '_')}", noted)
+    words = (command, "machine.toml", *(() if command == "settle" else ("--until", "1s")))
+    assert typed(*words, "--apart", "3 deg")[0] == typed(*words)[0] == 1
+    assert asked == ["3 deg", None]
+
+
 @pytest.mark.slow
 def test_settle_envelope_growth_and_run_ups_answer_as_python_does(typed, tmp_path):
     loaded = jv.load_scene("machine.toml")

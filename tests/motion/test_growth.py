@@ -159,3 +159,21 @@ def test_a_drive_that_changes_is_refused():
     scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5), jv.RunUp(60.0, acceleration=3.0))
     with pytest.raises(jv.InputError, match="drive is 'run_up'"):
         jv.growth(scene, 10.0)
+
+
+def test_growth_starts_as_far_apart_as_asked(monkeypatch):
+    """A run that is asked for has loads at these angles; those of a `State` are its own."""
+    s = jv.Scene(jammed().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
+    starts = []
+
+    def noted(scene, until, *, start, **given):
+        starts.append(np.ptp(np.asarray(start.angle[0])))
+        raise jv.ComputationError("stopped", "no more is needed")
+
+    monkeypatch.setattr("jaxvib.motion.growth.simulate", noted)
+    for apart in (None, "10 deg", 0.0):
+        with pytest.raises(jv.ComputationError, match="no more"):
+            jv.growth(s, 10.0, apart=apart)
+    np.testing.assert_allclose(np.degrees(starts), [1.0, 10.0, 0.0], atol=1e-12)
+    with pytest.raises(jv.InputError, match="goes with named starts"):
+        jv.growth(s, 10.0, start=jv.initial_state(s), apart=0.0)

@@ -60,6 +60,7 @@ def settle(
 @click.option("--until", required=True, help="End time, such as 20s or '10 min'.")
 @_START
 @_MODE
+@APART
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-4].")
 @WITHOUT
@@ -70,6 +71,7 @@ def envelope(
     until: str,
     start: Start | None,
     mode: int | None,
+    apart: str | None,
     spin_up: str | None,
     tolerance: float | None,
     without: tuple[str, ...],
@@ -80,7 +82,7 @@ def envelope(
     loaded = loaded_scene(scene, without)
     begin = ("rest" if mode is None else "jam") if start is None else start
     steps = None if tolerance is None else jv.Tolerance(tolerance)
-    run = jv.envelope(loaded, until, start=begin, mode=mode, spin_up=spin_up, stepsize_controller=steps)
+    run = jv.envelope(loaded, until, start=begin, mode=mode, apart=apart, spin_up=spin_up, stepsize_controller=steps)
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
@@ -93,17 +95,25 @@ def envelope(
 @click.option("--until", required=True, help="How long all stretches are together, such as 60s.")
 @_START
 @_MODE
+@APART
 @SPEED
 @click.option("--stretches", type=int, default=40, show_default=True, help="Into how many stretches it is cut, 8 at least.")
 @shared
 def growth(
-    scene: Path, until: str, start: Start | None, mode: int | None, speed: str | None, stretches: int, output: Output
+    scene: Path,
+    until: str,
+    start: Start | None,
+    mode: int | None,
+    apart: str | None,
+    speed: str | None,
+    stretches: int,
+    output: Output,
 ) -> None:
     """Growth of small disturbances of SCENE: regular, unstable, chaotic or undecided, and after which time derivatives fail."""
     if start == "spin_up":
         raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
     begin = ("rest" if mode is None else "jam") if start is None else start
     loaded = loaded_scene(scene, speed=speed, constant=True)
-    found = jv.growth(loaded, until, start=begin, mode=mode, stretches=stretches)
+    found = jv.growth(loaded, until, start=begin, mode=mode, apart=apart, stretches=stretches)
     output.picture("growth.png", found.plot)
     output.done(found.as_dict(), found.summary, "growth", found)

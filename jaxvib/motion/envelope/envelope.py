@@ -127,6 +127,7 @@ def envelope(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
+    apart: Number | None = None,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int = 256,
@@ -147,8 +148,8 @@ def envelope(
 
     **Arguments**
 
-    - `until`, `start`, `mode`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: from rest
-      loads start as far apart as in `simulate`, and separate if the averaged motion at one angle is unstable
+    - `until`, `start`, `mode`, `apart`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase:
+      loads that start apart separate if the averaged motion at one angle is unstable
     - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
     - `stepsize_controller`: `Tolerance`, the error a step may make, relative to the largest amplitude, and absolute in natural
       units, for rates the rotor's speed, for phases 1 rad (1e-4 by default); or a step size controller of diffrax
@@ -186,11 +187,11 @@ def envelope(
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     asked, scene = scene, brought_up(scene, end, start, spin_up)
     if isinstance(start, State):
-        state = whole_state(scene, start, mode)
+        state = whole_state(scene, start, mode, apart)
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
-        known = start in ("rest", "spin_up") and mode is None
-        state = None if known else initial_state(scene, start, mode=mode, throw=throw)
+        known = start in ("rest", "spin_up") and mode is None and apart is None
+        state = None if known else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     run = _run(
         scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )

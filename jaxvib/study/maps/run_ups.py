@@ -108,6 +108,7 @@ def run_ups(
     starts: int | None = None,
     seed: int = 0,
     angles: Sequence[Sequence[float]] | None = None,
+    apart: Number | None = None,
     stepsize_controller: StepChoice | None = None,
     batch: int = 16,
     max_steps: int | None = None,
@@ -119,7 +120,7 @@ def run_ups(
     - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`)
     - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
     - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
-      rad. Default: one set, at the bottom and as far apart as `initial_state` places them
+      rad. Default: one set, at the bottom and as far `apart` as in `simulate`
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
     - `batch`: so many runs go side by side on each core
     - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
@@ -157,6 +158,10 @@ def run_ups(
     n = scene.loads.count
     if starts is not None and angles is not None:
         raise InputError("starts", "goes without angles: either random angles or those that are named")
+    if apart is not None and not (starts is None and angles is None):
+        raise InputError(
+            "apart", f"is {quoted(apart)}, which goes without starts and angles: it places the loads of a single start"
+        )
     if angles is not None:
         sets = np.asarray(angles, dtype=float)
         if sets.ndim != 2 or sets.shape[1] != n or not np.all(np.isfinite(sets)):
@@ -166,7 +171,7 @@ def run_ups(
         if any(effect.couples_loads for effect in scene.effects):
             sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:
-        sets = np.asarray(initial_state(scene).azimuth)[None]
+        sets = np.asarray(initial_state(scene, apart=apart).azimuth)[None]
     count(batch, "batch")
     require_start(scene, (jnp.asarray(sets),))
 
