@@ -38,8 +38,7 @@ def run_ups(
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
     steps = None if tolerance is None else jv.Tolerance(tolerance)
     loaded = jv.load_scene(scene)
-    given = dict(drag=each, starts=starts, seed=seed, apart=apart, batch=batch, stepsize_controller=steps)
-    found = jv.run_ups(loaded, until, **given)
+    found = jv.run_ups(loaded, until, drag=each, starts=starts, seed=seed, apart=apart, batch=batch, stepsize_controller=steps)
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))
