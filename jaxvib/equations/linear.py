@@ -80,6 +80,13 @@ class AbstractLinearModel(eqx.Module):
         damping = self.damping(omega if speed is None else speed)
         return jax.lax.complex(self.carrier.stiffness - omega**2 * self.mass, omega * damping)
 
+    def dissipated(self, velocity: Array) -> Array:
+        """Mean power, W, that the carrier's damping takes from a periodic motion: sum_k V_k^H C V_k / 2.
+
+        **Arguments**: `velocity` V (nd, K) or (nd,), complex amplitudes of the coordinates' rates.
+        """
+        return jnp.vdot(velocity, self.carrier.damping @ velocity).real / 2.0
+
     def modes(self) -> tuple[Array, Array]:
         """Undamped natural frequencies (nd,) rad/s, ascending, and mass-normalised mode shapes (nd, nd), a column a mode."""
         square, inverse = relative_to(self.mass, self.carrier.stiffness)

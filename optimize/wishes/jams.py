@@ -31,6 +31,9 @@ __all__ = [
     "power",
 ]
 
+_SLIP = 1e-4
+"""Slip n - Omega, per n, below which the torque is computed from what the carrier dissipates: 1e-12 of either is rounding."""
+
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
     """Whose amplitude is meant: `of`, or, if it is None, platform 1 against 2, and the only platform where there is one.
@@ -303,9 +306,13 @@ def power(*, mode: int, tier: Tier = "leading") -> Quantity:
 def _power(answers: Answers, tier: Tier, mode: int) -> Array:
     if tier == "exact":
         return answers.orbit(mode).power
-    scene, loads = answers.scene, jammed_loads(answers.scene)
-    n, omega = scene.drive.speed, answers.jam(mode).omega
+    scene, loads, jam = answers.scene, jammed_loads(answers.scene), answers.jam(mode)
+    n, omega = scene.drive.speed, jam.omega
     torque = loads.drag_sum() * (n - omega)
     if any(effect.has_friction for effect in scene.effects):
         torque = torque + light_friction(loads, scene.effects, omega, n)
+    # Strong drag leaves n - Omega few digits; what the carrier dissipates, which that torque equals, has all of them.
+    close = n - omega < _SLIP * n
+    taken = answers.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
+    torque = jnp.where(close, taken / omega, torque)
     return n * torque

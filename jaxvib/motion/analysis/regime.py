@@ -115,11 +115,18 @@ class Regime(Result):
             near = f"{where} resonance {int(self.resonance)} at {float(self.resonance_speed):.5g} rad/s (mode {int(self.mode)})"
             evidence += [near, pattern]
         if bool(self.name == RegimeName.balanced) or bool(self.name == RegimeName.unbalanced):
-            evidence.append(f"{100.0 * float(self.unbalance):.2g} % of the loads' unbalance is left, {pattern}")
+            evidence += [self._remainder(), pattern]
         if bool(self.caught):
             evidence.append("the rotor itself is caught at a resonance, below its motor's speed")
         evidence.append(f"speeds change by {float(self.change):.1e}")
         return f"{self.message} ({'; '.join(evidence)})"
+
+    def _remainder(self) -> str:
+        share = float(self.unbalance)
+        # Loads have no more than their own unbalance: what exceeds it is the rotor's.
+        if share > 1.005:
+            return f"the rotor's imbalance is more than the loads can balance: {share:.2g} times their unbalance is left"
+        return f"{100.0 * share:.3g} % of the loads' unbalance is left"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:

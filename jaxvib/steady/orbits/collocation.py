@@ -248,13 +248,15 @@ def _linearised(
 class BranchTangent(NamedTuple):
     """`slope` dn/dOmega of the branch; `residual`: what is left of the torque balance at the points, relative to the torques in
     it; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`, rad: an estimate of what the
-    number of points leaves; `receptance` (K, nd, np) of the carrier at the orders of the grid."""
+    number of points leaves; `receptance` (K, nd, np) of the carrier at the orders of the grid; `acceleration` (np, M) of the
+    port at the points, m/s^2."""
 
     slope: Array
     residual: Array
     speed_error: Array
     deviation_error: Array
     receptance: Array
+    acceleration: Array
 
 
 def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
@@ -292,6 +294,7 @@ def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) 
         jnp.abs(error[-1] / speed),
         jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)),
         received[: grid.orders.size],
+        found.acceleration,
     )
 
 

@@ -311,20 +311,28 @@ def _numbers(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> tup
     `_measured`."""
     branch = branch_tangent(model, grid, motion)
     harmonics = harmonics_of(model, grid, motion, branch.receptance)
-    return harmonics, (*branch[:-1], *_measured(model, grid, motion, harmonics))
+    return harmonics, (*branch[:-2], *_measured(model, grid, motion, harmonics, branch.acceleration))
 
 
-def _measured(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> tuple[Array, ...]:
-    """Amplitude, foundation force, power and push between loads of one motion."""
+def _measured(
+    model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
+) -> tuple[Array, ...]:
+    """Amplitude, foundation force, power and push between loads of one motion.
+
+    The power is the sum of what drag, friction and the carrier dissipate; n times the mean torque is the same, but loses its
+    digits for strong drag, whose torque is that of a small difference n - phi'.
+    """
     phi, rate = grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T)
-    acceleration = synthesized(harmonics.acceleration, grid.synthesis)
-    drive = jnp.mean(jnp.sum(model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque), axis=0))
+    torque = model.torque(phi, rate, motion.rotor_speed, acceleration, model.rotor_torque)
+    power = jnp.sum(torque * (motion.rotor_speed - rate)) / grid.theta.size
+    velocity = motion.omega * (harmonics.displacement * grid.orders[None])
+    power = power + model.linear.dissipated(velocity)
     nd = harmonics.displacement.shape[0]
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
     push = _least_push(model, grid, motion, harmonics)
-    return (swings[:nd], force, motion.rotor_speed * drive, push)
+    return (swings[:nd], force, power, push)
 
 
 def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:

@@ -19,6 +19,9 @@ Mode = TypeVar("Mode")
 _STEP = 1e-7
 """Relative step of the slopes of a shooting, which need not be exact."""
 
+_IMPLICIT = 1e-9
+"""Relative tolerance of runs by Radau's method of order 5, whose steps grow too many below."""
+
 _MOST_CHANGES = 20_000
 
 
@@ -31,11 +34,19 @@ class Outcome(NamedTuple):
 
 
 def run_out(p: Plain, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Outcome:
-    """The motion from the state `y` at 0; where the drive jumps a step ends."""
+    """The motion from the state `y` at 0; where the drive jumps a step ends.
+
+    Scenes without effects at constant speed whose loads or carrier decay much faster than anything moves are integrated by
+    SciPy's implicit Radau method, to `_IMPLICIT` at best; the explicit method would need a step per decay.
+    """
     kinks = [float(t) for t in getattr(p.drive, "jump_ts", lambda: ())() if 0.0 < float(t) < until]
     nd, begun, largest = p.mass.shape[0], 0.0, np.zeros(2)
     for end in (*kinks, until):
-        found = solve_ivp(p.field, (begun, end), y, method="DOP853", rtol=rtol, atol=1e-2 * rtol * natural_sizes(p))
+        if is_stiff(p):
+            rtol, how = max(rtol, _IMPLICIT), {"method": "Radau", "jac": p.slopes}
+        else:
+            how = {"method": "DOP853"}
+        found = solve_ivp(p.field, (begun, end), y, rtol=rtol, atol=1e-2 * rtol * natural_sizes(p), **how)
         if not found.success:
             raise ArithmeticError(found.message)
         late = np.abs(found.y[: 2 * nd, found.t >= 0.8 * until])
@@ -43,6 +54,17 @@ def run_out(p: Plain, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Ou
             largest = np.maximum(largest, [np.max(late[:nd]), np.max(late[nd:])])
         y, begun = found.y[:, -1], end
     return Outcome(y, *map(float, largest))
+
+
+def is_stiff(p: Plain) -> bool:
+    """True if drag or damping acts 1000 times as fast as the rotor turns and the carrier vibrates, and `Plain.slopes` holds."""
+    if p.effects or getattr(p.drive, "kind", "") != "constant_speed":
+        return False
+    n = p.m.size
+    matrix, _ = p.forces(0.0, np.zeros(2 * (p.mass.shape[0] + n)))
+    decay = np.concatenate([np.diag(p.damping), p.drag * p.radius**2]) / np.diag(matrix)
+    motion = max(figure(p.drive, "speed"), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
+    return float(np.max(decay)) > 1000.0 * motion
 
 
 def natural_sizes(p: Plain) -> np.ndarray:

@@ -183,6 +183,18 @@ def test_the_moment_that_is_left_is_told_relative_to_the_radius_of_gyration():
     np.testing.assert_allclose(found.unbalance, 2e-5 / (4 * 0.05 * 0.08 * np.sqrt(0.479 / 37.0)), rtol=1e-9)
 
 
+def test_summary_names_an_imbalance_beyond_the_loads():
+    """Four pendulums of 0.05 kg at 0.08 m: 0.016 kg m of unbalance, opposite each other or all at one angle."""
+    opposite, together = [0.0, np.pi, np.pi, 0.0], [0.0] * 4
+    found = jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(4.8e3),))).summary()
+    assert "the rotor's imbalance is more than the loads can balance: 3e+05 times their unbalance is left" in found
+    assert (
+        "50 % of the loads' unbalance is left"
+        in jv.regime(*made(opposite, 460.0, effects=(jv.StaticImbalance(8e-3),))).summary()
+    )
+    assert "; 100 % of the loads' unbalance is left" in jv.regime(*made(together, 460.0)).summary()
+
+
 def test_a_jam_close_to_the_rotors_speed_is_a_jam():
     """An exact one, whose slip of 0.29 % balances drag and vibration."""
     loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=2.8)

@@ -99,6 +99,22 @@ def test_power_is_what_the_dampers_take_at_the_loads_speed(effects):
     np.testing.assert_allclose(power(mode=3)(s), 120.0 * taken / omega, rtol=1e-8)
 
 
+@pytest.mark.parametrize("drag", [1e6, 1e9, 1e12, 1e15])
+def test_power_keeps_its_digits_for_any_drag(drag):
+    """Loads that nearly turn with the rotor: n^2 c |y|^2 / 2 of the damper under an unbalance at speed n."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0)
+    s = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=drag), jv.ConstantSpeed(60.0))
+    moved = 0.05 * 60.0**2 / abs(4e4 - 50.5 * 60.0**2 + 100j * 60.0)
+    right = 100.0 * (60.0 * moved) ** 2 / 2.0
+    np.testing.assert_allclose(power(mode=3)(s), right, rtol=1.0 / drag + 1e-12)
+    # The torque of the moving mass shakes the load's speed, by its share in inertia per drag.
+    np.testing.assert_allclose(power(mode=3, tier="exact")(s), right, rtol=30.0 / drag + 1e-12)
+    slope = jax.grad(lambda x: power(mode=3, tier="exact")(eqx.tree_at(lambda s: s.machine.stiffness, s, x)).sum())
+    if drag > 1e8:
+        amount = 4.0 * (50.5 * 60.0**2 - 4e4) / abs(4e4 - 50.5 * 60.0**2 + 100j * 60.0) ** 2 / 2.0
+        np.testing.assert_allclose(slope(s.machine.stiffness), [right * amount], rtol=1e-6)
+
+
 def test_tiers_agree_with_the_functions_they_stand_for():
     orbit = jv.jam_orbit(SCENE, mode=3)
     np.testing.assert_allclose(amplitude(mode=3, of=2, tier="exact")(SCENE), orbit.amplitude[1], rtol=1e-12)
