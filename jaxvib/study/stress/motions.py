@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -40,12 +40,11 @@ def run_out(p: Plain, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Ou
     SciPy's implicit Radau method, to `_IMPLICIT` at best; the explicit method would need a step per decay.
     """
     kinks = [float(t) for t in getattr(p.drive, "jump_ts", lambda: ())() if 0.0 < float(t) < until]
+    how: dict[str, Any] = {"method": "DOP853"}
+    if is_stiff(p):
+        how, rtol = {"method": "Radau", "jac": p.slopes}, max(rtol, _IMPLICIT)
     nd, begun, largest = p.mass.shape[0], 0.0, np.zeros(2)
     for end in (*kinks, until):
-        if is_stiff(p):
-            rtol, how = max(rtol, _IMPLICIT), {"method": "Radau", "jac": p.slopes}
-        else:
-            how = {"method": "DOP853"}
         found = solve_ivp(p.field, (begun, end), y, rtol=rtol, atol=1e-2 * rtol * natural_sizes(p), **how)
         if not found.success:
             raise ArithmeticError(found.message)
