@@ -12,7 +12,17 @@ from scipy.integrate import solve_ivp
 
 from jaxvib.study.stress.plain import Plain, figure, root
 
-__all__ = ["Event", "Outcome", "by_events", "multipliers", "natural_sizes", "orbit_rotor_speed", "orbit_speed", "run_out"]
+__all__ = [
+    "Event",
+    "Outcome",
+    "by_events",
+    "is_stiff",
+    "multipliers",
+    "natural_sizes",
+    "orbit_rotor_speed",
+    "orbit_speed",
+    "run_out",
+]
 
 Mode = TypeVar("Mode")
 

@@ -15,6 +15,8 @@ from jaxvib.study.stress import run as catalogue
 from jaxvib.study.stress import sizes
 from jaxvib.study.stress.asked import end_of_run, final_state, state_of
 from jaxvib.study.stress.case import Answer, Case, Reference, judged
+from jaxvib.study.stress.motions import is_stiff, run_out
+from jaxvib.study.stress.plain import plain
 from jaxvib.study.stress.result import stress_of
 from jaxvib.study.stress.run import CATALOGUE, outcome
 
@@ -146,3 +148,15 @@ def test_the_other_precision_is_asked_in_a_process_of_its_own():
         jv.stress(["nonsense"])
     with pytest.raises(jv.InputError, match="must be 'float64' or 'float32'"):
         jv.stress(precisions=["float16"])
+
+
+def test_references_with_strong_drag_are_integrated_implicitly():
+    """A load that drag holds to the rotor is an unbalance at its speed; the oscillation at first has decayed by exp(-20)."""
+    machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=1000.0)
+    scene = jv.Scene(machine, jv.balls(count=1, mass=0.5, radius=0.1, drag=1e6), jv.ConstantSpeed(60.0))
+    p = plain(scene)
+    assert is_stiff(p)
+    found = run_out(p, np.array([0.0, 0.0, 0.0, 60.0]), 2.0)
+    moved = 0.05 * 60.0**2 / abs(4e4 - 50.5 * 60.0**2 + 1000j * 60.0)
+    np.testing.assert_allclose(found.displacement, moved, rtol=1e-4)
+    np.testing.assert_allclose(found.state[3], 60.0, rtol=1e-6)
