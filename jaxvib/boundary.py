@@ -43,6 +43,7 @@ _EXAMPLES = {
     "Quantity": "for example foundation_force(mode=3)",
     "DesignSpace": "for example DesignSpace(scene, free={'machine.stiffness': (1e4, 1e5)})",
     "BearingPendulum": "for example BearingPendulum(mass=2.0, length=0.3)",
+    "Demand": "for example amplitude(mode=3) > '2 mm'",
     "Record": "for example read_record('swing.csv')",
     "Axes": "of matplotlib",
     "Figure": "of matplotlib",

@@ -111,6 +111,7 @@ def test_figures_of_a_report_are_checked_before_it_is_written(tmp_path):
         with pytest.raises(jv.InputError, match=r"^figures\[0\]"):
             jv.html_report(modes, tmp_path / "page.html", figures=figures)
     assert not list(tmp_path.iterdir())
+    assert "a?b" in jv.html_report(modes, tmp_path / "page.html", title="a\ud800b", figures=()).read_text()
 
 
 def test_users_functions_that_cannot_be_called_are_named():

@@ -231,7 +231,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("threshold_curve", make=lambda x: torus_scene(), values=[1.0], speeds=[-0.5], **torus, equations=jv.vector_field)
     # Pictures, results
     yield call("sketch", scene=s, ax=None)
-    film = dict(scene=None, begin=None, end=None, seconds=0.1, fps=5, magnify=None, width=2.0)
+    film = dict(scene=None, begin=1.9, end=1.94, seconds=0.1, fps=5, magnify=None, width=2.0)
     yield call("animate", motion=later(run), path=None, **film)
     modes = later(lambda: jv.jam_modes(scene()))
     yield call("load", path=later(lambda: jv.jam_modes(scene()).save(FOLDER / "modes")))

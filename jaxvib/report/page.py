@@ -100,7 +100,7 @@ def html_report(
     drawn = [(kind, result.plot())] if figures is None else figures
     page = Report(title or kind, result.as_dict(), units_of(result), "", result.summary(), scene, drawn)
     with written(path) as part:
-        part.write_text(page.html(), encoding="utf-8")
+        part.write_text(page.html(), encoding="utf-8", errors="replace")
     return path
 
 

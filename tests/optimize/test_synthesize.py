@@ -111,8 +111,8 @@ def test_wrong_questions_are_said_in_one_sentence():
     running = DesignSpace(jv.Scene(SCENE.machine, SCENE.loads, jv.RunUp(120.0, acceleration=5.0)), {"loads.drag": (1.0, 2.0)})
     for space, subject_to, begin, says in (
         (3.0, [], None, "must be a DesignSpace"),
-        (SPACE, [3.0], None, "write demands such as"),
-        (SPACE, [], 3.0, "must be the Synthesis of an earlier search"),
+        (SPACE, [3.0], None, "must be a Demand, for example"),
+        (SPACE, [], 3.0, "must be a Synthesis"),
         (running, [], None, "give a ConstantSpeed"),
     ):
         with pytest.raises(jv.InputError, match=says):
