@@ -383,5 +383,5 @@ def test_relative_amplitudes_count_coordinates_from_one():
     orbit = SimpleNamespace(orders=(1,), displacement_harmonics=jnp.array([[2.0 + 0.0j], [-5.0 + 0.0j]]))
     np.testing.assert_allclose(Orbit.relative_amplitude(orbit, 1, 2), 7.0, rtol=1e-9)
     for i, j in ((0, 1), (1, 0), (-1, 1), (3, 1), (1, 3), (True, 2)):
-        with pytest.raises(jv.InputError, match=r"whole number, at least 1|numbered 1 to 2"):
+        with pytest.raises(jv.InputError, match=r"whole number|numbered 1 to 2"):
             Orbit.relative_amplitude(orbit, i, j)
