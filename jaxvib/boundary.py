@@ -22,7 +22,6 @@ import jax
 import jax.typing as jax_typing
 import numpy as np
 import numpy.typing as np_typing
-from jax.core import Tracer
 
 from jaxvib.errors import InputError, quoted
 
@@ -281,7 +280,11 @@ def _words(name: str) -> str:
 
 
 def _is_traced(value: Any) -> bool:
-    return isinstance(value, Tracer)
+    """Return True for a value that JAX is tracing, by public means: `runtime` lies above this module."""
+    try:
+        return isinstance(value, jax.Array) and not value.devices()
+    except jax.errors.ConcretizationTypeError:
+        return True
 
 
 def _has_array(kind: Any) -> bool:

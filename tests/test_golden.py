@@ -3,11 +3,11 @@
 import subprocess
 import sys
 
-import golden
 import jax
 import jax.numpy as jnp
 import pytest
-from golden import QUESTIONS, digest, program, recorded, scenes
+from programs import golden
+from programs.golden import QUESTIONS, digest, program, recorded, scenes
 
 import jaxvib as jv
 

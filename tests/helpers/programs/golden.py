@@ -1,8 +1,8 @@
 """Golden programs: a digest of the program that each question traces to, for scenes with every part.
 
-    python tests/helpers/golden.py            # print what differs from the recorded programs
-    python tests/helpers/golden.py --write    # record the programs of today, and print what changed
-    python tests/helpers/golden.py --show "two masses" energy    # print one program, for a diff between two revisions
+    python tests/helpers/programs/golden.py            # print what differs from the recorded programs
+    python tests/helpers/programs/golden.py --write    # record the programs of today, and print what changed
+    python tests/helpers/programs/golden.py --show "two masses" energy    # print one program, for a diff between two revisions
 
 A digest covers the order of the operations, their parameters and literals, the operands of each, and the shapes and types of
 the results. It is the same in every process for one version of JAX. Names, source lines and Python functions are left out.
@@ -28,10 +28,10 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.equations.averaged import amplitudes_of, averaged_field
 
-sys.path.insert(0, str(pathlib.Path(__file__).parent))
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1]))
 from scenes import BALLS, ROTOR, TWO_MASS, loads, machines, published
 
-RECORDED = pathlib.Path(__file__).parents[1] / "data" / "golden.json"
+RECORDED = pathlib.Path(__file__).parents[2] / "data" / "golden.json"
 
 LEFT_OUT = ("name", "debug_info", "source_info")
 """Parameters of operations that do not belong to the program."""
