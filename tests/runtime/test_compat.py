@@ -249,7 +249,8 @@ def test_members_of_enumerations_have_names():
     """equinox.Enumeration: _enumeration of a member, _name_to_item of the class; and the fallbacks where they are gone."""
     status = jv.RunStatus.where(jnp.asarray(True), jv.RunStatus.no_step, jv.RunStatus.done)
     assert status._enumeration is jv.RunStatus and compat.enumeration_of(status) is jv.RunStatus
-    names = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start", "beating", "would_separate")
+    names = ("done", "max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start", "beating", "creeping")
+    names += ("would_separate", "refused")
     assert tuple(jv.RunStatus._name_to_item) == names and compat.enumeration_names(jv.RunStatus) == names
 
     class Bare:
