@@ -257,6 +257,8 @@ def _problem(value: Any, kind: Any) -> str | InputError | None:
         return None if whole or _is_traced(value) else "a whole number"
     if kind is float:
         return _problem_of_float(value)
+    if kind is complex and (isinstance(value, complex) or getattr(getattr(value, "dtype", None), "kind", "") == "c"):
+        return None
     if kind is complex or _is_array(kind):
         return _problem_of_array(value)
     if kind is str:

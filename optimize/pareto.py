@@ -94,7 +94,7 @@ def pareto(
     second: Quantity,
     *,
     points: int = 9,
-    subject_to: Sequence[Demand] = (),
+    subject_to: Demand | Sequence[Demand] = (),
     starts: int = 32,
     seed: int = 0,
 ) -> Front:

@@ -53,7 +53,7 @@ def synthesize(
     space: DesignSpace,
     objective: Quantity,
     *,
-    subject_to: Sequence[Demand] = (),
+    subject_to: Demand | Sequence[Demand] = (),
     starts: int = 256,
     seed: int = 0,
     iterations: int = 100,
@@ -180,7 +180,7 @@ def _options(starts: int, seed: int, iterations: int, polishing: int, rate: floa
     return Options(starts, seed, iterations, float(rate), polishing, searcher)
 
 
-def _checked(space: DesignSpace, objective: Quantity, subject_to: Sequence[Demand]) -> tuple[Demand, ...]:
+def _checked(space: DesignSpace, objective: Quantity, subject_to: Demand | Sequence[Demand]) -> tuple[Demand, ...]:
     if not isinstance(space, DesignSpace):
         raise InputError("space", f"is {quoted(space)}; it must be a DesignSpace")
     require_quantity(objective, "objective")

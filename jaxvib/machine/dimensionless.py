@@ -162,12 +162,12 @@ class Dimensionless(eqx.Module):
 
     @validated
     def read(
-        self, *, omega: Array | None = None, amplitude: Array | None = None, force: Array | None = None
+        self, *, omega: Array | None = None, amplitude: Array | complex | None = None, force: Array | None = None
     ) -> dict[str, Array]:
         """Results in SI as the paper's numbers; any of them may be given.
 
-        **Arguments**: `omega` rad/s, any shape; `amplitude` m, last axis over the platforms; `force` N, any shape. NaN in an
-        array, of modes that do not exist, stays NaN.
+        **Arguments**: `omega` rad/s, any shape; `amplitude` m, real or complex, last axis over the platforms; `force` N, any
+        shape. NaN in an array, of modes that do not exist, stays NaN.
 
         **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
         """
