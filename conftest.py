@@ -120,7 +120,7 @@ class _Patch(pytest.MonkeyPatch):
 
 @pytest.fixture
 def unwatched():
-    """What a test replaces in the package keeps no program from being stored: it is about storing, not about physics."""
+    """Store programs although the test replaces a part of the package: the test is about storing, not about physics."""
     with unittest.mock.patch.object(imported._code, "differences", list):
         yield
 

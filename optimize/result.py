@@ -99,7 +99,7 @@ class Limit(NamedTuple):
     gain: float
 
     def shortfall(self) -> str:
-        """How far the machine is from keeping a broken limit, in words."""
+        """Distance of the machine from keeping a broken limit, in words."""
         if not math.isfinite(self.broken):
             return "the nearest machine found has no such value"
         unit, factor = shown_unit(self.unit, max(abs(self.value), abs(self.limit)))

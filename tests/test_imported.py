@@ -242,7 +242,7 @@ def peak_force(*args):
 """
 
 
-def test_an_edit_before_the_first_question_reaches_the_next_process(tmp_path):
+def test_an_early_edit_reaches_the_next_process(tmp_path):
     """The first process computes with the code that it imported, which is no longer that of the sources."""
     for package in ("jaxvib", "optimize"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))

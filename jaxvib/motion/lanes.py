@@ -59,7 +59,7 @@ def advance(
 def stretches(
     motion: PackedSystem, held: Held, length: Array, step: Array, number: int, *, implicit: bool
 ) -> tuple[Held, Array, Array]:
-    """Where so many stretches of the same `length` begin, s, how long each is, and the state of the integrator at the first.
+    """Beginnings of stretches of the same `length`, s, the length of each, and the integrator's state at the first.
 
     Implicit steps do not resolve how loads are dragged along at the start: the first one is taken in steps that double.
     """

@@ -180,7 +180,7 @@ def _slowest_decay(scene: Scene) -> float:
 
 
 def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -> float:
-    """How far a motion is from its end, relative, estimated from the drifts of its stretches so far.
+    """Relative distance of a motion from its steady state, estimated from the drifts of its stretches so far.
 
     A distance that decays at the rate a falls by 1 - exp(-a T) of itself from one half of the measuring window to the other,
     T apart: that fall is the drift. Free vibrations that beat with the jam make some drifts small by chance, so the largest of

@@ -85,7 +85,7 @@ def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.
 
 
 def advice(scene: Scene) -> str:
-    """What makes steps of a run short, as the end of a sentence; empty if decay is no faster than the motion."""
+    """The cause of short steps of a run, as the end of a sentence; empty if decay is no faster than the motion."""
     decay, motion = float(fastest_decay(scene)), float(fastest_and_slowest(scene)[0])
     if not decay > 10.0 * motion:
         return ""

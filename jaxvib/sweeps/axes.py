@@ -265,7 +265,7 @@ def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
 
 
 SAMPLINGS = ("low_discrepancy", "random")
-"""How samples are drawn: spread evenly by a sequence of low discrepancy, or independent of each other."""
+"""Methods of sampling: a sequence of low discrepancy, or samples independent of each other."""
 
 
 def samples(first: int, last: int, size: int, seed: int, sampling: str) -> np.ndarray:

@@ -74,13 +74,14 @@ _FACTORS = {
     "kg m^2": {"kg m^2": 1.0, "kg cm^2": 1e-4},
     "rad/s": {"rad/s": 1.0, "rpm": math.pi / 30.0, "Hz": 2.0 * math.pi},
 }
-"""What most drawings are written in. pint reads everything else, and takes half a second to get ready for it."""
+"""Units of most drawings. pint reads all others, and takes half a second to import."""
 
 _UNREADABLE = (AttributeError, TypeError, ValueError, ArithmeticError, AssertionError, SyntaxError, tokenize.TokenError)
-"""What pint, which reads a unit as Python, raises beside its own errors for a text that is none."""
+"""Errors of pint, which reads a unit as Python, beside its own ones, for a text that is no unit."""
 
 
 def unit_name(unit: str) -> str:
+    """Name of a unit for messages: "no unit" for a plain number."""
     return unit or "no unit"
 
 

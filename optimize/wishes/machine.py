@@ -189,7 +189,7 @@ def _carried(machine: Platforms) -> Array:
 
 @validated
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
-    """What the springs of supports and links cost, from a price list.
+    """Cost of the springs of supports and links, from a price list.
 
     Prices between two entries are interpolated. Beyond an end of the list they go on as between its last two entries there,
     but never below the price at that end. A spring of stiffness 0 costs nothing.

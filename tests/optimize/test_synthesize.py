@@ -154,7 +154,7 @@ def test_a_run_that_left_its_mode_is_no_verification(monkeypatch):
     assert _run(scene("two_mass", speed=120.0), 3, True) == (None, "the motion left mode 3 and settled at 50 rad/s")
 
 
-def test_scenes_without_an_exact_motion_are_integrated_from_the_jam(monkeypatch):
+def test_verification_without_exact_motion_starts_in_the_jam(monkeypatch):
     def refused(scene, **how):
         raise jv.InputError("effects", "has what no theory includes")
 

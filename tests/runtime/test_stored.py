@@ -169,7 +169,7 @@ def test_a_stored_program_holds_no_trace(folder):
 
 
 @pytest.mark.slow
-def test_two_hundred_scene_structures_stay_below_a_gigabyte_and_a_half(tmp_path):
+def test_memory_of_two_hundred_structures_is_bounded(tmp_path):
     """Jam modes with 1 to 200 balls; held all, their programs take 2.7 GB."""
     code = """
 import resource, sys

@@ -28,7 +28,7 @@ TOLERANCE = 1e-9
 
 
 class Unknowns(NamedTuple):
-    """What a fit finds: `angle` rad and `rate` rad/s at the first sample, counted from hanging; `offset` rad of the record's
+    """Parameters of a fit: `angle` rad and `rate` rad/s at the first sample, counted from hanging; `offset` rad of the record's
     zero; `frequency` rad/s of small swings; `viscous` mu1 N m s; `dry` mu2 or None."""
 
     angle: Array
@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
 
 def first_guess(pendulum: BearingPendulum, record: Record, turns: TurningPoints, dry: bool) -> tuple[Unknowns, Array]:
-    """Where a fit begins, from the turning points, and the width that dry friction is smoothed with.
+    """Initial parameters of a fit, from the turning points, and the width that dry friction is smoothed with.
 
     A swing loses pi mu1/(2 J w) of its amplitude in half a period to viscous friction and 2 T_f/(m g l) to dry friction.
     """

@@ -160,7 +160,7 @@ class TorusTables(Result):
         return self._nearer(self.moved) <= TABLE_TOLERANCE
 
     def _nearer(self, values: np.ndarray) -> np.ndarray:
-        """Those of `values` (M, P, 2) that belong to the border nearer to the paper's speed."""
+        """Entries of `values` (M, P, 2) for the border that is nearer to the paper's speed."""
         far = np.abs(np.stack([self.least, self.threshold], axis=-1) - self.paper[:, None])
         which = np.argmin(np.where(np.isnan(far), np.inf, far), axis=-1)
         return np.take_along_axis(values, which[..., None], axis=-1)[..., 0]

@@ -219,7 +219,7 @@ def test_a_motor_is_caught_below_a_resonance_and_its_speed(rotor, caught):
 
 
 @pytest.mark.parametrize(("tilts", "label"), [(1.0, "balanced"), (0.0, "unbalanced"), (-1.0, "unbalanced")])
-def test_loads_beside_the_mass_centre_balance_a_tilted_rotor_only(tilts, label):
+def test_loads_off_the_mass_centre_balance_tilted_rotors(tilts, label):
     """Loads 0.05 m from an imbalance U tilt the rotor, unless its principal axis leans by 0.05 U: the carrier then rests."""
     unbalance, place = 4.0 * 0.05 * 0.08 * 0.5, 0.05
     effects = (jv.StaticImbalance(unbalance, np.pi), jv.MomentImbalance(tilts * place * unbalance, np.pi))

@@ -247,7 +247,7 @@ def test_multipliers_of_unknown_scenes_hold_for_much_drag():
         np.testing.assert_allclose(value(drag), jv.jam_orbit(stiff(drag), omega=45.0).multiplier, rtol=1e-9)
 
 
-def test_derivatives_of_stiff_multipliers_are_those_of_differences():
+def test_stiff_multipliers_have_derivatives_of_differences():
     f = stored_jit(lambda drag: jv.jam_orbit(stiff(drag), omega=45.0).multiplier)
     reverse, h = jax.grad(f)(1000.0), 0.1
     np.testing.assert_allclose(reverse, (f(1000.0 + h) - f(1000.0 - h)) / (2.0 * h), rtol=1e-5)
