@@ -11,10 +11,10 @@ A mutant is the package with one change in one line:
 
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
-Each is given to the tests that reach its line, those of its own name first, then of its folder, then the shortest, up to
-`--seconds` of them by their usual time; the first test that fails ends it. The lines that a test file reaches are measured once
-for an `--out`, in a process of its own (`coverage`) that traces every program anew; with `--folder` only the test files of
-these folders are measured, unless `--all-tests` is given. Take a new `--out` for changed packages.
+Each is given to the tests that reach its line, those of the file of its own name first, then of its folder, then the shortest,
+up to `--seconds` of them by their usual time; the first test that fails ends it. The lines that each test reaches are measured
+once for an `--out`, a process for each test file (`coverage`), which traces every program anew; with `--folder` only the test
+files of these folders are measured, unless `--all-tests` is given. Take a new `--out` for changed packages.
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
 Survivors are printed with their changes, to be explained or killed by a new test. All results are kept in `--out`, so that a
@@ -40,8 +40,13 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 
+from coverage import Coverage, CoverageData
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PACKAGES = ("jaxvib", "optimize")
+
+PYTEST = ("-m", "pytest", "-p", "no:cacheprovider", "-p", "mutants")
+"""The arguments of Python that run tests with this module as a plugin."""
 
 OPERATORS: dict[type, type] = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.MatMult: ast.Mult}
 COMPARISONS: dict[type, type] = {
@@ -85,7 +90,7 @@ class Mutant:
     @property
     def folder(self) -> str:
         """The package's folder that the file is in, or the package itself."""
-        return "/".join(pathlib.Path(self.file).parent.parts[:2])
+        return folder_of(self.file)
 
     def rank(self, seed: int) -> str:
         """A random text that follows from the seed and the change, but not from its place in the file."""
@@ -222,15 +227,24 @@ def sources() -> list[str]:
 
 def all_folders() -> list[str]:
     """All folders that mutants are counted by, see `Mutant.folder`."""
-    return sorted({"/".join(pathlib.Path(file).parent.parts[:2]) for file in sources()})
+    return sorted({folder_of(file) for file in sources()})
+
+
+def folder_of(file: str) -> str:
+    """The folder that a file's mutants are counted in."""
+    return "/".join(pathlib.Path(file).parent.parts[:2])
 
 
 # --- tests and the lines that they reach ---
 
 
 def test_files(folders: Sequence[str], everything: bool) -> list[str]:
-    """The test files of folders: those in the test folder of the same name, or whose own name begins with it; or all."""
+    """The test files of folders and their own files with examples; or all.
+
+    Test files of a folder lie in the test folder of the same name, or their own name begins with the folder's.
+    """
     files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("test_*.py"))
+    examples = [file for file in sources() if ">>>" in (ROOT / file).read_text()]
     names = {folder.split("/")[0 if folder.startswith("optimize") else -1] for folder in folders}
     top = [path.stem for package in PACKAGES if package in folders for path in (ROOT / package).glob("*.py")]
 
@@ -238,80 +252,150 @@ def test_files(folders: Sequence[str], everything: bool) -> list[str]:
         folder, stem = file.split("/")[1], pathlib.Path(file).stem.removeprefix("test_")
         return folder in names or stem in names or stem in top
 
-    return [file for file in files if everything or own(file)]
+    own_examples = [file for file in examples if everything or folder_of(file) in folders]
+    return [file for file in files if everything or own(file)] + own_examples
 
 
 def reach(out: pathlib.Path, workers: int, tests: Sequence[str]) -> dict[str, dict]:
-    """For each test file its seconds and the lines it reaches in each file of the packages."""
-    kept = out / "reach.json"
-    known = json.loads(kept.read_text()) if kept.exists() else {}
+    """For each test file the seconds of each test, and the tests that reach each line of the packages.
+
+    Tests are numbered; no number means that the line runs at import, for all of them.
+    """
+    folder = out / "reach"
+    folder.mkdir(exist_ok=True)
+
+    def kept(test: str) -> pathlib.Path:
+        return folder / f"{test.replace('/', '-')}.json"
 
     def one(test: str) -> None:
-        data = out / f"{test.replace('/', '-')}.coverage"
-        report, home = data.with_suffix(".json"), data.with_suffix(".cache")
-        # An empty cache: a program that is read from the disk executes none of the lines that it was traced from.
-        environment = {**os.environ, "COVERAGE_FILE": str(data), "XDG_CACHE_HOME": str(home)}
-        coverage = [sys.executable, "-m", "coverage"]
-        command = [*coverage, "run", f"--source={','.join(PACKAGES)}", "-m", "pytest", "-p", "no:cacheprovider", test]
+        data, home = kept(test).with_suffix(".coverage"), kept(test).with_suffix(".cache")
+        # No traced program is read from the disk: it executes none of the lines that it was traced from.
+        environment = {
+            **os.environ,
+            "COVERAGE_FILE": str(data),
+            "XDG_CACHE_HOME": str(home),
+            **_plugin(ROOT, seconds=kept(test)),
+        }
+        coverage = [sys.executable, "-m", "coverage", "run", f"--source={','.join(PACKAGES)}"]
         began = time.perf_counter()
-        result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        seconds = time.perf_counter() - began
+        result = subprocess.run([*coverage, *PYTEST, test], cwd=ROOT, env=environment, capture_output=True, text=True)
+        taken = time.perf_counter() - began
         shutil.rmtree(home, ignore_errors=True)
         if result.returncode not in (0, 5):  # 5: all of its tests are slow ones
             print(f"left out, as it fails without a change: {test}\n{result.stdout[-1000:]}", flush=True)
             return
-        command = [*coverage, "json", "-q", "-o", str(report)]
-        subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
-        files = json.loads(report.read_text())["files"]
-        lines = {file: sorted(entry["executed_lines"]) for file, entry in files.items()}
-        known[test] = {"seconds": seconds, "lines": {file: found for file, found in lines.items() if found}}
-        kept.write_text(json.dumps(known))
+        seconds = json.loads(kept(test).read_text()) if kept(test).exists() else {}
+        numbers = {name: k for k, name in enumerate(seconds)}
+        found, lines = CoverageData(str(data)), {}
+        found.read()
+        for file in found.measured_files():
+            at = {line: [numbers[name] for name in names if name] for line, names in found.contexts_by_lineno(file).items()}
+            lines[str(pathlib.Path(file).relative_to(ROOT))] = at
+        kept(test).write_text(json.dumps({"tests": seconds, "lines": lines}))
         data.unlink()
-        report.unlink()
-        print(f"{len(known):3} known, {seconds:6.1f} s {test}", flush=True)
+        print(f"{taken:6.1f} s, {len(seconds):4} tests: {test}", flush=True)
 
     with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, [test for test in tests if test not in known]))
-    return known
+        list(pool.map(one, [test for test in tests if not kept(test).exists()]))
+    return {test: json.loads(kept(test).read_text()) for test in tests if kept(test).exists()}
 
 
 def tests_of(mutant: Mutant, known: dict[str, dict], seconds: float) -> tuple[list[str], float]:
-    """The tests to run and their usual time: the file's own first, then its folder's, then the shortest, up to `seconds`."""
+    """The tests to run and their usual time: of the file's own name first, then of its folder, then the shortest.
+
+    The tests that reach the line come before the others of their files, which may use a program that the first ones traced.
+    """
     place = pathlib.Path(mutant.file.removeprefix("jaxvib/"))
-    folder = place.parent
 
-    def order(test: str) -> tuple[bool, int, float]:
-        own = pathlib.Path(test).parent.relative_to("tests")
-        common = [one == other for one, other in zip(folder.parts, own.parts, strict=False)]
-        return pathlib.Path(test).stem != f"test_{place.stem}", -sum(common), known[test]["seconds"]
+    def order(file: str) -> tuple[bool, int, float]:
+        own = pathlib.Path(file).parent.parts[1:]
+        common = [one == other for one, other in zip(place.parent.parts, own, strict=False)]
+        return (
+            pathlib.Path(file).stem not in (f"test_{place.stem}", place.stem),
+            -sum(common),
+            sum(known[file]["tests"].values()),
+        )
 
-    reaching = sorted((test for test, entry in known.items() if mutant.line in entry["lines"].get(mutant.file, ())), key=order)
-    taken, usual = [], 0.0
-    for test in reaching:
-        if not taken or usual + known[test]["seconds"] <= seconds:
-            taken.append(test)
-            usual += known[test]["seconds"]
-    if ">>>" in (ROOT / mutant.file).read_text():
-        taken.insert(0, mutant.file)
-    return taken, usual
+    ordered, others = [], []
+    for file in sorted((file for file in known if reaches(known[file], mutant)), key=order):
+        numbers = known[file]["lines"][mutant.file][str(mutant.line)]
+        names = list(known[file]["tests"])
+        own = [names[k] for k in numbers] or names
+        ordered += sorted(own, key=known[file]["tests"].__getitem__)
+        others += sorted(set(names) - set(own), key=known[file]["tests"].__getitem__)
+    usual = {name: lasts for entry in known.values() for name, lasts in entry["tests"].items()}
+    taken, total = [], 0.0
+    for name in ordered + others:
+        if not taken or total + usual[name] <= seconds:
+            taken.append(name)
+            total += usual[name]
+    return taken, total
 
+
+def reaches(entry: dict, mutant: Mutant) -> bool:
+    """True if a test of the file reaches the mutant's line."""
+    return bool(entry["tests"]) and str(mutant.line) in entry["lines"].get(mutant.file, ())
+
+
+# --- this module as a plugin of pytest ---
+
+
+def _plugin(root: pathlib.Path, **settings: object) -> dict[str, str]:
+    return {"PYTHONPATH": f"{root}:{root / 'benchmarks' / 'trials'}", "MUTANTS": json.dumps(settings, default=str)}
+
+
+def _setting(name: str):
+    return json.loads(os.environ.get("MUTANTS", "{}")).get(name)
+
+
+def pytest_collection_modifyitems(items: list) -> None:
+    """Keep the chosen tests in their order."""
+    if (chosen := _setting("tests")) is not None:
+        by_name = {item.nodeid: item for item in items}
+        items[:] = [by_name[name] for name in chosen if name in by_name]
+
+
+def pytest_runtest_logstart(nodeid: str) -> None:
+    """Have coverage note which test runs a line."""
+    if _setting("seconds") is not None and (running := Coverage.current()) is not None:
+        running.switch_context(nodeid)
+
+
+def pytest_runtest_logreport(report) -> None:
+    """Add the time of a test's setup, call or end."""
+    _seconds[report.nodeid] += report.duration
+
+
+def pytest_sessionfinish() -> None:
+    """Write the seconds of each test."""
+    if (file := _setting("seconds")) is not None:
+        pathlib.Path(file).write_text(json.dumps(_seconds))
+
+
+_seconds: collections.Counter = collections.Counter()
 
 # --- fates ---
 
 
-def tried(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds: float) -> dict:
+def fate_of(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds: float) -> dict:
     """The mutant's fate: "killed", "slow" (too slow, killed), "died" (the process did), "survived"."""
     path = copy_of / mutant.file
     whole = path.read_bytes()
     taken, usual = tests_of(mutant, known, seconds)
+    files = list(dict.fromkeys(name.split("::")[0] for name in taken))
     began = time.perf_counter()
     try:
         path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
-        command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *taken]
-        home = str(copy_of.with_suffix(".cache"))  # a mutant's programs are of no use to others
-        environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": str(copy_of), "XDG_CACHE_HOME": home}
+        home = str(copy_of.with_suffix(".cache"))  # a mutant's traced programs are of no use to others
+        environment = {**os.environ, "XDG_CACHE_HOME": home, **_plugin(copy_of, tests=taken)}
         result = subprocess.run(
-            command, cwd=copy_of, env=environment, capture_output=True, text=True, timeout=3 * usual + 60, errors="replace"
+            [sys.executable, *PYTEST, "-x", *files],
+            cwd=copy_of,
+            env={**environment, "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            timeout=3 * usual + 60,
+            errors="replace",
         )
         fate = {0: "survived", 1: "killed", 2: "killed"}.get(result.returncode, "died")
         last = [line for line in result.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
@@ -320,7 +404,7 @@ def tried(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds
         fate, by = "slow", ""
     finally:
         path.write_bytes(whole)
-    return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1), "tests": taken}
+    return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1), "tests": len(taken)}
 
 
 def main() -> None:
@@ -342,7 +426,7 @@ def main() -> None:
     reached = collections.defaultdict(set)
     for entry in known.values():
         for file, lines in entry["lines"].items():
-            reached[file].update(lines)
+            reached[file].update(map(int, lines if entry["tests"] else ()))
     taken, total = drawn(asked.count, asked.seed, reached, asked.folder)
     kept = out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
@@ -357,7 +441,7 @@ def main() -> None:
 
     def one(mutant: Mutant) -> None:
         place = free.popleft()
-        fates[mutant.name] = tried(mutant, place, known, asked.seconds)
+        fates[mutant.name] = fate_of(mutant, place, known, asked.seconds)
         free.append(place)
         kept.write_text(json.dumps(fates, indent=1))
         print(f"{len(fates):4} {fates[mutant.name]['fate']:9} {fates[mutant.name]['seconds']:6.1f} s {mutant.name}", flush=True)
