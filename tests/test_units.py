@@ -150,6 +150,48 @@ def test_a_count_is_a_whole_number_that_an_array_can_have(value):
         count(value, "samples")
 
 
+def test_a_count_ends_where_indices_and_memory_end():
+    assert count(2**31 - 1, "samples") == 2**31 - 1
+    with pytest.raises(jv.InputError, match=r"is 2147483648; it must be a whole number from 1 to 2147483647"):
+        count(2**31, "samples")
+    with pytest.raises(jv.InputError, match=r"needs 1\.86e\+06 GiB, more than half of this machine's memory; \d+ at most fit"):
+        count(2 * 10**9, "samples", each=10**6)
+    with pytest.raises(jv.InputError, match=r"it must be a whole number from 1 to 2147483647"):
+        count(10**20, "samples", each=10**6)
+
+
+def test_an_angle_keeps_digits_within_a_turn():
+    assert number(1e15, "rad", "apart") == 1e15 and number(1e16, "m", "radius") == 1e16
+    with pytest.raises(jv.InputError, match=r"^apart is 1e\+16 rad; it must be below 4\.5e\+15 rad"):
+        number(1e16, "rad", "apart")
+
+
+def test_unknown_and_known_numbers_may_stand_in_one_list():
+    """The known ones are checked, also while a program is built."""
+    listed = jax.jit(lambda x: numbers([x, 2.0], "kg", "mass", 2, low=0.0))(1.0)
+    assert listed.dtype == jnp.float64 and listed.tolist() == [1.0, 2.0]
+    with pytest.raises(jv.InputError, match=r"^mass\[1\] is -1 kg; it must be at least 0"):
+        jax.jit(lambda x: numbers([x, -1.0], "kg", "mass", 2, low=0.0))(1.0)
+    with pytest.raises(jv.InputError, match=r"^mass\[1\] is .* too large; give a number below 1e308"):
+        numbers([jnp.asarray(1.0), 10**400], "kg", "mass", 2)
+
+
+@pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
+def test_an_array_of_numbers_has_one_axis(array):
+    assert (
+        numbers(array([-1.0, 0.0]), "m", "x", 2).tolist() == numbers(array([-1.0, 0.0]), "m", "x", None).tolist() == [-1.0, 0.0]
+    )
+    with pytest.raises(jv.InputError, match=r"^x has shape \(3,\); \(2,\) is needed"):
+        numbers(array([1.0, 2.0, 3.0]), "m", "x", 2)
+    with pytest.raises(jv.InputError, match=r"^x has shape \(2, 2\); a list is needed"):
+        numbers(array([[1.0, 2.0], [3.0, 4.0]]), "m", "x", None)
+
+
+def test_numbers_have_the_precision_of_programs():
+    for given in (3, np.int32(3), np.float32(3.0), jnp.asarray(3), jnp.asarray(3.0, dtype=jnp.float32)):
+        assert number(given, "kg", "mass").dtype == numbers([given], "kg", "mass", 1).dtype == jnp.float64
+
+
 def test_units_compare_as_what_they_count():
     """A frequency in hertz is 2 pi times itself in rad/s; radians have no dimension beside lengths."""
     assert unit_ratio("Hz", "rad/s") == pytest.approx(2.0 * np.pi, rel=1e-15)

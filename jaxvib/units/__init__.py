@@ -100,7 +100,7 @@ def number(value: Number, unit: str, field: str, *, low: float = -math.inf, open
     >>> float(number("2 t", "kg", "machine.mass"))
     2000.0
     """
-    return jnp.asarray(known_number(value, unit, field, low=low, open_low=open_low), dtype=float)
+    return jnp.asarray(known_number(value, unit, field, low=low, open_low=open_low))
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
@@ -164,7 +164,7 @@ def numbers(
 
 
 def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
-    return jnp.asarray(_converted(value, unit, field, shape, low, open_low), dtype=float)
+    return jnp.asarray(_converted(value, unit, field, shape, low, open_low))
 
 
 def _converted(
