@@ -21,7 +21,8 @@ def printed():
     found = {}
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
-        lines = re.findall(r"^\s*(?:\$ )?(jaxvib [^\n]+)$", text, flags=re.M)
+        blocks = re.findall(r"^```.*?^```", text, flags=re.M | re.S) + re.findall(r"^    .+$", text, flags=re.M)
+        lines = [line for block in blocks for line in re.findall(r"^\s*(?:\$ )?(jaxvib [^\n]+)$", block, flags=re.M)]
         spans = [" ".join(span.split()) for span in re.findall(r"`(jaxvib [a-z-]+ [^-`][^`]*)`", text)]
         for line in (*lines, *spans):
             command = re.sub(r"\s+#.*", "", line).strip()
