@@ -33,7 +33,7 @@ def with_turbine():
     return jv.Scene(machines()["two_mass"], jv.balls(count=2, mass=0.4, radius=0.1, drag=1.0), drive)
 
 
-def test_an_effect_with_friction_runs_in_every_tier_that_has_friction():
+def test_plugin_friction_runs_in_every_tier_with_friction():
     scene = with_friction()
     jam, orbit = jv.jam_modes(scene).select(3), jv.jam_orbit(scene, mode=3)
     # The seal turns the load as well: the drag has less to do than the balance without it says.
@@ -69,7 +69,7 @@ def test_the_power_of_an_effect_from_outside_balances_the_energy():
     np.testing.assert_allclose(rate, supplied - lost, rtol=1e-11)
 
 
-def test_loads_with_two_coordinates_held_at_the_equator_are_those_of_the_plane_track():
+def test_two_coordinate_loads_at_the_equator_are_plane_loads():
     scene = on_torus()
     plane = jv.Scene(scene.machine, jv.pendulums(count=2, mass=0.4, radius=0.1, drag=0.9), scene.drive)
     torus, track = (jv.simulate(s, 4.0, save="window", estimate=False) for s in (scene, plane))
@@ -79,7 +79,7 @@ def test_loads_with_two_coordinates_held_at_the_equator_are_those_of_the_plane_t
     assert bool(torus.regime.name == track.regime.name)
 
 
-def test_loads_with_two_coordinates_balance_their_power_and_run_in_ensembles():
+def test_two_coordinate_loads_balance_power_in_ensembles():
     scene = on_torus()
     angle, rate = (jnp.asarray([0.1, 2.0]), jnp.asarray([1.2, 1.9])), (jnp.full(2, 40.0), jnp.zeros(2))
     start = jv.State(jnp.asarray([1e-3, 0.0]), jnp.zeros(2), angle, rate)
@@ -112,7 +112,7 @@ def test_gradients_go_through_loads_with_two_coordinates():
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
-def test_a_motor_from_outside_turns_the_rotor_and_balances_its_power():
+def test_plugin_motor_turns_the_rotor_and_balances_power():
     scene = with_turbine()
     run = jv.simulate(scene, 3.0, save="all", samples=200, estimate=False)
     last = jax.tree.map(lambda leaf: leaf[-1], run.trajectory.state)

@@ -243,7 +243,7 @@ def test_failures_have_their_exit_code_and_one_sentence(typed, tmp_path, words, 
     assert says in err and err.count("\n") == 1
 
 
-def test_what_a_command_refuses_of_a_scene_is_told_with_the_option_that_takes_it_out(typed, tmp_path):
+def test_refusal_of_an_effect_names_the_option_that_removes_it(typed, tmp_path):
     (tmp_path / "rotor.toml").write_text(TEMPLATES["planar_rotor"])
     for words, option in (
         (["criterion"], "--without gravity"),

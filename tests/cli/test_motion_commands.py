@@ -95,7 +95,7 @@ def test_loads_start_apart_as_typed_in_every_command(typed, monkeypatch, command
 
 
 @pytest.mark.slow
-def test_settle_envelope_growth_and_run_ups_answer_as_python_does(typed, tmp_path):
+def test_motion_commands_give_the_results_of_python(typed, tmp_path):
     loaded = jv.load_scene("machine.toml")
     mode = jv.jam_modes(loaded).mode_numbers()[0]
     code, out, _ = typed("settle", "machine.toml", "--mode", str(mode), "--json")
@@ -190,7 +190,7 @@ def test_describe(typed):
     assert set(SECTIONS["machine"]) == set(GROUPS["machines"])
 
 
-def test_help_is_fast_and_says_of_each_command_what_the_command_itself_says():
+def test_overview_has_the_summary_of_each_command():
     begun = time.process_time()
     assert run(["--help"]) == 0
     assert time.process_time() - begun < 0.3
@@ -204,7 +204,7 @@ def test_help_is_fast_and_says_of_each_command_what_the_command_itself_says():
         assert " ".join(begins) in " ".join(said.split())
 
 
-def test_help_of_every_command_imports_nothing_slow_and_its_choices_are_those_of_the_library():
+def test_help_imports_nothing_slow_and_lists_the_choices():
     code = "import sys; from jaxvib.cli.app import _HOMES, run\n"
     code += "for name in _HOMES: assert run([name, '--help']) == 0\nprint('numpy' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

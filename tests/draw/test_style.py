@@ -51,7 +51,7 @@ def test_a_legend_stands_above_its_panel():
     assert axis.get_legend().get_window_extent().y0 >= axis.get_window_extent().y1 - 1.0
 
 
-def test_numbers_that_nearly_touch_are_one_text_and_what_is_outside_has_none():
+def test_labels_that_nearly_touch_are_merged():
     axis = Figure().subplots()
     axis.set_ylim(0.0, 1.0)
     numbered(axis, 0.5, [0.5, 0.51, 0.9, 7.0, np.nan], ["3", "4", "5", "6", "7"], [True, False, True, True, True])
@@ -71,7 +71,7 @@ def diagram(**options):
     return branch_diagram(speed, omega, modes != 2, **arrays, **{**own, **options}), speed, omega
 
 
-def test_a_branch_diagram_says_what_its_lines_are_and_numbers_the_modes():
+def test_branch_diagram_labels_lines_and_modes():
     figure, speed, omega = diagram(unit="rpm")
     told = [text.get_text() for text in figure.legends[0].get_texts()]
     assert {"stable", "unstable", "resonance", "speed of the rotor", "operating speed; numbers: jam modes", "y1", "y2"} < set(
@@ -89,7 +89,7 @@ def test_a_branch_diagram_says_what_its_lines_are_and_numbers_the_modes():
     np.testing.assert_allclose(drawn, np.stack([speed, omega], 1)[: len(drawn)] * 30.0 / np.pi)
 
 
-def test_more_than_two_coordinates_have_a_panel_each_and_panels_are_chosen():
+def test_three_coordinates_have_one_panel_each():
     figure, _, omega = diagram(amplitude=np.ones((81, 4)), names=("y1", "y2", "y3", "y4"))
     assert [axis.get_ylabel() for axis in figure.axes][1:5] == [f"amplitude of y{k}, mm" for k in (1, 2, 3, 4)]
     axis = Figure().subplots()
@@ -100,7 +100,7 @@ def test_more_than_two_coordinates_have_a_panel_each_and_panels_are_chosen():
         diagram(show=("power",))
 
 
-def test_a_stretch_without_a_point_is_left_out_and_the_rest_drawn():
+def test_empty_pieces_of_a_branch_are_left_out():
     axis = panels(1)[1][0]
     there = np.where(np.arange(20) < 10, 1.0, np.nan)
     solid_and_dashed(axis, there, there, np.arange(20) < 12, "black", "loads", marker="o")
@@ -117,7 +117,7 @@ def test_a_logarithmic_axis_reaches_down_to_what_matters():
     assert low == pytest.approx(0.5 * np.min(force[omega > 2.0])) and high > np.max(force) and np.min(force) < 1e-5 * low
 
 
-def test_a_band_holds_the_signal_and_the_last_periods_are_the_signal():
+def test_band_contains_the_signal():
     t = np.linspace(0.0, 10.0, 10_001)
     y = np.sin(2.0 * np.pi * 10.0 * t) * t
     middle, low, high = band(t, y, 50)

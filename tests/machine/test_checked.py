@@ -81,7 +81,7 @@ def test_plain_numbers_are_numbers():
     assert np.all(np.asarray(slope(s.machine.mass)) < 0.0)
 
 
-def test_numbers_that_rounding_loses_are_refused_when_a_scene_is_made():
+def test_numbers_lost_by_rounding_are_refused():
     def made(**changes):
         return jv.Scene(machines()["two_mass"], jv.balls(**{**BALLS, **changes}), jv.ConstantSpeed(120.0))
 

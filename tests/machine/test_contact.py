@@ -38,7 +38,7 @@ def after(s, rates, until, spacing=0.2):
 
 @pytest.mark.parametrize("make", [plane, on_equator])
 @pytest.mark.parametrize("restitution", [1.0, 0.6, 0.2])
-def test_balls_part_with_the_share_of_their_speed_that_restitution_says(make, restitution):
+def test_balls_separate_with_the_coefficient_of_restitution(make, restitution):
     rates, least = after(make(restitution), [2.0, -1.0], 0.1)
     # The force of the damper begins with a jump, within a step: up to 1 % of the speed.
     np.testing.assert_allclose(rates[-1, 1] - rates[-1, 0], 3.0 * restitution, rtol=0.02, atol=2e-3)
@@ -54,7 +54,7 @@ def test_three_balls_in_a_torus_meet_in_any_pair_and_do_not_pass():
     assert energy[-1] < 0.9 * energy[0]
 
 
-def test_the_damping_of_a_restitution_is_that_of_the_oscillator_let_go_when_it_would_pull():
+def test_contact_damping_follows_from_the_restitution():
     """Against the contact integrated as such: x'' + 2 zeta x' + x = 0 until the force is none."""
     for restitution in (0.9, 0.5, 0.2, 0.05):
         zeta = float(damping_ratio(jnp.asarray(restitution)))
@@ -76,7 +76,7 @@ def test_the_damping_of_a_restitution_is_that_of_the_oscillator_let_go_when_it_w
     np.testing.assert_allclose(slope, (damping_ratio(0.4 + step) - damping_ratio(0.4 - step)) / (2.0 * step), rtol=1e-7)
 
 
-def test_a_restitution_survives_the_file_and_wrong_ones_are_named():
+def test_restitution_is_read_from_files_and_checked():
     s = plane(0.7)
     again = jv.scene_from_toml(jv.scene_to_toml(s))
     assert float(again.effects[0].restitution) == 0.7 and RADIUS > OWN
@@ -92,7 +92,7 @@ def test_a_restitution_survives_the_file_and_wrong_ones_are_named():
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
 
 
-def test_balls_of_a_torus_that_start_in_one_place_are_refused_and_named_starts_lay_them_side_by_side():
+def test_overlapping_balls_are_refused_named_starts_avoid_them():
     s, zero = on_equator(0.5, count=3), jnp.zeros(2)
 
     def start(*f, a=0.5 * jnp.pi):
@@ -122,7 +122,7 @@ def test_steps_of_captures_and_ensembles_resolve_a_contact():
     assert steps_per_second(bare) == float(bare.loads.own_frequency(140.0)) < swing
 
 
-def test_jammed_balls_press_together_with_the_unbalance_of_their_arc():
+def test_touching_jammed_balls_have_the_unbalance_of_their_arc():
     """Three balls near the outer equator of a torus, a little apart, jammed below the resonance of a rotor that whirls.
 
     S = m R sin(N arcsin(r/R)) / (r/R); the rotor's amplitude is S Omega^2 / |c - (M + N m) Omega^2 + i b Omega|.

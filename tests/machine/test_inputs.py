@@ -89,7 +89,7 @@ def test_wrong_input_is_one_sentence(case):
     assert "\n" not in text and text.startswith(error.value.field)
 
 
-def test_a_number_that_single_precision_cannot_hold_is_not_finite():
+def test_overflow_in_single_precision_is_not_finite():
     with jax.enable_x64(False), pytest.raises(jv.InputError, match=r"loads\.drag is inf N s/m; a finite number is needed"):
         balls(drag=1e300)
 

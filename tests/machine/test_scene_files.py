@@ -171,7 +171,7 @@ def test_a_file_that_cannot_be_read_says_which(tmp_path):
         jv.scene_from_toml("[machine")
 
 
-def test_a_file_with_a_byte_order_mark_is_read_and_other_encodings_are_named(tmp_path):
+def test_byte_order_mark_is_read_and_other_encodings_named(tmp_path):
     text = TEMPLATES["one_mass"]
     (tmp_path / "bom.toml").write_text(text, encoding="utf-8-sig")
     assert jv.load_scene(tmp_path / "bom.toml").machine.kind == "one_mass"

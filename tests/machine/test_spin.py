@@ -56,7 +56,7 @@ def test_a_ball_that_spins_freely_is_the_rigid_ball_in_space():
     assert abs(found[-1]) > SPEED  # what it has gathered counts
 
 
-def test_a_ball_that_does_not_turn_slides_until_it_rolls_as_the_rigid_ball_does():
+def test_sliding_ball_starts_to_roll_like_a_rigid_ball():
     place, velocity = RIGID.state(*START)
     still = np.concatenate([place, velocity, np.zeros(3)])
     sliding, _ = RIGID.ends(still, 0.03, coefficient=0.1)
@@ -80,7 +80,7 @@ def test_a_ball_that_does_not_turn_slides_until_it_rolls_as_the_rigid_ball_does(
     assert errors[1] < 1e-3 and errors[1] < 0.4 * errors[0]
 
 
-def test_on_a_plane_track_it_rolls_at_the_speed_that_the_closed_form_says():
+def test_plane_track_ball_rolls_at_the_closed_form_speed():
     """f' grows by mu f'^2, the slip by kappa/(kappa-1) as much: it rolls at f0 + (w (1 + r/R) - f0) (kappa-1)/kappa."""
     machine = jv.one_mass(mass=1e12, stiffness=0.0, damping=0.0)
     loads = jv.rollers(count=1, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
@@ -96,7 +96,7 @@ def test_on_a_plane_track_it_rolls_at_the_speed_that_the_closed_form_says():
     np.testing.assert_allclose(state.rate[0][early, 0], 20.0 / (1.0 - 0.2 * 20.0 * run.trajectory.time[early]), rtol=1e-9)
 
 
-def test_a_contact_that_holds_rolls_exactly_and_one_that_does_not_is_let_go():
+def test_contact_rolls_exactly_below_the_limit_and_slides_above():
     s, firm = (scene((*published(), *more), count=1) for more in ((), (jv.Sliding(1e3),)))
     state = at(0.4, 1.1, 90.0, 20.0)
     found, expected = evaluate(firm, 0.1, jv.with_spin(firm, state)), evaluate(s, 0.1, state)
@@ -131,7 +131,7 @@ def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
         np.testing.assert_allclose(rate, supplied - lost, rtol=1e-9, atol=1e-9 * abs(float(supplied)))
 
 
-def test_derivatives_of_balls_that_spin_and_slide_are_the_differences():
+def test_derivatives_with_spin_and_sliding_are_differences():
     """Along one direction in which every number of the scene and of the state changes."""
     s = scene((*published(), *BOTH), count=1)
     start = jv.with_spin(s, at(0.4, 1.1, 90.0, 20.0), "still")
@@ -154,7 +154,7 @@ def test_derivatives_of_balls_that_spin_and_slide_are_the_differences():
     np.testing.assert_allclose(total, float(weight @ forward), rtol=1e-9)
 
 
-def test_a_scene_without_them_has_no_state_and_no_operation_of_theirs():
+def test_scene_without_spin_has_no_state_of_it():
     def size(effects):
         s = scene((*published(), *effects))
         state = jv.with_spin(s, some_state())

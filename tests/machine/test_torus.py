@@ -119,7 +119,7 @@ def test_a_run_says_when_balls_leave_their_wall():
     np.testing.assert_allclose(with_.rate[1][1], without.rate[1][1], rtol=1e-3)
 
 
-def test_an_ensemble_names_the_runs_in_which_balls_leave_their_wall():
+def test_ensemble_names_runs_in_which_balls_leave_the_wall():
     s = scene((jv.Gravity(along="axis"), jv.RollingFriction(4e-5)))
 
     def make(a):
@@ -133,7 +133,7 @@ def test_an_ensemble_names_the_runs_in_which_balls_leave_their_wall():
     assert "kept on it all the same" in many.summary()
 
 
-def test_small_motions_about_the_equator_have_the_frequency_that_steps_resolve():
+def test_frequency_about_the_equator_is_the_resolved_one():
     s = jv.Scene(jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0), balls(1), jv.ConstantSpeed(SPEED))
     a = jnp.asarray([0.5 * jnp.pi + 1e-5])
     turning = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1), a), (jnp.full(1, SPEED), jnp.zeros(1)))
@@ -176,7 +176,7 @@ def test_wrong_numbers_are_named(build, says):
         build()
 
 
-def test_without_friction_and_with_a_coefficient_of_zero_is_the_same():
+def test_zero_friction_equals_no_friction():
     state = some_state()
     zero, bare = (
         evaluate(scene(effects), jnp.asarray(0.0), state)
@@ -189,7 +189,7 @@ def test_without_friction_and_with_a_coefficient_of_zero_is_the_same():
 
 
 @pytest.mark.parametrize("along", ["axis", "up"])
-def test_friction_holds_a_ball_on_a_slope_up_to_its_limit_and_lets_it_roll_beyond(along):
+def test_rolling_friction_holds_a_ball_on_a_slope(along):
     """Up the wall of a tube that lies level, and along the outer equator of a ring that stands upright."""
     share, width = 0.05, 1e-4
     friction = jv.RollingFriction(share * OWN, width=width)
@@ -271,7 +271,7 @@ def test_balls_that_slide_move_as_in_mujoco():
     assert np.ptp(run.trajectory.state.angle[1]) > 1.0
 
 
-def test_balls_that_roll_add_to_mujocos_equations_what_their_own_rotation_asks_for():
+def test_rolling_balls_agree_with_mujoco_and_their_rotation():
     """MuJoCo's mass matrix and forces of the masses, and of a rolling ball (2/5) m (B^2 f' (f' - w) + rho^2 a'^2)/2."""
     s = wide_scene()
     model = mujoco_torus(s)

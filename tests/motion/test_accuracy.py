@@ -101,7 +101,7 @@ def test_accuracy_looks_at_numbers():
 
 
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
-def test_the_estimate_is_above_the_error_where_a_stop_bends_the_motion(double):
+def test_estimate_exceeds_the_error_with_a_stop(double):
     """Two runs whose steps miss the same touch are nearer to each other than to the truth (benchmarks/trials/estimates.py).
 
     Two seconds: after four one of these motions has nothing left of its start, and no error is small or large."""

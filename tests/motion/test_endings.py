@@ -55,7 +55,7 @@ def test_a_lane_whose_start_does_not_exist_says_so():
     assert int(steps[0]) < 4096
 
 
-def test_without_raising_a_missing_mode_says_no_start_and_shows_no_motion():
+def test_missing_mode_has_the_status_no_start():
     s = published(eps=1e-3, speed=1.2).scene()
     with pytest.raises(jv.ComputationError, match="does not exist"):
         jv.simulate(s, 20.0, start="jam", mode=4)
@@ -65,7 +65,7 @@ def test_without_raising_a_missing_mode_says_no_start_and_shows_no_motion():
             assert np.all(np.isnan(leaf))
 
 
-def test_a_lane_that_is_not_finite_does_not_keep_the_others_waiting():
+def test_nonfinite_run_does_not_delay_the_others():
     """Each of its steps is refused and made smaller, until a smaller one is none."""
     s = published(eps=1e-3).scene()
 

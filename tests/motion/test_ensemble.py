@@ -66,7 +66,7 @@ def test_another_process_need_not_trace_an_ensemble(tmp_path):
     assert list(tmp_path.glob("_together-*.program"))
 
 
-def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():
+def test_nonfinite_run_leaves_the_errors_of_the_others():
     whole = jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(200))
     broken = jv.ensemble(make, values(displaced=(1.0, jnp.nan, 1.1)), 5.0, stepsize_controller=jv.EqualSteps(200))
     assert broken.finite.tolist() == [True, False, True]
@@ -74,7 +74,7 @@ def test_a_run_that_is_not_finite_leaves_the_errors_of_the_others():
     assert 0.0 < float(whole.error.max()) < 1e-2 and np.isnan(broken.error[1])
 
 
-def test_a_quiet_run_beside_loud_ones_has_the_error_it_has_without_them():
+def test_error_of_a_run_is_independent_of_the_batch():
     """One stands still beside them: nothing is not divided by nothing."""
     quiet = values(displaced=(0.1, 0.0, 1.1), moving=(0.0, 0.0, 0.8))
     loud = values(displaced=(0.1, 0.0, 1e2), moving=(0.0, 0.0, 0.8))

@@ -117,7 +117,7 @@ def test_the_later_half_decides(late, name):
     assert _judged(late) == name
 
 
-def test_angles_that_are_kept_within_a_turn_are_compared_across_its_end(monkeypatch):
+def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
     """In single precision of two motions that are 2 pi - 6.2 apart one may end at 3.1 rad, the other at -3.1 rad."""
     ends = itertools.cycle([3.1, -3.1])
 

@@ -168,7 +168,7 @@ def test_jam_in_time_nears_leading_order_as_loads_get_light():
     np.testing.assert_allclose(error[:-1] / error[1:], jnp.asarray([[2.15, 2.0, 2.0]] * 2), rtol=0.05)
 
 
-def test_a_soft_mount_under_a_fast_rotor_is_measured_without_aliasing():
+def test_soft_mount_under_a_fast_rotor_has_no_aliasing():
     """20 periods of the lowest frequency are thousands of turns of the rotor: the window has to be shorter than that."""
     machine = jv.two_mass(
         mass=(400.0, 40.0), stiffness=(300.0, 0.0), damping=(10.0, 0.0), link_stiffness=4e5, link_damping=50.0

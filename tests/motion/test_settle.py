@@ -174,7 +174,7 @@ def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
 
 
 @pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])
-def test_the_last_32_stretches_are_judged_or_more_where_they_are_shorter(monkeypatch, periods, stretches):
+def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
     """Of 100 slow periods each; a whole number of them in every quarter."""
     run, seen = small_run(save="window"), []
     monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *_, **__: run)

@@ -133,12 +133,12 @@ def test_so_many_states_are_kept_unless_said_otherwise(turns, samples):
     assert _enough_samples(s, jnp.asarray(2.0 * np.pi * turns / 100.0)) == samples
 
 
-def test_steps_are_chosen_to_1e_8_and_in_single_precision_to_1e_5():
+def test_default_tolerance_depends_on_the_precision():
     for dtype, tolerance in ((jnp.float64, 1e-8), (jnp.float32, 1e-5)):
         np.testing.assert_allclose(_control(jnp.asarray(1.0, dtype), None, None).tolerance, tolerance, rtol=1e-6)
 
 
-def test_less_of_a_difference_is_counted_to_vanish_than_a_method_of_order_8_lets():
+def test_estimate_assumes_less_than_order_8():
     """An eighth is left where steps are half as long, 100^-0.45 where the tolerance is a hundredth."""
     equal, adaptive = ((lambda n: StepControl(steps=jnp.asarray(n))), (lambda x: StepControl(tolerance=jnp.asarray(x))))
     np.testing.assert_allclose(_shrink(equal(200.0), equal(100.0)), 0.125, rtol=1e-12)
@@ -185,7 +185,7 @@ def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, doub
     assert plainly.value.args == (None,)
 
 
-def test_the_next_tolerance_is_smaller_by_a_little_more_than_what_is_missing(monkeypatch):
+def test_next_tolerance_has_a_safety_margin(monkeypatch):
     """Of an error 10, 1e3 and 1e9 times what is asked, and of one that nobody knows."""
     base = small_run(save="window")
     for times, low, high in (

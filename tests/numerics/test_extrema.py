@@ -14,7 +14,7 @@ def samples(per_turn, count, first=0.37):
 
 
 @pytest.mark.parametrize(("per_turn", "error"), [(16, 4e-9), (32, 4e-9 / 256), (64, 4e-9 / 256**2)])
-def test_the_extrema_of_a_cosine_are_found_to_the_error_that_is_promised(per_turn, error):
+def test_extrema_of_a_cosine_have_the_stated_error(per_turn, error):
     x, v = samples(per_turn, 4 * per_turn)
     (low, high), _, _ = locate_extrema(x, v)
     np.testing.assert_allclose(np.abs([low, high]), 1.0, rtol=0.0, atol=error + 1e-15)

@@ -26,7 +26,7 @@ def _called(function):
 
 
 @pytest.mark.parametrize("n", [4, 8, 9, 20])
-def test_solves_of_a_batch_and_their_derivatives_call_no_library_for_the_batch(n):
+def test_batched_solves_make_no_batched_library_call(n):
     """Such calls, as many at once as XLA has threads, wait for each other for ever (jaxlib before 0.11.2)."""
     rng = np.random.default_rng(n)
     a, b = jnp.asarray(rng.normal(size=(3, n, n)) + n * np.eye(n)), jnp.asarray(rng.normal(size=(3, n)))
@@ -48,7 +48,7 @@ def test_types_may_be_mixed(n):
     np.testing.assert_allclose(a @ x, np.arange(n), atol=1e-12)
 
 
-def test_eigenvalues_of_a_batch_of_batches_call_the_library_for_one_matrix():
+def test_nested_batches_of_eigenvalues_solve_one_matrix_a_call():
     matrices = jax.random.normal(jax.random.key(0), (3, 4, 5, 5))
     many = jax.jit(jax.vmap(jax.vmap(eigenvalues_in_turn)))
     for found, matrix in zip(many(matrices).reshape(-1, 5), matrices.reshape(-1, 5, 5), strict=True):

@@ -95,7 +95,7 @@ def test_what_has_no_rule_stays_on_arrays(function, named):
     np.testing.assert_array_equal(alone, 2.0 * jax.vmap(function)(batch))
 
 
-def test_a_rule_that_fails_or_gives_another_shape_is_not_believed(monkeypatch):
+def test_failing_or_misshapen_rule_is_not_used(monkeypatch):
     x = jnp.arange(3.0)
     changed = dict(rules())
     monkeypatch.setattr(module, "rules", lambda: changed)
@@ -120,7 +120,7 @@ def test_primitives_are_known_by_themselves_and_not_by_name():
     assert type(found["add"])("add") not in rules()
 
 
-def test_a_zero_of_the_program_leaves_no_term_and_a_zero_among_the_arguments_does():
+def test_constant_zero_leaves_no_term_but_a_zero_argument_does():
     """Which tells the two apart where the other factor is infinite."""
 
     def function(c, x):
@@ -143,7 +143,7 @@ def expanded(jaxpr):
     return max(cost.get(v, 0) for v in jaxpr.outvars)
 
 
-def test_shared_parts_of_shared_parts_are_not_computed_again_and_again():
+def test_nested_shared_values_are_computed_once():
     """A chain in which every value is used twice: 2^40 operations without fences."""
 
     def chain(t, c):
@@ -174,7 +174,7 @@ def test_a_batch_has_the_shapes_and_derivatives_that_vmap_gives():
 
 
 @pytest.mark.parametrize(("machine", "load"), [("one_mass", "balls"), ("two_mass", "balls")])
-def test_no_part_of_a_states_second_derivative_is_computed_again_and_again(machine, load):
+def test_second_derivatives_share_their_parts(machine, load):
     """Without fences that of the rotor with four pendulums took ten seconds at 4096 samples."""
 
     def second(moment, field):

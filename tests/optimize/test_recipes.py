@@ -96,14 +96,14 @@ def test_recipes_leave_springs_that_are_not_there():
         retune(free, None)
 
 
-def test_the_lightest_exciter_shakes_by_what_is_asked_and_no_more():
+def test_lightest_exciter_gives_exactly_the_requested_amplitude():
     best = lightest_exciter(SCENE, "42 mm", mode=3).run(starts=4, iterations=25, verify=False)
     assert best.status_name == "done" and best.limits[0].active
     np.testing.assert_allclose(best.limits[0].value, 0.042, rtol=1e-7)
 
 
 @pytest.mark.slow
-def test_the_antiphase_machine_balances_each_platform_on_its_own_spring():
+def test_antiphase_machine_has_equal_partial_frequencies():
     """Little damped platforms in antiphase leave the bed alone where M1 y1 + M2 y2 = 0 and k1 y1 + k2 y2 = 0: k1/M1 = k2/M2."""
     light = eqx.tree_at(
         lambda s: (s.machine.damping, s.machine.link_damping), SCENE, (jnp.array([0.04, 0.02]), jnp.array([0.06]))

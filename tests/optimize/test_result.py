@@ -25,7 +25,7 @@ def limit(what, value, at, *, broken=0.0, active=True, gain=0.0):
     return Limit(what, "m", value, at, broken, active, 0.0, gain)
 
 
-def test_limits_influences_and_machines_are_said_in_a_designers_units(searched):
+def test_results_are_given_in_the_units_of_designers(searched):
     limits = (
         limit("first at most 2 mm", 2e-3, 2e-3, gain=-0.5),
         limit("second at most 3 mm", 3.3e-3, 3e-3, broken=0.1),

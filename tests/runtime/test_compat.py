@@ -21,7 +21,7 @@ from jaxvib.runtime import compat
 from jaxvib.runtime.operations import operations
 
 
-def test_backend_started_is_false_before_the_first_array_and_true_after():
+def test_backend_starts_with_the_first_array():
     """jax._src.xla_bridge._backends."""
     code = """
 import jax.numpy as jnp
@@ -177,7 +177,7 @@ def test_a_jaxlib_that_is_not_known_is_asked_once(tmp_path, monkeypatch):
     assert compat.accepted_flags(flags) == flags[:1]
 
 
-def test_run_time_checks_are_left_out_by_the_threads_that_ask_for_it():
+def test_run_time_checks_are_switched_off_by_thread():
     """equinox._errors: branched_error_if_impl_jit; while one thread leaves its checks out, others come, go, and have theirs."""
     begun, ended = Barrier(2, timeout=60.0), Barrier(2, timeout=60.0)
 

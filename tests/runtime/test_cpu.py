@@ -20,7 +20,7 @@ def test_functions_of_long_arrays_are_right_under_the_flags(name):
     np.testing.assert_allclose(found, getattr(np, name)(*given), rtol=1e-13)
 
 
-def test_prepare_cpu_sets_flags_before_anything_else_and_says_when_it_is_late():
+def test_prepare_cpu_sets_flags_first_and_warns_if_late():
     code = """
 import os, jaxvib as jv
 os.environ["XLA_FLAGS"] = "--xla_cpu_prefer_vector_width=256"

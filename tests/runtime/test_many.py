@@ -18,7 +18,7 @@ from jaxvib.runtime.cache import keep_programs
 from jaxvib.runtime.rehearsal import begin_others
 
 
-def test_items_are_taken_as_there_is_room_and_the_first_one_alone(monkeypatch):
+def test_items_are_taken_in_order_with_the_first_one_alone(monkeypatch):
     monkeypatch.setattr(many, "cores", lambda: 3)
     taken, threads = [], {}
 
@@ -59,7 +59,7 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
     assert len(begun) < 30
 
 
-def test_other_threads_begin_as_soon_as_a_program_that_has_run_before_runs_again(monkeypatch, tmp_path, unwatched):
+def test_other_threads_begin_when_a_known_program_runs_again(monkeypatch, tmp_path, unwatched):
     """Of a new program nobody else runs anything while the first one is at work; of a known one others do."""
     monkeypatch.setattr(many, "cores", lambda: 2)
     keep_programs(tmp_path)

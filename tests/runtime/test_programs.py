@@ -126,7 +126,7 @@ def labelled(x, labels):
 
 
 @pytest.mark.parametrize("labels", [("a",), ["a"], (np.float64(1.0),)])
-def test_results_and_arguments_that_are_no_arrays_stand_beside_derivatives(asked, labels, monkeypatch, tmp_path):
+def test_static_arguments_and_results_allow_derivatives(asked, labels, monkeypatch, tmp_path):
     function = programs.cached(labelled)
     monkeypatch.setitem(globals(), "labelled", function)  # where it is found by its name
     for route in (jax.jacfwd, jax.jacrev):
@@ -196,7 +196,7 @@ def test_what_has_no_name_is_differentiated_all_the_same(asked):
     assert float(jax.grad(cubed)(2.0)) == 12.0 and jax.vmap(cubed)(jnp.arange(3.0)).tolist() == [0.0, 1.0, 8.0]
 
 
-def test_derivatives_of_jam_modes_are_those_of_the_traced_function(asked):
+def test_derivatives_of_jam_modes_equal_those_without_cache(asked):
     s = scene("two_mass", "balls")
 
     def force(k):

@@ -55,7 +55,7 @@ def test_programs_of_a_question_are_compiled_together(folder):
     assert len(seen) == 3 and len(traces) == 2
 
 
-def test_a_question_that_depends_on_numbers_is_answered_all_the_same(folder):
+def test_question_that_depends_on_numbers_is_answered(folder):
     def refused(y):
         if not y.any():
             raise jv.InputError("y", "is zero")

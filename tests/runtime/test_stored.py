@@ -228,7 +228,7 @@ def test_the_key_holds_every_source_and_the_versions(module, monkeypatch):
     assert digest() != imported.digest_of_sources()
 
 
-def test_what_a_change_of_the_sources_leaves_alone_is_not_compiled_again(folder, monkeypatch):
+def test_unchanged_programs_are_not_recompiled_after_an_edit(folder, monkeypatch):
     """JAX finds what it compiled by the program and its name."""
     texts = []
     for sources in ("these", "others"):

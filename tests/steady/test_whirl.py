@@ -103,7 +103,7 @@ def test_platforms_do_not_whirl():
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_whirls_of_one_speed_are_told_apart_in_machines_of_every_size(size):
+def test_whirls_of_one_speed_are_distinguished_at_every_size(size):
     """Without damping and gyroscopic coupling both turn at sqrt(k/m), one in each sense."""
     machine = jv.planar_rotor(mass=37.0 * size, stiffness=1.16e6 * size, damping=0.0)
     scene = jv.Scene(machine, jv.pendulums(count=1, mass=0.5 * size, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))

@@ -41,7 +41,7 @@ def test_low_discrepancy_is_low_and_keeps_its_digits():
     assert samples(far, far + 1, 1, 0, "low_discrepancy")[0, 0] == ((begin + far * golden) % 2**64 >> 11) * 2.0**-53
 
 
-def test_every_case_stands_in_one_chunk_and_has_the_numbers_of_its_place():
+def test_every_case_is_in_one_chunk_with_its_numbers():
     axes = {"drive.speed": [1.0, 2.0, 3.0, 4.0, 5.0], "loads.drag": {"from": 0.1, "to": 10.0, "count": 3, "scale": "log"}}
     sampled = {"machine.mass": {"from": 40.0, "to": 60.0}}
     found = tuple(axis_of(SCENE, name, spec) for name, spec in (axes | sampled).items())

@@ -129,7 +129,7 @@ def test_what_no_figure_can_show(grid, sampled, draw, says):
 
 
 @pytest.mark.slow
-def test_lines_of_the_theory_lie_where_the_diagram_has_its_points(grid):
+def test_theory_lines_pass_through_the_points_of_the_diagram(grid):
     axis = plot_map(grid.store).axes[0]
     special = jv.branches(SCENE, exact=True).special
     assert any("fold" in text.get_text() for text in axis.get_legend().get_texts()) == any(p.kind == "fold" for p in special)

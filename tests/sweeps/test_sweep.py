@@ -165,7 +165,7 @@ def poisoned(scene):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_poisoned_case_is_recorded_with_its_sentence_and_harms_no_other(tmp_path):
+def test_failing_case_is_recorded_and_harms_no_other(tmp_path):
     found = jv.sweep(SCENE, {"drive.speed": AXES["drive.speed"]}, [Quantity("twice", "rad/s", poisoned)], tmp_path / "s.zarr")
     data = found.data
     assert dict(found.counts) == {"done": 7, "failed": 2} and found.status_name == "done"

@@ -72,7 +72,7 @@ def test_regimes_of_made_up_motions(name):
 
 
 @pytest.mark.parametrize(("effects", "label"), [((), "balanced"), ((jv.MomentImbalance(2e-3),), "unbalanced")])
-def test_loads_at_one_station_cannot_balance_what_tilts_their_rotor(effects, label):
+def test_loads_at_one_station_cannot_balance_a_moment(effects, label):
     s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0, effects=effects)
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.05))
     assert jv.regime(jv.Scene(machine, s.loads, s.drive, effects), motion).label == label
@@ -106,7 +106,7 @@ def with_motor(drive):
     return jv.Scene(machine, jv.balls(count=1, mass=1e-3, radius=0.05, drag=2.0), drive, (jv.StaticImbalance(0.15),))
 
 
-def test_weak_motor_is_caught_at_the_resonance_and_a_strong_one_passes():
+def test_weak_motor_is_caught_and_a_strong_one_passes():
     """The mean torque that the resonance takes, S^2 w^3 / (2 c) = 4.24 N m, against the motor's at that speed."""
     weak = jv.simulate(
         with_motor(jv.DCMotor(60.0, stall_torque=2.0, inertia=0.05)), 15.0, stepsize_controller=jv.Tolerance(1e-6)
@@ -175,7 +175,7 @@ def test_regime_under_jit_and_vmap():
     assert np.all(found.name == once.name) and found.load_speed.shape == (2, 4)
 
 
-def test_the_moment_that_is_left_is_told_relative_to_the_radius_of_gyration():
+def test_remaining_moment_is_relative_to_the_radius_of_gyration():
     """Where the loads run at the port they have no levers of their own: J_t = 0.479 kg m^2 of 37 kg, four times 0.05 kg."""
     s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0)
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.0))

@@ -27,7 +27,7 @@ def spun_up(s, speed, duration):
     return eqx.tree_at(lambda x: x.drive, s, jv.SpinUp(speed, duration))
 
 
-def test_a_rotor_that_is_alike_in_all_directions_is_followed_exactly():
+def test_envelope_of_an_isotropic_rotor_is_exact():
     """Nothing is dropped then: gyroscopic terms, stations along the axis, the loads' own reaction, parted loads, from rest."""
     machine = jv.rotor(
         mass=37.0,
@@ -179,7 +179,7 @@ def test_the_ripple_of_a_run_is_the_greatest_in_its_window():
     assert np.all(each.min(axis=0) < 0.9 * each.max(axis=0))
 
 
-def test_an_error_is_relative_to_the_length_of_a_vector_and_never_to_an_angle():
+def test_envelope_error_is_relative_to_vector_lengths():
     """A block of two numbers, of which one is 0, and an angle of 1e6 rad: what each may be off by to a relative 1e-3."""
     controller = diffrax.PIDController(rtol=1e-3, atol=1e-9, norm=lambda error: jnp.max(jnp.abs(error)))
     steps = _Tolerance(controller=controller, blocks=(2, 1))

@@ -101,7 +101,7 @@ def test_a_step_to_where_there_is_nothing_is_not_taken():
 
 
 @pytest.mark.parametrize("start", [[0.2, 0.4], [0.9, 0.05]])
-def test_what_is_held_is_corrected_at_every_step_and_kept_on_the_way(start):
+def test_held_quantities_are_corrected_at_every_step(start):
     """x + y = 7 from off it: onto it by the first step but for what bounds forbid, then along it to the least value."""
     total = plain("sum", lambda x, y: x + y)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(total, 7.0)]), plain("bowl", lambda x, y: bowl(x, y, jnp.log)), [], 2)

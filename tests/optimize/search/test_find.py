@@ -90,7 +90,7 @@ def test_a_search_tells_what_it_does_and_keeps_its_history():
     assert find(nowhere, OPTIONS, lambda *_: None) is None
 
 
-def test_what_takes_long_is_searched_from_the_best_without_tolerances():
+def test_costly_objectives_start_from_nominal_optima():
     problem = problem_of(DesignSpace(SCENE, FREE), expected(NEAR, {"machine.stiffness": 0.05}, samples=4), [], 4)
     told = []
     found = find(problem, OPTIONS, lambda what, share: told.append((what, share)))

@@ -36,7 +36,7 @@ def pieces_of_two():
     return point_of(np.full((2, 2), 0.5), pieces.max(axis=1)[:, None], tilts[:, :1], pieces, tilts)
 
 
-def test_pieces_that_count_are_compared_with_the_one_that_counts_most():
+def test_active_pieces_are_compared_with_the_largest():
     point = pieces_of_two()
     shares, size = np.array([[0.0, 0.3, 0.7, 0.0], [0.2, 0.3, 0.0, 0.5]]), np.array([2.0, 4.0])
     apart, tilts = unlike(point, shares, size)
@@ -105,7 +105,7 @@ def symmetric(random, *count):
     return a + np.swapaxes(a, -1, -2)
 
 
-def test_curvatures_are_those_of_the_lagrangian_along_what_is_free():
+def test_curvatures_are_those_of_the_reduced_lagrangian():
     """One number held, one of two demands active; of four designs of three numbers one lies on a bound, one has not all second
     derivatives."""
     random = np.random.default_rng(2)
@@ -155,7 +155,7 @@ def test_flat_directions_are_left_a_little_curvature():
     np.testing.assert_allclose(found[0], np.diag([4.0, 4e-10, 1.0]), atol=1e-12)
 
 
-def test_the_step_is_the_models_least_value_within_bounds_and_reach():
+def test_step_minimizes_the_model_within_the_trust_region():
     """Numbers apart: -g/(b size), no further than the reach, and to the bound."""
     bend = np.diag([2.0, 4.0, 1.0, 1.0])[None]
     z, slope = np.array([[0.5, 0.9, 0.05, 0.5]]), np.array([[[-0.8, -4.0, 4.0, 6.0]]])
@@ -232,7 +232,7 @@ def test_what_constraints_cost_does_not_count_as_a_fall():
             np.testing.assert_allclose(found, [0.5 * 6.0 * size * 0.01 / 2.0], rtol=1e-12)
 
 
-def test_an_objective_that_is_nothing_is_measured_by_what_it_changes_by():
+def test_scale_of_a_zero_objective_is_its_change():
     model = Step(np.array([[0.1, 0.0]]), np.zeros((1, 0)), np.zeros((1, 0)), np.ones((1, 1)))
     point = point_of(np.full((1, 2), 0.5), np.zeros((1, 1)), np.array([[[-3.0, 8.0]]]))
     none = np.zeros((1, 2, 2))

@@ -28,7 +28,7 @@ def xy(point):
     return 1.0 + 8.0 * point.z
 
 
-def test_the_violation_is_the_greatest_amount_by_which_something_is_off(held):
+def test_violation_is_the_largest_residual(held):
     values = np.array([[9.0, -0.3, 0.2], [9.0, 0.1, 0.2], [9.0, -0.1, -5.0], [np.nan, 0.0, 0.0]])
     point = point_of(np.full((4, 2), 0.5), values, np.ones((4, 3, 2)))
     np.testing.assert_array_equal(violation(held, point), [0.3, 0.2, 0.1, np.inf])
@@ -151,7 +151,7 @@ def test_starts_are_moved_onto_what_is_held():
     np.testing.assert_array_equal(none.nearest.z, np.random.default_rng(0).uniform(size=(8, 2)))
 
 
-def test_polishing_tells_how_much_is_left_and_ends_after_few_steps(held):
+def test_polishing_reports_its_residual_and_ends_early(held):
     """(x - 6)^2 + (y - 5)^2 + 2 along x + y = 7: the least is 8 + 2 at (4, 3), where x is at its limit as well."""
     start = at(held, (2.0, 2.0), (6.0, 8.0), (1.5, 6.0), (9.0, 1.0))
     shares = []
@@ -194,7 +194,7 @@ def test_a_dear_constraint_is_kept_at_last(held):
     assert np.all(ended.left < 1e-6)
 
 
-def test_the_size_of_an_objective_that_is_nothing_comes_from_its_slope():
+def test_scale_of_a_zero_objective_follows_from_its_slope():
     nothing = plain("nothing", lambda x, y: (x - 6.0) ** 2 + (y - 5.0) ** 2 - 1.0)
     problem = problem_of(DesignSpace(SCENE, FREE), nothing, [], starts=2)
     start = at(problem, (7.0, 5.0))

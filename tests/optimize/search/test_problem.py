@@ -45,7 +45,7 @@ def test_pieces_stand_beside_the_values():
     np.testing.assert_allclose(point.tilts, 8.0 * np.array([[[1.0, 0.0], [2.0, 2.0]]]))
 
 
-def test_a_demands_scale_is_its_limit_or_its_value_at_the_beginning():
+def test_scale_of_a_demand_is_its_limit_or_first_value():
     """Limits of 0 have none; x - 5 is 0 at the beginning, up to rounding, and counts as it is; a small value is no rounding."""
     off, rounded = plain("off", lambda x, y: x - 5.0), plain("rounded", lambda x, y: x - 5.0 + 3e-16)
     small = plain("small", lambda x, y: x - 5.0 + 1e-8)
@@ -61,7 +61,7 @@ def test_designs_that_are_computed_together_are_a_power_of_two(starts, lanes):
     assert problem_of(DesignSpace(SCENE, FREE), NEAREST, [], starts).lanes == lanes
 
 
-def test_derivatives_are_those_by_hand_whichever_way_they_are_had():
+def test_all_derivative_modes_agree_with_derivatives_by_hand():
     """Of one number of six in reverse, which follows nothing further; of as many numbers as there are values forward."""
     machine = scene("three_mass")
     free = {"machine.stiffness": (1e3, 9e4), "machine.link_stiffness": (1e3, 9e4)}
@@ -134,7 +134,7 @@ LEADING = EXACT.at_tier("leading")
 TIMED = asking("timed", "time", ("time",))
 
 
-def test_what_comes_first_is_to_leading_order_and_without_tolerances():
+def test_first_search_uses_leading_order_and_no_tolerances():
     force, off = foundation_force(mode=3), {"machine.stiffness": 0.05}
     demands = [TIMED < 3.0, EXACT < 5.0, FIRST < 4.0]
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(EXACT, 7.0)]), expected(force, off, samples=4), demands, 8)

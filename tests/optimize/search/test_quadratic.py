@@ -39,7 +39,7 @@ def test_quadratic_programs_meet_their_conditions():
     assert np.all(one.demands >= 0.0) and np.all(p >= low) and np.all(p <= high)
 
 
-def test_a_program_is_solved_in_few_steps_and_beside_others_as_alone(monkeypatch):
+def test_quadratic_program_is_independent_of_its_batch(monkeypatch):
     """Two systems of equations a step, and some twenty steps are usual of Mehrotra's method; an easy program beside hard ones
     ends before them."""
     solved = []
@@ -66,7 +66,7 @@ def test_boxes_and_amounts_may_be_far_from_nothing():
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
-def test_numbers_apart_from_each_other_end_at_their_own_least_value_or_bound(size):
+def test_separable_program_ends_at_minima_or_bounds(size):
     """min sum b p^2/2 + g p between -1 and 2: p = -g/b within the bounds, and the bounds push with -(b p + g)."""
     bend, slope = np.array([2.0, 1.0, 4.0, 0.5]), np.array([-2.0, 3.0, -20.0, 0.1])
     box = -np.ones((1, 4)), 2.0 * np.ones((1, 4))

@@ -91,7 +91,7 @@ def test_searches_end_at_kinks(wish, at, value):
     np.testing.assert_allclose(best.values.min(), value, rtol=1e-9, atol=1e-8)
 
 
-def test_the_worst_of_samples_is_a_kink_where_two_machines_are_as_bad():
+def test_worst_of_samples_ends_at_a_kink():
     """Stiffness a k of each sample is to be 5e4; a, A its extremes: the least of the largest |a k/5e4 - 1| is (A-a)/(A+a)."""
     wish = worst(plain("off", lambda x, y: jnp.abs(x / 5.0 - 1.0)), {"machine.stiffness[0]": 0.05}, samples=16)
     best = found(DesignSpace(SCENE, {"machine.stiffness[0]": (1e4, 9e4, "even")}), wish)
@@ -152,7 +152,7 @@ def test_catalogues_give_the_best_of_all_choices():
     assert found(several, mass).scene.loads.count == 5
 
 
-def test_an_interrupt_keeps_the_best_and_a_search_goes_on_from_it(tmp_path):
+def test_interrupted_search_continues_from_the_best(tmp_path):
     space = DesignSpace(SCENE, FREE)
 
     def stop(what, share):
@@ -186,7 +186,7 @@ def test_a_demand_on_a_machine_costs_what_its_multiplier_says():
 
 
 @pytest.mark.slow
-def test_a_design_beside_a_fold_keeps_the_distance_that_is_demanded():
+def test_design_keeps_the_demanded_distance_from_a_fold():
     """The largest amplitude lies at the fold of the jam; a demand on the distance to it is at its limit, and the fold of the
     exact branch is where it should be."""
     space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 2e5), "machine.link_stiffness": (5e4, 5e5)})

@@ -34,7 +34,7 @@ def test_ranges_are_divided_evenly_or_by_ratio(bounds, middle):
     np.testing.assert_array_equal(fixed.shares(np.array([5e4])), [0.0])
 
 
-def test_catalogues_are_ascending_without_doubles_and_have_places():
+def test_catalogues_are_sorted_and_unique():
     catalogue = {"machine.stiffness": ["30 N/mm", 1e4, 3e4, 2e4], "loads.count": [4, 2, 4], "loads.drag": [0.0, 2.0]}
     space = DesignSpace(SCENE, {"machine.link_stiffness": (1e5, 3e5)}, choices=catalogue)
     assert space.counts == (2, 4) and space.size == 4

@@ -22,7 +22,7 @@ def modes():
     return jv.jam_modes(SCENE)
 
 
-def test_runs_in_a_jam_take_sixty_periods_of_the_lowest_frequency(monkeypatch):
+def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
     asked = []
     monkeypatch.setattr(answers_module, "simulate", lambda scene, until, **more: asked.append((until, more)))
     answers = Answers(SCENE)

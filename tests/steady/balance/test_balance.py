@@ -177,7 +177,7 @@ def unbalance_after(s, speeds, times, errors):
 
 
 @pytest.mark.parametrize(("name", "count"), [("one_mass", 2), ("two_mass", 3), ("three_mass", 2)])
-def test_runs_from_small_errors_balance_inside_the_exact_intervals_only(name, count):
+def test_runs_balance_inside_the_exact_intervals_only(name, count):
     """Six time constants each, on both sides of every boundary, whatever the criterion says of the same speed."""
     s = loaded(name, count)
     resonances = np.asarray(jv.natural_frequencies(s))
@@ -200,7 +200,7 @@ def test_runs_from_small_errors_balance_inside_the_exact_intervals_only(name, co
     assert np.all(end[~inside] > 4e-3), (speeds, growth, end)
 
 
-def test_light_loads_with_strong_drag_have_the_boundaries_of_the_criterion():
+def test_light_loads_with_strong_drag_follow_the_criterion():
     for name, count, top in (("one_mass", 2, 40.0), ("two_mass", 3, 90.0), ("three_mass", 2, 60.0)):
         s = loaded(name, count, mass=0.001, drag=5.0)
         exact = np.array(balanced_intervals(s, 12.0, top, points=POINTS))
@@ -210,7 +210,7 @@ def test_light_loads_with_strong_drag_have_the_boundaries_of_the_criterion():
 
 
 @pytest.mark.parametrize("polar", [0.093, 0.9], ids=["long rotor", "disc"])
-def test_rotor_with_gyroscopic_coupling_has_the_boundaries_of_the_criterion(polar):
+def test_gyroscopic_rotor_follows_the_criterion(polar):
     """The first balancing interval, exact to 1e-6: what turns backward is rightly left out of the functional."""
     s = rotor(polar, mass=0.05)
     said = np.asarray(jv.criterion(s).balancing[0])
@@ -238,7 +238,7 @@ def test_twenty_platforms():
     np.testing.assert_array_equal(balanced_growth(s, speeds) < 0.0, said)
 
 
-def test_criterion_holds_better_for_lighter_loads_and_for_stronger_drag_on_light_ones():
+def test_criterion_improves_for_lighter_loads_and_stronger_drag():
     """Loads of 0.1, 0.3 and 3 % of their platform's mass. On the heaviest, stronger drag makes it worse again."""
     speeds = np.linspace(12.0, 90.0, POINTS)
     found = jv.criterion_map(loaded("two_mass", 3), speeds=speeds, mass=[0.1, 0.3, 3.0], drag=[0.1, 1.0, 10.0])
@@ -336,7 +336,7 @@ def test_every_change_of_stability_is_halved_to_the_same_part(monkeypatch):
     np.testing.assert_allclose(found, [np.pi, 500.0], rtol=1e-9)
 
 
-def test_a_motion_without_a_spring_is_refused_whatever_holds_the_others():
+def test_motion_without_a_spring_is_refused():
     gyroscopic = rotor(0.1, stiffness=(1.1e6, 0.0))
     with pytest.raises(jv.InputError, match="leaves a motion of the rotor without a spring"):
         characteristic_speeds(gyroscopic)

@@ -291,7 +291,7 @@ def test_table_is_ready_for_json_and_covers_all_speeds():
         assert table["status"].startswith("every rotor speed")
 
 
-def test_machine_without_supports_is_named_and_balances_from_the_start():
+def test_free_machine_balances_at_all_speeds():
     machine = jv.two_mass(mass=(4.0, 3.0), stiffness=(0, 0), damping=(0, 0), link_stiffness=1e4, link_damping=3.0)
     result = jv.criterion(jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0)))
     assert CriterionStatus[result.status].startswith("no support")

@@ -13,7 +13,7 @@ from jaxvib.steady.balance.speeds import _free_and_held_modes, _inverse_root, ch
 @pytest.mark.parametrize(
     "port", [[3.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, -5.0], [0.3 - 2.0j, 1.0j, 4.0, -0.5], [1e-9, 7.0, 1.0, 0.0]]
 )
-def test_modes_are_those_of_the_matrix_and_of_what_the_port_leaves(port):
+def test_modes_are_those_of_the_full_and_the_pinned_matrix(port):
     random = np.random.default_rng(0)
     a = random.normal(size=(4, 4)) + (1j * random.normal(size=(4, 4)) if np.iscomplexobj(np.asarray(port)) else 0.0)
     square, c = a @ a.conj().T, np.asarray(port)

@@ -58,7 +58,7 @@ def test_followed_folds_are_those_of_the_whole_branch():
         np.testing.assert_allclose(slope[0], (sides[0] - sides[1]) / (2.0 * step), rtol=1e-5)
 
 
-def test_steps_are_no_longer_than_a_tenth_and_stay_below_the_most():
+def test_steps_are_at_most_a_tenth_and_bounded():
     far = _newton(lambda w: w - 1000.0, jnp.asarray(10.0), jnp.asarray(jnp.inf))
     np.testing.assert_allclose(far, 10.0 * 1.1**6, rtol=1e-12)
     np.testing.assert_allclose(_newton(lambda w: w - 1.0, jnp.asarray(10.0), jnp.asarray(jnp.inf)), 10.0 * 0.9**6, rtol=1e-12)
@@ -66,7 +66,7 @@ def test_steps_are_no_longer_than_a_tenth_and_stay_below_the_most():
     np.testing.assert_allclose(_newton(lambda w: w**2 - 110.0, jnp.asarray(10.0), jnp.asarray(20.0)), 110.0**0.5, rtol=1e-12)
 
 
-def test_an_undamped_resonance_has_no_amplitude_though_another_platform_rests():
+def test_undamped_resonance_has_no_amplitude():
     """The exciter's platform at its resonance, without damping and apart from the other one, which does not move."""
     machine = jv.two_mass(mass=(2.0, 1.0), stiffness=(8.0, 9.0), damping=(0.0, 0.0), link_stiffness=0.0, link_damping=0.0)
     alone = jv.Scene(machine, jv.balls(count=1, mass=0.01, radius=0.1, drag=1e-3), jv.ConstantSpeed(20.0))
@@ -77,7 +77,7 @@ def test_an_undamped_resonance_has_no_amplitude_though_another_platform_rests():
     assert np.isfinite(beside.displacement).all()
 
 
-def test_amplitudes_are_bounded_beside_those_of_the_lightest_platform():
+def test_amplitudes_are_bounded_by_the_lightest_platform():
     """Near an undamped resonance 1e12 times the imbalance over the lightest mass is an answer, however heavy another one is."""
     machine = jv.two_mass(mass=(2e6, 1.0), stiffness=(8e6, 9.0), damping=(0.0, 0.0), link_stiffness=0.0, link_damping=0.0)
     alone = jv.Scene(machine, jv.balls(count=1, mass=0.01, radius=0.1, drag=1e-3), jv.ConstantSpeed(20.0))

@@ -123,7 +123,7 @@ def turning_frame(scene, jam):
 
 
 @pytest.mark.parametrize("which", ["rotor together", "rotor opposite", "rotor unequal", "planar heavy"])
-def test_on_supports_alike_both_ways_jams_and_stability_are_exact(which):
+def test_jams_on_isotropic_supports_are_exact(which):
     scene, start, phase = {
         "rotor together": (rotor(9.2e-4), 169.6, [0.0] * 4),
         "rotor opposite": (rotor(1.24e-2, 0.0, 21.56), 271.1, [0.0, 0.13, -3.0, 3.14]),

@@ -108,7 +108,7 @@ def test_loads_side_by_side_carry_less_unbalance():
     np.testing.assert_allclose(np.sum(0.5 * places), loads.unbalance(), rtol=1e-14)
 
 
-def test_loads_side_by_side_move_as_the_lagrangian_of_a_rigid_arc_says():
+def test_loads_side_by_side_follow_the_lagrangian_of_a_rigid_arc():
     """Euler and Lagrange by automatic differentiation, each ball for itself at its place on the arc; SciPy's DOP853."""
     scene = side_by_side(effects=(jv.Gravity(),))
     orbit = jv.jam_orbit(scene, omega=26.0)
@@ -141,7 +141,7 @@ def test_loads_side_by_side_move_as_the_lagrangian_of_a_rigid_arc_says():
     assert bool(orbit.status == jv.OrbitStatus.found) and orbit.multipliers.shape == (3,)
 
 
-def test_loads_side_by_side_in_the_leading_order_and_in_scene_files():
+def test_loads_side_by_side_in_leading_order_and_files():
     scene = side_by_side()
     light = jax.tree.map(lambda x: x, eqx.tree_at(lambda s: (s.loads.mass, s.loads.drag), scene, (5e-6, 7e-11)))
     np.testing.assert_allclose(jv.jam_orbit(light, omega=26.0).rotor_speed, jam_rotor_speed(light, 26.0), rtol=1e-5)
@@ -151,12 +151,12 @@ def test_loads_side_by_side_in_the_leading_order_and_in_scene_files():
     assert jv.jam_modes(scene).select(1).amplitude < jv.jam_modes(side_by_side(own_radius=None)).select(1).amplitude
 
 
-def test_loads_that_would_have_to_pull_at_each_other_are_not_called_stable():
+def test_loads_that_would_have_to_pull_are_not_stable():
     orbit = jv.jam_orbit(side_by_side(), omega=40.0)
     assert bool(orbit.status == jv.OrbitStatus.held) and not bool(orbit.stable)
 
 
-def test_what_loads_side_by_side_push_with_is_what_those_behind_need():
+def test_contact_forces_are_those_that_trailing_loads_need():
     """Of a motion that is no balance: the mean over a period of m R cos(phi_j) y'' - b R^2 (n - phi_j'), summed up to each."""
     model, grid = assembled(side_by_side()), grid_of(33, False)
     deviation = lambda theta: 0.3 * np.sin(theta) + 0.1 * np.cos(2.0 * theta)  # noqa: E731
@@ -183,7 +183,7 @@ def test_loads_side_by_side_need_room_and_one_size():
         side_by_side(own_radius=-0.01)
 
 
-def test_modes_have_no_numbers_where_resonances_move_with_the_rotor():
+def test_gyroscopic_modes_have_no_numbers():
     with pytest.raises(jv.InputError, match="give omega or near"):
         jv.jam_orbit(rotor(0.093), mode=1)
 
@@ -194,7 +194,7 @@ def test_a_rotor_out_of_balance_has_no_periodic_jam():
         jv.jam_orbit(s, mode=1)
 
 
-def test_bodies_of_single_loads_have_together_the_numbers_of_the_one_that_all_are():
+def test_bodies_of_single_loads_sum_to_the_common_body():
     """Drag, inertia and unbalance of three balls named one by one, against m R, 7/5 m R^2 and b R^2 of each."""
     machine, drive = machines()["one_mass"], jv.ConstantSpeed(50.0)
     mass, drag = np.array([0.6, 1.2, 0.9]), np.array([0.7, 1.5, 1.1])

@@ -51,7 +51,7 @@ def test_special_points_of_light_loads_are_the_published_folds():
     np.testing.assert_allclose([p.rotor_speed for p in special], [0.7978, 0.4141, 5.1829, 1.3932], rtol=2e-4)
 
 
-def test_every_fold_of_a_coarse_diagram_is_found_to_its_last_digits():
+def test_folds_of_a_coarse_diagram_are_exact():
     """However soon others are found: what is left of dn/dOmega there, beside what is left 1e-6 away."""
     scene = published(eps=0.05).scene()
     found = jv.branches(scene, exact=True, points=25, least=0.25, most=2.0)
@@ -162,7 +162,7 @@ def test_an_onset_needs_a_kind_and_an_accuracy(given, says):
         ("symmetry", (0.2, 0.3), (0.9, 1.01), 0.273),
     ],
 )
-def test_load_mass_from_which_on_odd_modes_are_not_stable_everywhere(kind, between, omega, eps):
+def test_load_mass_at_which_odd_modes_lose_stability(kind, between, omega, eps):
     """eps = m/(kappa M2S): self-pins, confirmed by the time integrations above on both sides at eps = 0.3."""
     found = stability_onset(lambda x: published(eps=x).scene(), kind, between, omega=omega)
     np.testing.assert_allclose(found, eps, rtol=4e-3)

@@ -67,7 +67,7 @@ QUICK = ("two loads, gravity", "across and up")
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES])
-def test_orbit_multipliers_and_power_are_those_of_the_full_equations(name):
+def test_orbits_with_friction_satisfy_the_full_equations(name):
     make, omega, points = CASES[name]
     orbit = jv.jam_orbit(make(), omega=omega, points=points)
     scene = eqx.tree_at(lambda s: s.drive.speed, make(), orbit.rotor_speed)
@@ -119,7 +119,7 @@ def test_gradient_by_the_coefficient_by_differences():
     np.testing.assert_allclose(stored_jit(jax.jacfwd(lambda x: f(x)[0]))(x), reverse, rtol=1e-9)
 
 
-def test_loads_side_by_side_take_the_friction_of_each_at_its_place():
+def test_friction_of_loads_side_by_side_depends_on_their_place():
     """Each load for itself, at its own place on the arc; by differences of the sum."""
     loads = jv.balls(count=3, mass=0.5, radius=0.1, drag=0.7, own_radius=0.02)
     scene = scene_of(loads, RollingFriction(0.1, diameter=0.02), jv.Gravity())
@@ -153,7 +153,7 @@ def test_leading_order_is_the_balance_by_hand(reaction):
 
 
 @pytest.mark.slow
-def test_exact_modes_with_dry_friction_continue_those_of_light_loads():
+def test_exact_modes_with_friction_continue_light_modes():
     scene = alike(dry(1e-4), mass=1e-4, drag=1e-8)
     for k in (1, 2):
         np.testing.assert_allclose(jv.jam_orbit(scene, mode=k, points=8).omega, jv.jam_modes(scene).select(k).omega, rtol=1e-5)

@@ -14,7 +14,7 @@ from jaxvib.steady.orbits.jam_orbit import _between
 from jaxvib.steady.orbits.orbit import _swing
 
 
-def test_points_between_are_on_the_cubic_through_values_and_slopes():
+def test_points_between_follow_the_hermite_cubic():
     x = np.array([0.0, 1.0, 3.0, 3.5])
     cubic, slope = np.poly1d([1.0, -4.0, 2.0, 5.0]), np.polyder(np.poly1d([1.0, -4.0, 2.0, 5.0]))
     between, values = _between(x, cubic(x), slope(x))

@@ -153,7 +153,7 @@ def many(scene, omega, points):
     return jax.vmap(one)(omega)
 
 
-def test_every_point_of_the_published_diagram_for_light_and_heavy_loads():
+def test_all_points_of_the_published_diagram():
     omega = jnp.linspace(0.15, 2.0, 2000)
     for eps in (1e-6, 1e-3, 0.05, 0.3):
         _, residual, error = many(published(eps=eps).scene(), omega, 24)
@@ -172,7 +172,7 @@ def test_error_falls_exponentially_and_is_known():
     assert errors[1] < 1e-8 < 1e-4 * errors[0]
 
 
-def test_jams_are_found_from_load_speeds_that_are_far_from_theirs():
+def test_jams_are_found_from_distant_load_speeds():
     """Steps of Newton's method that lead away are shortened: from every load speed to one at which the rotor has its speed."""
     scene = published(eps=0.05, speed=3.0).scene()
     model, grid = assembled(scene), grid_of(16, True)
@@ -282,7 +282,7 @@ def test_at_a_fold_the_status_says_so():
     assert all(np.all(np.isfinite(slope)) for slope in jax.tree.leaves(slopes)) and abs(float(slopes.drive.speed)) > 1e2
 
 
-def test_reverse_derivatives_at_a_known_motion_are_those_of_the_search():
+def test_derivatives_at_a_known_orbit_equal_those_of_the_search():
     """The gradient asked alone starts from the motion, that within jit from the equations; where there is none it is 0."""
     scene = published(eps=0.05).scene()
 

@@ -61,7 +61,7 @@ def test_a_gradient_of_an_unstable_jam_is_not_taken_of_a_run():
 
 
 @pytest.mark.slow
-def test_where_light_loads_have_no_such_jam_the_exact_motion_is_there():
+def test_exact_motion_exists_without_a_light_jam():
     """The exact fold of a machine with one heavy load lies beyond that of light loads, 5.1829."""
     scene = published(speed=5.19, eps=0.05).scene()
     cost = jv.work_precision(scene, mode=3, until=30.0, tolerances=(1e-6,), solvers=["Tsit5"], repeats=1)
@@ -87,7 +87,7 @@ def test_a_run_up_is_measured_at_its_end():
         jv.work_precision(scene, mode=1)
 
 
-def test_a_final_state_is_told_apart_but_for_whole_turns_in_single_precision():
+def test_final_states_are_compared_up_to_whole_turns():
     cost = jv.work_precision(light(), "final_state", until=20.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
     error = {row.dtype: row.error for row in cost.rows}
     assert error.keys() == {"float64", "float32"} and 0.0 < error["float64"] < 1e-3 and error["float32"] < 0.1

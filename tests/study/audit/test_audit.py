@@ -53,7 +53,7 @@ def found():
     return jv.audit(SCENE, accuracy=2e-3, mode=1, possible=(SEAL,), repeats=0)
 
 
-def test_an_effect_changes_what_the_scene_with_and_without_it_say(found):
+def test_change_by_an_effect_is_that_of_both_scenes(found):
     with_, without = (jv.jam_orbit(scene, mode=1) for scene in (SCENE, BARE))
     gravity, _ = found.effects
     assert gravity.effect == "gravity" and gravity.present and gravity.tier == "exact orbit"
@@ -118,7 +118,7 @@ class Silent(jv.Effect):
 
 
 @pytest.mark.parametrize("scene", [BARE, ROTOR], ids=["platform", "rotor"])
-def test_a_scene_without_an_effect_traces_the_program_from_before(scene):
+def test_scene_without_an_effect_traces_the_same_program(scene):
     silent = jv.Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, Silent()))
     assert program(silent) == program(scene)
     names = [variant.name for variant in present_variants(silent, None)]
@@ -129,7 +129,7 @@ def test_a_scene_without_an_effect_traces_the_program_from_before(scene):
         assert program(variant.scene) == program(jv.Scene(scene.machine, scene.loads, scene.drive, left)) != program(scene)
 
 
-def test_every_effect_drive_and_coordinate_has_its_price_and_costs_nothing_where_it_is_not():
+def test_every_part_has_a_price_and_none_if_absent():
     rows = {(row.part, row.kind): row for row in prices()}
     assert {kind for part, kind in rows if part == "effect"} == set(EFFECTS)
     assert {kind for part, kind in rows if part == "drive"} == set(DRIVES)
@@ -235,7 +235,7 @@ def test_a_balanced_machine_is_judged_by_what_its_loads_could_do():
     assert row.advice == "negligible"
 
 
-def test_gravity_in_the_radial_load_is_what_the_bearing_paper_says():
+def test_gravity_in_the_radial_load_follows_the_paper():
     """The largest change over a turn of N = m (l f'^2 - g sin f), by `normal_force`: below 0.5 % above 157 rad/s only."""
     still = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
     loads = jv.pendulums(count=1, mass=0.05, radius=0.08, drag=0.0)

@@ -49,7 +49,7 @@ def test_large_viscous_swing_is_scipys():
     np.testing.assert_allclose(swing.angle, expected, atol=1e-6)
 
 
-def test_dry_friction_tends_to_the_sharp_sign_and_stops_where_it_stops():
+def test_dry_friction_converges_to_the_sharp_law():
     t = np.linspace(0.0, 80.0, 801)
     expected, stop = scipy_swing(ROD, t, 0.17, 0.0, 2e-4, 0.02)
     errors = []
@@ -136,7 +136,7 @@ def swings_with_slopes(x):
 
 @pytest.mark.parametrize("wrong", [dict(angle=jnp.nan), dict(dry=jnp.inf), dict(g=-9.81)])
 @no_host_checks()  # a program with these is compiled anew each time
-def test_a_swing_that_does_not_exist_leaves_those_beside_it_alone(wrong):
+def test_invalid_swing_leaves_the_others_unchanged(wrong):
     """As where a fit's step leads into nothing; their stops and slopes are looked for together."""
     right = dict(angle=0.3, dry=0.02, g=9.81)
     both = {name: jnp.asarray([value, wrong.get(name, value)]) for name, value in right.items()}

@@ -216,7 +216,7 @@ def outcome(change, adjoint=None):
     return jnp.stack([capture_time(run), jv.regime(scene, run.window).unbalance])
 
 
-def test_forward_derivatives_of_capture_time_and_of_what_is_left_of_the_imbalance():
+def test_derivatives_of_capture_time_and_remaining_imbalance():
     evaluate = stored_jit(outcome)
     assert 0.01 < float(evaluate(AT)[0]) < 1.0 and len(NUMBERS) == 14
     forward = np.asarray(stored_jit(jax.jacfwd(lambda x: outcome(x, diffrax.ForwardMode())))(AT))
