@@ -20,7 +20,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
-from jaxvib.units import traced
+from jaxvib.units.known import when_known
 
 __all__ = [
     "AbstractLinearModel",
@@ -167,9 +167,10 @@ def natural_frequencies(scene: Scene) -> Array:
     Source: the antiphase paper, equations (19), (23).
     """
     frequencies, lost = _natural_frequencies(checked(scene))
-    if not traced(frequencies) and np.asarray(lost).any():
+    is_lost = when_known(lambda lost, _: bool(np.any(lost)), lost, frequencies)
+    if is_lost:
         raise failure(FrequencyStatus.lost_digits)
-    return jnp.where(lost, jnp.nan, frequencies) if traced(lost) else frequencies
+    return jnp.where(lost, jnp.nan, frequencies) if is_lost is None else frequencies
 
 
 def estimated_frequencies(scene: Scene) -> Array:
@@ -238,8 +239,12 @@ def jammed_loads(scene: Scene) -> CircularLoads:
 
 def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
     """**Raises** `InputError` where it is known that no load has drag, or of `each` that one has none."""
-    if not traced(loads.drag) and not (np.all if each else np.any)(np.asarray(loads.drag) > 0.0):
-        raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+
+    def check(drag: np.ndarray | float) -> None:
+        if not (np.all if each else np.any)(np.asarray(drag) > 0.0):
+            raise InputError("loads.drag", "is 0; loads without drag never follow the rotor, give a drag greater than 0")
+
+    when_known(check, loads.drag)
 
 
 def require_one_point(scene: Scene) -> None:

@@ -17,7 +17,8 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import rebuilt
 from jaxvib.machine.scene import Scene, require_comparable
 from jaxvib.runtime.compat import evaluating
-from jaxvib.units import bounds_of_unknowns, require_real, traced
+from jaxvib.units import bounds_of_unknowns, require_real
+from jaxvib.units.known import is_known, when_known
 
 __all__ = ["allowed_unknowns", "checked", "made"]
 
@@ -46,7 +47,7 @@ def checked(scene: Scene) -> Scene:
     arrays = [_number(f"scene{jax.tree_util.keystr(path)}", leaf) for path, leaf in leaves]
     if any(new is not old for new, (_, old) in zip(arrays, leaves, strict=True)):
         scene = jax.tree.unflatten(structure, arrays)
-    if not any(traced(leaf) for leaf in arrays):
+    if is_known(arrays):
         numbers = structure, *((leaf.shape, leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, arrays))
         with evaluating():  # a derivative around this has no part in it, and would make it slower
             try:
@@ -70,7 +71,7 @@ def allowed_unknowns(scene: Scene) -> Array | None:
     >>> bool(stiff(4e4)), bool(stiff(-4e4)), allowed_unknowns(scene)
     (True, False, None)
     """
-    if not any(traced(leaf) for leaf in jax.tree.leaves(scene)):
+    if is_known(scene):
         return None
     with bounds_of_unknowns() as found:
         _rebuild(scene)
@@ -125,7 +126,11 @@ def _number(name: str, leaf: object) -> Array:
             leaf = jnp.asarray(leaf, dtype=float)
         except (TypeError, ValueError) as error:
             raise InputError(name, f"is {quoted(leaf)}, which is not a number; put one in, in SI units") from error
-    if not traced(leaf) and not np.all(np.isfinite(leaf)):
-        wrong = np.asarray(leaf)[~np.isfinite(leaf)].ravel()[0]
-        raise InputError(name, f"is {wrong}; a finite number is needed, see how it was computed")
+    when_known(functools.partial(_require_finite, name), leaf)
     return leaf
+
+
+def _require_finite(name: str, value: np.ndarray | float) -> None:
+    if not np.all(np.isfinite(value)):
+        wrong = np.asarray(value)[~np.isfinite(value)].ravel()[0]
+        raise InputError(name, f"is {wrong}; a finite number is needed, see how it was computed")

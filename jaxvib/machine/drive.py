@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.units import Number, number, traced
+from jaxvib.units import Number, number
+from jaxvib.units.known import when_known
 
 __all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
 
@@ -308,8 +309,7 @@ class InductionMotor(Motor):
         self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
         self.breakdown_torque = number(breakdown_torque, "N m", "drive.breakdown_torque", low=0.0, open_low=True)
         self.breakdown_slip = number(breakdown_slip, "", "drive.breakdown_slip", low=0.0, open_low=True)
-        if not traced(self.breakdown_slip) and not self.breakdown_slip < 1.0:
-            raise InputError("drive.breakdown_slip", f"is {float(self.breakdown_slip):g}; it must be below 1")
+        when_known(_require_below_one, self.breakdown_slip)
         self.inertia = number(inertia, "kg m^2", "drive.inertia", low=0.0, open_low=True)
         self.kind = "induction_motor"
 
@@ -317,3 +317,8 @@ class InductionMotor(Motor):
         """Kloss's formula."""
         slip = 1.0 - speed / self.speed
         return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)
+
+
+def _require_below_one(slip: float) -> None:
+    if not slip < 1.0:
+        raise InputError("drive.breakdown_slip", f"is {slip:g}; it must be below 1")

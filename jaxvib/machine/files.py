@@ -6,6 +6,7 @@ import difflib
 import inspect
 import tomllib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -23,7 +24,7 @@ from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
-from jaxvib.runtime.compat import traced
+from jaxvib.units.known import when_known
 
 __all__ = [
     "DRIVES",
@@ -302,14 +303,18 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
             continue
         if isinstance(value, tuple):
             fields[name] = [list(pair) for pair in value]
-        elif isinstance(value, (int, str)) or traced(value):  # one without a value is for the constructor, no file
+        elif isinstance(value, (int, str)):
             fields[name] = value
         else:
-            array = np.asarray(value, dtype=float)
             # A machine's single value is written as a number; one load's own value stays a list, apart from a shared one.
-            single = array.ndim == 0 or (array.size == 1 and isinstance(part, Machine))
-            fields[name] = array.item() if single else array.tolist()
+            plain = when_known(partial(_plain, unwrap=isinstance(part, Machine)), value)
+            fields[name] = value if plain is None else plain  # a value that is not known is for the constructor, no file
     return fields
+
+
+def _plain(value: np.ndarray | float, *, unwrap: bool) -> float | list:
+    array = np.asarray(value, dtype=float)
+    return array.item() if array.ndim == 0 or (array.size == 1 and unwrap) else array.tolist()
 
 
 _REST = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.units import Number, Numbers, count, number, numbers, traced
+from jaxvib.units import Number, Numbers, count, number, numbers
+from jaxvib.units.known import when_known
 
 __all__ = [
     "CircularLoads",
@@ -254,8 +256,7 @@ def _fit(loads: CircularLoads, r: Array) -> None:
     """**Raises** `InputError` for loads with an own radius that have no room side by side."""
     if not loads.alike:
         raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
-    if not traced(r) and not traced(loads.radius):
-        require_side_by_side(loads.count, float(loads.radius), float(r))
+    when_known(partial(require_side_by_side, loads.count), loads.radius, r)
 
 
 def side_by_side(count: int, ratio: Array) -> Array:

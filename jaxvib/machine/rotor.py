@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
-from jaxvib.units import Number, Numbers, number, numbers, traced
+from jaxvib.units import Number, Numbers, number, numbers
+from jaxvib.units.known import when_known
 
 __all__ = ["TEMPLATES", "PlanarRotor", "Rotor", "planar_rotor", "rotor"]
 
@@ -132,24 +134,15 @@ def rotor(
         if len(values) != 3:
             raise InputError(f"machine.{field}", f"has {len(values)} values; 3 are needed")
         given = [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
-        if not any(map(traced, given)):
-            one, two, three = map(float, given)
-            if min(one, three) < 0.0 or two**2 > one * three * (1.0 + 1e-9):
-                problem = (
-                    "would drive the rotor; the outer two must be at least 0, their product at least the middle one's square"
-                )
-                raise InputError(f"machine.{field}", f"{list(map(float, given))} {problem}")
+        when_known(partial(_require_passive, field), *given)
         return jnp.stack(given)
 
     places = numbers(position, "m", "machine.position", 2)
-    if stiffness_terms is None and not traced(places) and places[0] == places[1]:
-        problem = "where nothing holds the rotor's tilt; give two places, such as [0.165, -0.155]"
-        raise InputError("machine.position", f"puts both supports at {float(places[0]):g} m, {problem}")
+    if stiffness_terms is None:
+        when_known(_require_two_places, places)
     across = number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True)
     along = number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0)
-    if not traced(across) and not traced(along) and float(along) > 2.0 * float(across) * (1.0 + 1e-6):
-        most = f"no body has more than twice its transverse inertia, {2.0 * float(across):g} kg m^2 (a thin disc)"
-        raise InputError("machine.polar_inertia", f"is {float(along):g} kg m^2; {most}")
+    when_known(_require_body, across, along)
     return Rotor(
         mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
         transverse_inertia=across,
@@ -162,6 +155,24 @@ def rotor(
         damping_terms=terms(damping_terms, ("N s/m", "N s", "N m s"), "damping_terms"),
         kind="rotor",
     )
+
+
+def _require_passive(field: str, one: float, two: float, three: float) -> None:
+    if min(one, three) < 0.0 or two**2 > one * three * (1.0 + 1e-9):
+        problem = "would drive the rotor; the outer two must be at least 0, their product at least the middle one's square"
+        raise InputError(f"machine.{field}", f"{[one, two, three]} {problem}")
+
+
+def _require_two_places(places: np.ndarray) -> None:
+    if places[0] == places[1]:
+        problem = "where nothing holds the rotor's tilt; give two places, such as [0.165, -0.155]"
+        raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
+
+
+def _require_body(across: float, along: float) -> None:
+    if along > 2.0 * across * (1.0 + 1e-6):
+        most = f"no body has more than twice its transverse inertia, {2.0 * across:g} kg m^2 (a thin disc)"
+        raise InputError("machine.polar_inertia", f"is {along:g} kg m^2; {most}")
 
 
 class PlanarRotor(Machine):

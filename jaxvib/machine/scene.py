@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import numpy as np
 
@@ -10,7 +12,7 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import Loads
-from jaxvib.units import traced
+from jaxvib.units.known import when_known
 
 __all__ = ["Scene", "require_comparable"]
 
@@ -79,16 +81,20 @@ class Scene(eqx.Module):
         self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # shares of the largest and least numbers there are
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` for numbers, where they are known, of which one is lost in the rounding of another: loads too
-    heavy or too light beside the machine, drag too weak beside their inertia."""
-    platforms, mass, drag = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None)
-    if any(traced(x) for x in (platforms, mass, drag, drive.speed)):
-        return
-    each = np.broadcast_to(np.asarray(mass, dtype=float), (loads.count,))
+    """**Raises** `InputError` for known numbers of which one is lost in the rounding of another: loads too heavy or too light
+    beside the machine, drag too weak beside their inertia."""
+    parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
+    when_known(partial(_require_comparable, loads.count), *parts)
+
+
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # shares of the largest and least numbers there are
+def _require_comparable(
+    count: int, platforms: np.ndarray | float | None, mass: np.ndarray | float, drag: np.ndarray | float | None, speed: float
+) -> None:
+    each = np.broadcast_to(np.asarray(mass, dtype=float), (count,))
     if platforms is not None:
-        whole, total = float(np.sum(np.asarray(platforms, dtype=float))), float(np.sum(each))
+        whole, total = float(np.sum(platforms)), float(np.sum(each))
         if not _LEAST <= total / whole <= 1.0 / _LEAST:
             raise InputError(
                 "loads.mass",
@@ -96,10 +102,10 @@ def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
                 f"loads may have {_LEAST:g} to {1.0 / _LEAST:g} times the machine's mass",
             )
     if drag is not None:
-        share = np.asarray(drag, dtype=float) / (each * float(drive.speed))
+        share = np.asarray(drag, dtype=float) / (each * speed)
         lost = (share > 0.0) & (share < _LEAST)
         if np.any(lost):
-            least = _LEAST * float(np.max(each[lost])) * float(drive.speed)
+            least = _LEAST * float(np.max(each[lost])) * speed
             raise InputError(
                 "loads.drag",
                 f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by a radian, which is lost in "

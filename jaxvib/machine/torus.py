@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,8 +11,9 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.loads import Loads, Pressing, Twisting, require_side_by_side, side_by_side
-from jaxvib.units import Number, number, numbers, traced
+from jaxvib.units import Number, number, numbers
 from jaxvib.units import count as whole
+from jaxvib.units.known import when_known
 
 __all__ = ["TEMPLATE", "TorusBalls", "in_torus", "torus_balls"]
 
@@ -155,8 +157,7 @@ def torus_balls(
         number(value, "m", f"loads.{name}", low=0.0, open_low=True)
         for name, value in (("radius", radius), ("tube", tube), ("own_radius", own_radius))
     )
-    if not any(map(traced, (large, wide, own))):
-        _require_room(n, float(large), float(wide), float(own))
+    when_known(partial(_require_room, n), large, wide, own)
     return TorusBalls(
         mass=numbers(mass, "kg", "loads.mass", n, low=0.0, open_low=True, shared=True),
         radius=large,

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxvib.errors import ComputationError
-from jaxvib.runtime.compat import enumeration_names, enumeration_of, traced
+from jaxvib.runtime.compat import enumeration_names, enumeration_of
 from jaxvib.runtime.devices import on_device
 
 __all__ = ["Computed", "failure", "is_status", "member", "sentence", "status_name", "status_names"]
@@ -46,9 +46,11 @@ def status_names(status: eqx.Enumeration) -> np.ndarray:
     **Raises** `TypeError` for a status that is not known yet, under a JAX transformation.
     """
     (numbers,) = jax.tree.leaves(status)
-    if traced(numbers):
-        raise TypeError("a status under a JAX transformation has no name yet; look at it outside")
-    return np.asarray(enumeration_names(enumeration_of(status)))[np.asarray(numbers)]
+    try:
+        numbers = np.asarray(numbers)
+    except jax.errors.TracerArrayConversionError as error:
+        raise TypeError("a status under a JAX transformation has no name yet; look at it outside") from error
+    return np.asarray(enumeration_names(enumeration_of(status)))[numbers]
 
 
 def status_name(status: eqx.Enumeration) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 from matplotlib.axes import Axes
 
 from jaxvib.boundary import validated
@@ -12,7 +11,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.show.views import View, view_of
 from jaxvib.show.wheel import at_rest, caption
-from jaxvib.units import traced
+from jaxvib.units.known import require_known
 
 __all__ = ["checked_scene", "fit", "sketch"]
 
@@ -55,10 +54,7 @@ def checked_scene(scene: object) -> Scene:
     """The scene. **Raises** `InputError` for what is none, and for one whose numbers are not known."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    if any(traced(leaf) for leaf in jax.tree.leaves(scene)):
-        raise InputError(
-            "scene", "has numbers that are not known under a JAX transformation; draw it outside of jit, grad or vmap"
-        )
+    require_known(scene, "scene", "a drawing", "draw it outside")
     return scene
 
 

@@ -21,7 +21,8 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.refused import REFUSED, refuse_unknowns
-from jaxvib.units import Numbers, numbers, traced
+from jaxvib.units import Numbers, numbers
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -272,13 +273,18 @@ def _two_directions(scene: Scene) -> LinearModel:
             f"is {quoted(scene.machine.kind)}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
             "whirl needs a rotor such as rotor(...)",
         )
-    if not traced(carrier.stiffness) and not _held(np.asarray(carrier.stiffness)):
-        single = carrier.stiffness.dtype.itemsize < 8
+    when_known(_require_springs, carrier.stiffness)
+    return model
+
+
+def _require_springs(stiffness: np.ndarray) -> None:
+    """**Raises** `InputError` if a motion of the rotor has no spring."""
+    if not _held(stiffness):
+        single = stiffness.dtype.itemsize < 8
         problem = "leaves a motion of the rotor without a spring" + (", as far as single precision can tell" if single else "")
         raise InputError(
             "machine.stiffness", f"{problem}; give every motion one{', or use double precision' if single else ''}"
         )
-    return model
 
 
 def _held(stiffness: np.ndarray) -> bool:

@@ -31,7 +31,6 @@ import jax
 import numpy as np
 
 from jaxvib.results.fields import Plain
-from jaxvib.units import traced
 
 __all__ = ["UnknownIdentity", "difference", "digest", "identity"]
 
@@ -153,9 +152,10 @@ class _Description:
         return self._object(value)
 
     def _array(self, value: Any) -> Plain:
-        if traced(value):
-            raise UnknownIdentity("refers to an array under a JAX transformation")
-        array = np.asarray(value)
+        try:
+            array = np.asarray(value)
+        except jax.errors.TracerArrayConversionError as error:
+            raise UnknownIdentity("refers to an array under a JAX transformation") from error
         if array.dtype == object:
             return {"array": self.of(array.tolist())}
         kind = f"{array.dtype.str}{list(array.shape)}"

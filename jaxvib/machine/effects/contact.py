@@ -12,7 +12,8 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.loads import CircularLoads, Loads, own_radius
-from jaxvib.units import Number, number, traced
+from jaxvib.units import Number, number
+from jaxvib.units.known import when_known
 
 __all__ = ["LoadContact", "damping_ratio"]
 
@@ -63,9 +64,8 @@ class LoadContact(Effect):
         if restitution is not None:
             field = "effects.load_contact.restitution"
             self.restitution = number(restitution, "", field, low=0.0, open_low=True)
-            if not traced(self.restitution) and self.restitution > 1.0:
-                raise InputError(field, f"is {float(self.restitution):g}; it must be at most 1, where nothing is lost")
-            if traced(self.damping) or self.damping != 0.0:
+            when_known(_require_at_most_one, self.restitution)
+            if when_known(lambda damping: damping == 0.0, self.damping) is not True:
                 raise InputError(field, "goes without damping, which it stands for; leave one of them out")
         self.kind = "load_contact"
 
@@ -198,3 +198,9 @@ def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
         distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
         found.append(distance - 2.0 * own)
     return found or [jnp.ones_like(u[0])]
+
+
+def _require_at_most_one(restitution: float) -> None:
+    if restitution > 1.0:
+        field = "effects.load_contact.restitution"
+        raise InputError(field, f"is {restitution:g}; it must be at most 1, where nothing is lost")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.units import traced
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,8 +169,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     scene = checked(scene)
     require_one_point(scene)
     found, *parts = _characteristic_speeds(scene)
-    if not any(map(traced, parts)):
-        _require_port_that_moves(scene, *map(np.asarray, parts))
+    when_known(partial(_require_port_that_moves, scene), *parts)
     allowed = allowed_unknowns(scene)
     return found if allowed is None else jax.tree.map(lambda x: jnp.where(allowed, x, jnp.nan), found)
 

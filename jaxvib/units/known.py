@@ -1,0 +1,49 @@
+"""Checks of numbers that may have no value yet: JAX is transforming the computation they are part of (jit, grad, vmap)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from jaxvib.errors import InputError
+from jaxvib.runtime.compat import traced
+
+__all__ = ["is_known", "require_known", "when_known"]
+
+T = TypeVar("T")
+
+
+def is_known(*trees: PyTree) -> bool:
+    """True if every number in the trees has a value. Modules that plan a computation ask this, once for a question.
+
+    >>> is_known({"mass": 1.0}, None)
+    True
+    """
+    return not any(traced(leaf) for leaf in jax.tree.leaves(trees))
+
+
+def when_known(check: Callable[..., T], *values: PyTree) -> T | None:
+    """Return `check(*values)`, with numbers of Python and NumPy's arrays, or None if one of the numbers has no value yet.
+
+    >>> when_known(lambda mass: mass > 0.0, np.asarray(2.0))
+    True
+    """
+    return check(*jax.tree.map(_plain, values)) if is_known(values) else None
+
+
+def _plain(leaf: object) -> object:
+    array = np.asarray(leaf)
+    return array.item() if array.ndim == 0 else array
+
+
+def require_known(tree: PyTree, field: str, asking: str, instead: str) -> None:
+    """**Raises** `InputError` if a number of `field` has no value: the function `asking` decides by values in Python."""
+    if not is_known(tree):
+        problem = (
+            f"holds numbers that JAX is transforming (jit, grad, vmap, ...), and {asking} decides by their values in Python"
+        )
+        raise InputError(field, f"{problem}; {instead}")
