@@ -1,4 +1,4 @@
-"""What mkdocs runs: a page of the reference for each group of public names, and formulas as MathML, without a script."""
+"""Hooks of mkdocs: a reference page for each group of public names, and formulas as MathML, without a script."""
 
 import ast
 import contextlib

@@ -1,4 +1,4 @@
-"""How large programs may be: what a question costs before it is answered the first time grows with its operations.
+"""Budgets of program sizes: the cost of a first question grows with its operations.
 
 A budget is what was counted when it was written down, with a tenth to spare. One that is broken says that something is traced
 more often than before: make it less, or raise the budget together with the reason.

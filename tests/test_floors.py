@@ -23,7 +23,7 @@ FLOORS = (
     ("jaxvib.boundary",),
     ("jaxvib.errors", "jaxvib.imported"),
 )
-"""From the top down; a module may import from its own package and from floors below its own."""
+"""Floors from the top down; a module may import from its own package and from floors below its own."""
 
 MOST_FILES, MOST_LINES = 12, 400
 

@@ -13,7 +13,7 @@ import jaxvib as jv
 
 
 def test_programs_are_those_recorded():
-    """In a process of its own: the configuration of the tests changes some programs by an operation."""
+    """The programs are traced in a process of their own, since the configuration of the tests changes some by an operation."""
     if recorded()["jax"] != jax.__version__:
         pytest.skip(f"recorded with jax {recorded()['jax']}; record them anew by {golden.__file__} --write")
     done = subprocess.run([sys.executable, golden.__file__], capture_output=True, text=True)

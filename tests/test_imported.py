@@ -31,7 +31,7 @@ ROOT = pathlib.Path(jv.__file__).parents[1]
 
 @pytest.fixture
 def folder(tmp_path):
-    """Of a process that has asked nothing yet."""
+    """Cache folder of a process that has not asked anything yet."""
     jam.jams_of.stored.ready.clear()
     cache.keep_programs(tmp_path)
     yield tmp_path
@@ -118,7 +118,7 @@ def test_every_kind_of_replacement_is_noticed(change):
 
 
 def test_a_replacement_that_came_and_went_counts_too():
-    """What other functions traced meanwhile may be held by JAX."""
+    """JAX may hold programs that other functions traced meanwhile."""
     before = imported.code_state(look=True)
     with mock.patch.object(jam, "peak_force"):
         pass

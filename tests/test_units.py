@@ -60,7 +60,7 @@ def test_numbers_come_in_any_unit(given, unit, expected):
 
 
 def test_a_number_goes_to_a_program_as_it_is_known():
-    """What JAX does not hold is not moved to its device first, and has the precision that it would have there."""
+    """A number that JAX does not hold is not moved to its device first, and has the precision that it would have there."""
     plain, given = known_number("2 ms", "s", "field"), jnp.asarray(2e-3)
     assert isinstance(plain, np.ndarray) and plain.shape == () and plain.dtype == np.float64 and plain == 2e-3
     assert isinstance(known_number(given, "s", "field"), jax.Array)

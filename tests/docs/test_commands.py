@@ -87,7 +87,7 @@ def test_printed_command_runs(line, folder, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_all_printed_commands_run_one_after_the_other(folder, monkeypatch, capsys):
-    """In the order of the documentation: some read what others wrote."""
+    """The order is that of the documentation, since some commands read files that others wrote."""
     run_of = jv.simulate(jv.load_scene(folder / "machine.toml"), "6 s")
     for place in ("out", "out/simulate"):
         (folder / place).mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,8 @@ def test_example_runs(block, monkeypatch, tmp_path):
 
 
 def run_alone(block):
-    """In a process of its own, as a user's script: jaxvib prepares JAX by itself. As strict as `conftest.py` is."""
+    """Run a block in a process of its own, like a script of a user: jaxvib prepares JAX by itself. As strict as `conftest.py`
+    is."""
     clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     clean |= {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir), "JAX_NUMPY_RANK_PROMOTION": "raise"}
     clean |= {"MPLBACKEND": "Agg", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.0"}

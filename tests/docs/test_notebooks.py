@@ -16,7 +16,7 @@ NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
 
 
 def printed(notebook, but=()):
-    """What code cells print, those apart that have a tag of `but`."""
+    """Text printed by code cells, except those with a tag of `but`."""
     cells = [c for c in notebook.cells if c.cell_type == "code" and not set(but) & set(c.metadata.get("tags", []))]
     return "".join(o.text for c in cells for o in c.outputs if o.output_type == "stream")
 

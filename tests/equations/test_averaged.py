@@ -62,7 +62,7 @@ def test_averaged_is_the_mean_of_the_full_equations_over_a_turn(machine, load):
 
 @pytest.mark.parametrize("machine", machines())
 def test_equilibria_are_the_leading_order_jams(machine):
-    """Nothing changes where `jam_rotor_speed` says that the loads jam."""
+    """The averaged equations are at rest at the jams of `jam_rotor_speed`."""
     s = scene(machine, "balls")
 
     @stored_jit

@@ -147,7 +147,7 @@ def test_absent_effect_is_not_in_the_program():
 
 
 def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
-    """With every hook of an effect, a motor and a station taken out of the code, its program is the same, word for word."""
+    """The program is the same after all hooks of effects, a motor and a station are removed from the code."""
     s = scene("two_mass", "pendulums")
     state = random_state(s)
 
@@ -266,7 +266,7 @@ def test_two_directional_port_is_euler_lagrange(load):
 
 @pytest.mark.parametrize("kind", ["balls", "pendulums"])
 def test_a_circles_tangents_are_as_long_as_its_loads_say(kind):
-    """What the equations leave out for loads with `tangent_lengths` is what they would compute."""
+    """`tangent_lengths`, which lets the equations leave out terms, equals the value that they would compute."""
     load = loads()[kind]
     u, rate = (jnp.linspace(-2.0, 3.0, load.count),), (jnp.linspace(7.0, -5.0, load.count),)
     told = kinematics(load, u, rate)

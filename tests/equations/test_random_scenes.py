@@ -101,7 +101,7 @@ def differences(function, flat, along, h):
 
 @functools.cache
 def derivatives():
-    """Of jams and of a run of the two platforms, by every number of the scene, in one program each."""
+    """Derivatives of jams and of a run of the two platforms by every number of the scene, in one program each."""
     base = eqx.tree_at(lambda s: s.effects, SCENES["two platforms"], ())
     base = eqx.tree_at(lambda s: s.loads, base, jv.pendulums(count=2, mass=0.4, radius=0.1, drag=0.9, inertia=1e-3))
     restore = ravel_pytree(base)[1]

@@ -20,7 +20,7 @@ def started(coefficient, angle):
 
 @pytest.mark.parametrize("degrees", [60.0, 120.0, 50.0])
 def test_hanging_balls_roll_or_slide_by_their_force(degrees):
-    """On the upper half |N| = m g sin phi holds a ball from its other side: up to mu |N| it rolls, then it slides."""
+    """|N| = m g sin phi holds a ball on the upper half from its other side: up to mu |N| it rolls, then it slides."""
     angle = np.radians(degrees)
     pull, normal = -G * np.cos(angle), G * np.sin(angle)
     limit = (1.0 - 5.0 / 7.0) * abs(pull) / normal

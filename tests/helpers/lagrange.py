@@ -33,7 +33,7 @@ def residual(s, t, state, field):
     a = jnp.concatenate([field.velocity, field.rate[0], change[None]])
 
     def centre(x, s_):
-        """Where the axis is at the distance s_ from the mass centre."""
+        """Position of the axis at the distance s_ from the centre of mass."""
         if vertical:
             return jnp.stack([0.0 * x[1], x[1]])
         return x[:2] if planar else x[:2] + s_ * x[2:4]

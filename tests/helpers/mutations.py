@@ -126,7 +126,7 @@ def numbers_of_csv(text):
 
 
 def file_outcome(path, text, read, key, base, numbers=numbers_of_toml):
-    """Of a file mutated from `base`: refused, or accepted with another `key` if a number is another one.
+    """Outcome of a file mutated from `base`: refused, or accepted with another `key` if a number is another one.
 
     `base` is the original text and its key.
     """
@@ -145,7 +145,7 @@ def file_outcome(path, text, read, key, base, numbers=numbers_of_toml):
 
 
 def study_outcome(folder, text, original, base=STUDY):
-    """Of a study file mutated from `base`, see `file_outcome`."""
+    """Outcome of a study file mutated from `base`, see `file_outcome`."""
     return file_outcome(folder / "study.toml", text, load_study, lambda study: study.key, (base, original.key))
 
 
@@ -204,7 +204,7 @@ def mutate_store(store, rng):
 
 
 def store_outcome(store, asked, truth):
-    """Of a damaged store: reading it, computing on, and both with no number that is not the right one.
+    """Outcome of a damaged store: reading it, computing on, and both with no number that is not the right one.
 
     The `truth` is the dataset of the undamaged store.
     """
@@ -289,7 +289,7 @@ def mutate_result(path, rng):
 
 
 def result_outcome(path, prepared, alike):
-    """Of a changed saved result: refused, or the result that was saved; of a prepared one some result."""
+    """Outcome of a changed saved result: refused, or the result that was saved; of a prepared one some result."""
 
     def ask():
         found = jv.load(path)

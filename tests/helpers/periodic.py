@@ -13,7 +13,7 @@ import jaxvib as jv
 
 @functools.partial(jax.jit, static_argnums=0)
 def _rate(structure, leaves, size, y):
-    """Of a state as one vector, in parts of `size`: one program for all scenes of a structure."""
+    """Rate of a state given as one vector, in parts of `size`: one program for all scenes of a structure."""
     scene = jax.tree.unflatten(structure, leaves)
     nd = scene.machine.carrier().mass.shape[0]
     q, v, angle, rate = jnp.split(y * size, [nd, 2 * nd, 2 * nd + scene.loads.count])

@@ -1,4 +1,4 @@
-"""What is said about numbers that `equinox.tree_at` puts into a scene, when a question is asked."""
+"""Messages about numbers that `equinox.tree_at` puts into a scene."""
 
 import equinox as eqx
 import jax

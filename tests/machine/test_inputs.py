@@ -1,4 +1,4 @@
-"""What is said about wrong machines, loads, drives and effects."""
+"""Messages about invalid machines, loads, drives and effects."""
 
 import jax
 import jax.numpy as jnp

@@ -30,7 +30,7 @@ def at(f, a, turn, climb):
 
 
 def compared(run):
-    """What `RigidBall.coordinates` gives, of the end of a run."""
+    """Coordinates of `RigidBall.coordinates` at the end of a run."""
     end = jax.tree.map(lambda leaf: np.asarray(leaf[-1, 0]), (run.trajectory.state.angle, run.trajectory.state.rate))
     (f, a), (turn, climb) = end
     arm = RADIUS + GAP * np.sin(a)
@@ -114,7 +114,7 @@ def test_contact_rolls_exactly_below_the_limit_and_slides_above():
 
 @pytest.mark.parametrize("effects", [BOTH, BOTH[:1], BOTH[1:], (jv.FreeSpin(), jv.Sliding(0.1, 1e3))])
 def test_power_balances_the_energy_of_balls_that_spin_and_slide(effects):
-    """On a rotor that gives way, with friction of all kinds: sliding, and in the last case sticking while a slip dies out."""
+    """The rotor moves, with all kinds of friction: sliding, and in the last case sticking while a slip ends."""
     s = scene((*published(1e-4), *effects), drag=0.2)
 
     @stored_jit

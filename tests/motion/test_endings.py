@@ -1,4 +1,4 @@
-"""How runs end: what did not exist, did not finish or grew beyond all bounds, and what is known of the error."""
+"""Endings of runs: missing starts, unfinished runs, divergence, and the known error."""
 
 import diffrax
 import equinox as eqx
@@ -154,7 +154,7 @@ def test_estimates_that_nobody_can_make_are_refused(change, says):
 
 
 def test_a_motion_has_grown_where_one_platform_alone_has():
-    """By its place or by its speed, beyond 1e8 of what it was or of the natural units."""
+    """Divergence is a displacement or a velocity beyond 1e8 of its initial value or of the natural units."""
     s = scene("two_mass", "balls")
     unit = natural_units(s)
     first = jv.initial_state(s)

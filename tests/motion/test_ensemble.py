@@ -51,13 +51,13 @@ def nth(tree, k):
 
 
 def error_of(given, k, found, exact):
-    """What `Ensemble.error` is about, of run k."""
+    """Quantity that `Ensemble.error` estimates, for run k."""
     a, b = nth(found.state, k), nth(exact.state, k)
     return float(scaled_error(a, b, error_scale(b, natural_units(make(nth(given, k))[0]))))
 
 
 def test_another_process_need_not_trace_an_ensemble(tmp_path):
-    """Not even where `make` is written in the call: the program is that of the scenes it made."""
+    """This holds even if `make` is defined within the call: the program is that of the scenes it made."""
     cache.keep_programs(tmp_path)
     try:
         jv.ensemble(lambda value: make(value), values(), 5.0, stepsize_controller=jv.EqualSteps(200))
@@ -215,7 +215,7 @@ def test_ensembles_that_cannot_be(change, says):
 
 @pytest.mark.parametrize(("lanes", "together"), [(2, 2), (64, 3)])
 def test_so_many_runs_advance_together_as_is_asked(monkeypatch, lanes, together):
-    """As many as there are where more are allowed: nothing is computed for runs that nobody asked for."""
+    """At most the number of runs, so that nothing is computed for runs that do not exist."""
     seen = []
 
     def in_chunks(size, *_, **__):

@@ -199,8 +199,8 @@ def test_forward_gradient_through_time_is_the_implicit_one():
 
 
 def last_state(run):
-    """Where the motion ends. Amplitudes are the largest of many peaks, of which rounding chooses one: the derivatives of two
-    settled peaks differ by what has not died out yet, 1e-6."""
+    """The state at the end of a run. Amplitudes are the largest of many peaks, of which rounding chooses one: the derivatives
+    of two settled peaks differ by what has not died out yet, 1e-6."""
     return jnp.concatenate([leaf[-1] for leaf in jax.tree.leaves(run.window.state)])
 
 

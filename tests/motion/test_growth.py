@@ -118,7 +118,7 @@ def test_the_later_half_decides(late, name):
 
 
 def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
-    """In single precision of two motions that are 2 pi - 6.2 apart one may end at 3.1 rad, the other at -3.1 rad."""
+    """Two motions in single precision that are 2 pi - 6.2 apart may end at 3.1 rad and -3.1 rad."""
     ends = itertools.cycle([3.1, -3.1])
 
     def run(scene, stretch, *, start, **_):

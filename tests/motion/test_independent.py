@@ -201,7 +201,7 @@ def test_loads_in_contact_keep_their_order_and_their_distance():
 
 @pytest.mark.slow
 def test_the_energy_balance_closes_over_ten_thousand_turns():
-    """What the rotor gave less what was lost is what is stored: to 10 tolerances of that, and 0.1 of what it gave."""
+    """Energy from the rotor less losses is the stored energy: to 10 tolerances of that, and 0.1 of what it gave."""
     s, tolerance = published(speed=3.0, eps=0.05).scene(), jnp.asarray(1e-8)
     field, unit, start = jv.vector_field(s), natural_units(s), jv.initial_state(s)
 

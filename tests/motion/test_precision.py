@@ -60,7 +60,7 @@ def machine32(machine):
 
 
 def test_a_gradient_in_single_precision_is_that_of_double():
-    """Where angles are held within a turn, the method itself knows how: it must hold none of what is differentiated."""
+    """The method itself keeps angles within a turn, and must not hold any differentiated value."""
 
     def force(stiffness, machine):
         stiffer = eqx.tree_at(lambda s: s.machine.stiffness, machine, stiffness)

@@ -1,4 +1,4 @@
-"""What a run can do."""
+"""Methods of a run."""
 
 import types
 

@@ -24,7 +24,7 @@ def test_settle_names_a_motion_that_left_its_mode():
 
 
 def test_settle_does_not_pass_a_jam_that_only_glued_loads_keep():
-    """By slope mode 5 is stable; two balls in it part, and balance the rotor."""
+    """Mode 5 is stable by slope, but two balls in it separate and balance the rotor."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     s = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=5.0), jv.ConstantSpeed(100.0))
     assert bool(jv.jam_modes(s).select(3).stable)
@@ -90,7 +90,7 @@ def test_a_motion_that_beats_has_settled_in_the_mean():
 
 
 def test_a_balanced_rotor_settles_although_its_rounding_does_not():
-    """Nothing is left of its amplitude but what changes from turn to turn."""
+    """Only changes from turn to turn remain of its amplitude."""
     s, start = two_pendulums(mass=0.2, drag=1.94, imbalance="8 g m")
     run = jv.settle(s, start=start, stretches=40)
     assert run.status_name == "done" and run.regime.label == "balanced" and float(run.drift) < 1e-6
@@ -175,7 +175,7 @@ def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
 
 @pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])
 def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
-    """Of 100 slow periods each; a whole number of them in every quarter."""
+    """A stretch has 100 slow periods; every quarter has a whole number of stretches."""
     run, seen = small_run(save="window"), []
     monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *_, **__: run)
     monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
@@ -185,7 +185,7 @@ def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
 
 @pytest.mark.parametrize("periods", [100, 30])
 def test_a_stretch_is_so_many_periods_of_the_slowest_resonance(monkeypatch, periods):
-    """In whole turns of the rotor, which is three of this machine's units fast."""
+    """A stretch has a whole number of turns of the rotor, which turns three times in a time unit of this machine."""
     asked, run = [], small_run(save="window")
     monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda _, until, **__: asked.append(float(until)) or run)
     jv.settle(small_machine(), start=small_start(), periods=periods, stretches=1, throw=False)

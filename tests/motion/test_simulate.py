@@ -157,13 +157,13 @@ def test_a_run_that_another_is_compared_with_measures_nothing(monkeypatch):
 
 
 class Asked(Exception):
-    """What the engine was called with."""
+    """Arguments with which the engine was called."""
 
 
 @pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()])
 @pytest.mark.parametrize("double", [True, False], ids=["float64", "float32"])
 def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, double, adjoint):
-    """In single precision the engine's own, which alone keeps angles within a turn."""
+    """The engine's own method is used in single precision, because it alone keeps angles within a turn."""
 
     def asked(scene, end, state, solver, *_):
         raise Asked(solver)
@@ -186,7 +186,7 @@ def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, doub
 
 
 def test_next_tolerance_has_a_safety_margin(monkeypatch):
-    """Of an error 10, 1e3 and 1e9 times what is asked, and of one that nobody knows."""
+    """The errors are 10, 1e3 and 1e9 times the requested one, and an unknown one."""
     base = small_run(save="window")
     for times, low, high in (
         (10.0, 1e-3, 0.1),

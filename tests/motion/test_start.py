@@ -1,4 +1,4 @@
-"""How a run begins: at rest, in a jam, spun up, or in a given state."""
+"""Starts of runs: at rest, in a jam, with a spin-up, from a given state."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -20,7 +20,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 @pytest.mark.parametrize("effects", [(), (jv.Gravity(),)])
 @pytest.mark.parametrize("lanes", [False, True])
 def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effects, lanes):
-    """On numbers in lanes, on arrays where one run has several loads."""
+    """Numbers in a batch, and arrays if one run has several loads."""
     s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
     state, field = some_state(s), jv.vector_field(s)
     motion = PackedSystem(field, state, lanes=lanes)
@@ -33,7 +33,7 @@ def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effect
 
 @pytest.mark.parametrize("name", ["imbalance, spin-up", "imbalance, dc", "supports", "friction, run-up", "contact"])
 def test_equations_are_the_same_on_numbers(name):
-    """As they are integrated."""
+    """The equations as they are integrated."""
     s = case(name)
     state, t = rotor_state(s, 5), jnp.asarray(0.7)
     motion = PackedSystem(jv.vector_field(s), state, lanes=True)
@@ -57,7 +57,7 @@ def test_equations_of_many_operations_stay_on_arrays():
 @pytest.mark.parametrize("name", ["friction, exact, dc", "imbalance, dc", "contact"])
 @pytest.mark.parametrize("solver", [None, UnrolledDopri8(), LoopDopri8()])
 def test_a_state_comes_back_as_it_was(name, solver):
-    """From a vector, from a tuple of numbers, with angles that are wrapped and with such that are not."""
+    """Both from a vector and from a tuple of numbers, with wrapped angles and without."""
     state = rotor_state(case(name), 5)
     for wrapped in (False, True):
         motion = PackedSystem(jv.vector_field(case(name)), state, wrapped=wrapped, solver=solver)
@@ -68,7 +68,7 @@ def test_a_state_comes_back_as_it_was(name, solver):
 
 @pytest.mark.parametrize("machine", ["one_mass", "two_mass"])
 def test_wrapping_counts_every_turn(machine):
-    """Of numbers that are held one by one, and of a vector of them."""
+    """Both for numbers held one by one and for a vector."""
     s = scene(machine, "balls")
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
     for together in (False, True):

@@ -27,7 +27,7 @@ def test_a_run_that_needs_exactly_the_allowed_steps_is_done():
 
 
 def decided(error, before=1.0, y0=0.5, y1=-2.0, unit=1.0, relative=1.0, dtype=jnp.float64):
-    """What the controller of the tolerance 1e-3 decides of a step from 2 to 3 with this error, after one of the ratio
+    """Decision of the controller with the tolerance 1e-3 about a step from 2 to 3 with this error, after one with the ratio
     `before`."""
     y0, y1, error = (jnp.asarray(x, dtype) for x in (y0, y1, error))
     control = PIController(jnp.asarray(1e-3, dtype), jnp.asarray(unit, dtype), jnp.asarray(relative, dtype))
@@ -41,7 +41,7 @@ def decided(error, before=1.0, y0=0.5, y1=-2.0, unit=1.0, relative=1.0, dtype=jn
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.parametrize(("ratio", "before"), [(0.3, 1.0), (0.9, 0.2), (0.05, 0.7), (2.0, 0.5), (7.0, 0.5)])
 def test_steps_follow_from_the_errors_of_this_step_and_the_last(ratio, before, dtype):
-    """Of the ratio e of error and tolerance: accepted up to 1, the next step longer by 0.88 e^(-3/32) e_before^(2/32); else
+    """The ratio e is error over tolerance: accepted up to 1, the next step longer by 0.88 e^(-3/32) e_before^(2/32); else
     shorter by 0.88 e^(-4/32), and what was before stays. In single precision 0.97 in place of 0.88."""
     allowed = 1e-3 * (1.0 + 2.0)  # in units of 1 and of the larger of the two states
     accept, start, step, kept, fine = decided(-ratio * allowed, before, dtype=dtype)
@@ -60,7 +60,7 @@ def test_steps_change_by_no_more_than_five_times_and_a_fifth():
 
 
 def test_the_largest_error_of_all_parts_decides():
-    """In units of each entry's own and of its own size."""
+    """Errors are relative to the unit and the size of each entry."""
     entries = decided([1e-3, 5e-3], y0=[0.0, 1.0], y1=[0.0, 0.0], unit=[1.0, 3.0], relative=[7.0, 2.0])
     np.testing.assert_allclose(entries[3], 1.0, rtol=1e-12)  # 1e-3/1e-3, and 5e-3/(3e-3 + 2e-3)
     control = PIController(jnp.asarray(1e-3), (jnp.asarray(1.0),) * 3, (jnp.asarray(0.0),) * 3)

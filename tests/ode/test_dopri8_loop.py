@@ -19,7 +19,7 @@ assert_close = functools.partial(np.testing.assert_allclose, equal_nan=False)
 
 @pytest.fixture(autouse=True)
 def _nan_where_a_run_fails():
-    """In place of an error: programs that can raise one are compiled anew each time."""
+    """NaN in place of an error: programs that can raise one are compiled anew each time."""
     with no_host_checks():
         yield
 

@@ -78,7 +78,7 @@ def test_derivatives_are_those_of_the_steps_taken(right):
 
 
 def test_steps_chosen_again_are_other_steps(right):
-    """What noting the steps is for: without it the same roundings cost many thousand times as much."""
+    """Recorded steps are needed because choosing steps again amplifies roundings many thousand times."""
     adjoint = diffrax.RecursiveCheckpointAdjoint()
     reverse = jnp.stack(stored_jit(jax.jacrev(lambda args: run(args, again=rounded, adjoint=adjoint)))(ARGS))
     assert float(jnp.max(jnp.abs(reverse - right))) > 1e-7 * float(jnp.max(jnp.abs(right)))
@@ -122,13 +122,13 @@ def test_given_steps_need_no_noting(controller):
 
 @pytest.mark.parametrize("max_steps", [2**17, 2**20])
 def test_states_that_were_not_noted_are_computed_again(right, max_steps):
-    """Of so many steps only every 2nd and 16th state is noted; the last stretch is a short one."""
+    """Only every 2nd and 16th state is recorded; the last stretch is shorter."""
     reverse = jnp.stack(stored_jit(jax.jacrev(lambda args: run(args, max_steps=max_steps)))(ARGS))
     np.testing.assert_allclose(reverse, right, atol=1e-12 * float(jnp.max(jnp.abs(right))))
 
 
 def test_states_within_the_first_step_have_derivatives():
-    """By where the motion begins: a state that is saved there moves with it, one within the first step as forward mode says."""
+    """A state saved within the first step depends on the start in the same way as in forward mode."""
 
     def value(y0, adjoint=None):
         save = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=jnp.asarray([0.0, 0.06]))])

@@ -121,7 +121,7 @@ def test_primitives_are_known_by_themselves_and_not_by_name():
 
 
 def test_constant_zero_leaves_no_term_but_a_zero_argument_does():
-    """Which tells the two apart where the other factor is infinite."""
+    """The difference matters if the other factor is infinite."""
 
     def function(c, x):
         return jnp.stack([jnp.dot(jnp.array([1.0, 0.0]), x), jnp.dot(c, x)])
@@ -135,7 +135,7 @@ def test_constant_zero_leaves_no_term_but_a_zero_argument_does():
 
 
 def expanded(jaxpr):
-    """For each result the operations that it takes if all are computed anew for each use, but those of divisions."""
+    """Number of operations of each result if shared values are computed anew for each use, without divisions."""
     cost = {}
     for equation in jaxpr.eqns:
         total = 1 + sum(cost.get(v, 0) for v in {v for v in equation.invars if not hasattr(v, "val")})

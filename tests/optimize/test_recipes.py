@@ -42,7 +42,7 @@ def test_one_spring_is_chosen_to_be_exchanged():
 
 
 def test_springs_are_ranked_by_the_best_that_each_search_found(monkeypatch):
-    """Not by where its other starts ended."""
+    """The order does not depend on the end points of other starts."""
     ends = {"machine.stiffness[0]": [3.0, 9.0], "machine.stiffness[1]": [4.0, 4.0], "machine.link_stiffness[0]": [1.0, 99.0]}
 
     def search(space, objective, *, starts, verify):

@@ -1,4 +1,4 @@
-"""What a person reads of a search, from results with known numbers."""
+"""Text and tables of a search, from results with known numbers."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""What a search puts together: the table, the tiers that check it, which of several searches is the best."""
+"""Results of a search: the table, the tiers that verify it, the best of several searches."""
 
 import dataclasses
 import math
@@ -122,7 +122,7 @@ def test_wrong_questions_are_said_in_one_sentence():
 
 
 def test_unstable_modes_are_not_verified():
-    """Of mode 4 the loads slide to mode 3, in mode 5 they part: neither has amplitudes to be told."""
+    """Loads slide from mode 4 to mode 3, and separate in mode 5: neither mode has verified amplitudes."""
     fast = scene("two_mass", speed=120.0)
     for mode in (4, 5):
         multiplier = float(jv.jam_orbit(fast, mode=mode).multiplier)
@@ -197,7 +197,7 @@ def test_the_mode_of_a_search_is_that_of_its_objective():
 
 
 def test_searches_of_all_numbers_of_loads_count(monkeypatch):
-    """Of two, three and four loads: the least is of three, the last has no design; what all of them drew is told."""
+    """Searches with two, three and four loads: three are best, four have no design, and all starts are counted."""
     none = Optimality(np.zeros((1, 0)), np.zeros((1, 0)), np.zeros((1, 1)), np.zeros(1))
 
     def choose(problem, options, tell):

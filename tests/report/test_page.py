@@ -19,7 +19,7 @@ HOSTILE = "<script>alert('x')</script>&\"<img src=http://evil.example/x onerror=
 
 
 class Page(html.parser.HTMLParser):
-    """What tags a page has, whether each is closed, and what its attributes point at."""
+    """Tags of a page, whether each is closed, and the targets of their attributes."""
 
     VOID = ("meta", "img", "br")
 

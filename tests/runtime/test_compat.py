@@ -1,4 +1,4 @@
-"""What may change in a new version of JAX, XLA or diffrax: each test names one thing."""
+"""Properties of JAX, XLA and diffrax that may change in a new version; each test names one."""
 
 import importlib
 import importlib.metadata

@@ -13,7 +13,7 @@ import jaxvib as jv
 
 @pytest.mark.parametrize("name", ["arctan", "arctan2", "arcsin", "sin", "cosh", "exp", "log", "expm1", "log1p", "cbrt", "tanh"])
 def test_functions_of_long_arrays_are_right_under_the_flags(name):
-    """With vectors of 512 bits a code generator of XLA gave 0 for the arctangent of 64 numbers and more."""
+    """A code generator of XLA with vectors of 512 bits gave 0 for the arctangent of 64 numbers and more."""
     x = np.linspace(0.01, 0.99, 1000)
     given = (x, x[::-1]) if name == "arctan2" else (x,)
     found = jax.jit(getattr(jnp, name))(*given)

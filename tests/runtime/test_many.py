@@ -60,7 +60,7 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
 
 
 def test_other_threads_begin_when_a_known_program_runs_again(monkeypatch, tmp_path, unwatched):
-    """Of a new program nobody else runs anything while the first one is at work; of a known one others do."""
+    """Nothing else runs beside the first item of a new program; other items run beside a known one."""
     monkeypatch.setattr(many, "cores", lambda: 2)
     keep_programs(tmp_path)
     threads, both = [], threading.Event()
@@ -106,7 +106,7 @@ def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
 
 
 def test_nobody_waits_for_a_thread_that_has_not_begun(monkeypatch):
-    """Where all others are busy, with what asks for threads itself for example, the caller's computes everything."""
+    """The calling thread computes everything if all others are busy, for example with work that needs threads itself."""
     pool, free = ThreadPoolExecutor(1), threading.Event()
     monkeypatch.setattr(many, "_threads", lambda: pool)
     busy = pool.submit(free.wait)

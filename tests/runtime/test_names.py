@@ -22,7 +22,7 @@ assert "jax" in sys.modules and not {"matplotlib", "diffrax", "pint", "rich", "o
 
 
 def test_no_name_loads_pictures():
-    """Who draws nothing does not wait for matplotlib: only the names that draw load it."""
+    """A user who draws nothing does not wait for matplotlib: only the names that draw load it."""
     names = sorted(set(jv.__all__) - {"animate", "sketch"})
     code = f"import sys, jaxvib; [getattr(jaxvib, name) for name in {names}]; assert 'matplotlib' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -30,7 +30,7 @@ def wave(x, shift, name):
 
 
 def from_wave(found, x, shift, name):
-    """What is known of a wave that was found: its values, as if the sine had been searched for."""
+    """Outputs that follow from a known wave, as if the sine had been searched for."""
     told.append(name)
     sine = jax.lax.stop_gradient((found.values - shift) / x) + jnp.cos(x) * (x - jax.lax.stop_gradient(x))
     return Wave(sine * x + shift, None, None, found.name)
@@ -227,7 +227,7 @@ def test_what_lies_beneath_a_tracer_is_found(tracer):
 
 @pytest.mark.parametrize("asked", [from_wave], indirect=True)
 def test_a_reverse_derivative_is_taken_of_what_the_result_tells(asked):
-    """Of the function, traced once more, where that is not all that is asked for."""
+    """The function is traced once more if other outputs are needed."""
     function, _ = asked
     with pytest.MonkeyPatch.context() as patch:
         for name in ("_noted", "_pulled"):

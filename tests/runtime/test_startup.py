@@ -1,4 +1,4 @@
-"""What jaxvib sets by itself at the first question."""
+"""Settings that jaxvib makes at the first question."""
 
 import os
 import subprocess

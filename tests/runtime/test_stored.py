@@ -283,7 +283,7 @@ def test_what_cannot_be_stored_still_runs(folder):
 
 
 def test_checks_at_run_time_keep_no_program_from_the_disk(folder):
-    """Those of Equinox and diffrax become NaN in place of errors, which need a callback."""
+    """Checks of Equinox and diffrax become NaN in place of errors, which need a callback."""
     function = programs.cached(checked)
     assert float(function(jnp.asarray(2.0))) == 2.0 and np.isnan(function(jnp.asarray(-2.0)))
     assert len(list(folder.iterdir())) == 1

@@ -21,7 +21,7 @@ def test_workers_compute_what_one_process_does(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_scheduler_that_is_none(tmp_path):
-    """Nobody is there, or somebody who answers something else."""
+    """The address has no listener, or one that is no scheduler."""
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"

@@ -68,7 +68,7 @@ ARGUMENTS = {
         {"quantity": amplitude(mode=1), "level": 0.8, "tolerances": {"machine.mass": 0.06}, "samples": 32, "seed": 1},
     ),
 }
-"""By quantity its arguments, and for every argument another value."""
+"""Arguments of each quantity, with another value for every argument."""
 
 
 def build(name):

@@ -27,7 +27,7 @@ class TorusPoints(Loads):
         return arm * jnp.cos(f), arm * jnp.sin(f), -self.tube * jnp.cos(a)
 
     def rest(self):
-        """At the outer equator."""
+        """The outer equator."""
         return jnp.full((self.count,), -0.5 * jnp.pi), jnp.full((self.count,), 0.5 * jnp.pi)
 
     def inertia_factor(self):

@@ -65,7 +65,7 @@ def motor_driven():
 
 
 def numbers_for(scene):
-    """As many numbers of -1 to 1 as the scene has numbers."""
+    """Random numbers from -1 to 1, as many as the scene has numbers."""
     size = ravel_pytree(scene)[0].size
     return st.lists(NUMBERS, min_size=size, max_size=size).map(np.asarray)
 

@@ -13,7 +13,7 @@ class RigidBall:
         self.inertia = 0.4 * mass * own**2
 
     def normal(self, x, v):
-        """From the tube's middle line through the ball's centre, and its rate."""
+        """Unit vector from the centre line of the tube through the centre of the ball, and its rate."""
         h = np.hypot(x[0], x[1])
         out = np.array([x[0] / h, x[1] / h, 0.0])
         rise = out @ v

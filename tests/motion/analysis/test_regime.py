@@ -133,7 +133,7 @@ def rubbing(lever, width, speed=100.0):
 
 
 def slipped(s, until=0.5, from_rest=False, tolerance=1e-9, **options):
-    """How far the pendulum falls back behind the shaft, that it turned with at first or hung still beside, rad."""
+    """Angle by which the pendulum falls back behind the shaft, rad; it starts at the shaft's speed or at rest."""
     rate = jnp.zeros(1) if from_rest else s.drive.speed[None]
     start = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (rate,))
     run = jv.simulate(s, until, start=start, samples=2, stepsize_controller=jv.Tolerance(tolerance), **options)
@@ -176,7 +176,7 @@ def test_regime_under_jit_and_vmap():
 
 
 def test_remaining_moment_is_relative_to_the_radius_of_gyration():
-    """Where the loads run at the port they have no levers of their own: J_t = 0.479 kg m^2 of 37 kg, four times 0.05 kg."""
+    """Loads at the port have no levers of their own: J_t = 0.479 kg m^2 of 37 kg, four times 0.05 kg."""
     s, motion = made([0.0, np.pi, np.pi, 0.0], 460.0)
     machine = eqx.tree_at(lambda m: m.stations, s.machine, jnp.asarray(0.0))
     found = jv.regime(jv.Scene(machine, s.loads, s.drive, (jv.MomentImbalance(2e-5),)), motion)

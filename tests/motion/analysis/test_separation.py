@@ -19,7 +19,7 @@ def three_balls(**given):
 
 
 def two_balls(drag, speed, mass=0.5):
-    """By slope the upper jam is stable; two balls in it separate, and balance the rotor."""
+    """A scene whose upper jam is stable by slope; two balls in it separate, and balance the rotor."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
     return jv.Scene(machine, jv.balls(count=2, mass=mass, radius=0.1, drag=drag), jv.ConstantSpeed(speed))
 

@@ -28,7 +28,8 @@ def spun_up(s, speed, duration):
 
 
 def test_envelope_of_an_isotropic_rotor_is_exact():
-    """Nothing is dropped then: gyroscopic terms, stations along the axis, the loads' own reaction, parted loads, from rest."""
+    """Nothing is dropped for such a rotor: gyroscopic terms, stations along the axis, reaction of the loads, separate loads,
+    from rest."""
     machine = jv.rotor(
         mass=37.0,
         transverse_inertia=0.479,

@@ -36,7 +36,7 @@ def run_out(drag, until=5.0):
 
 @pytest.mark.parametrize(("drag", "damping", "count"), [(1.0, 0.0, 1), (1e4, 0.0, 3), (1.0, 1e6, 2)])
 def test_fastest_decay_is_that_of_the_dense_damping_matrix(drag, damping, count):
-    """Of all angles, the port lessens the loads' inertia most where they move along it."""
+    """The port reduces the inertia of a load most if the load moves along it."""
     scene = dragged(drag, damping, count)
     p = plain(scene)
     along = [p.forces(0.0, np.r_[np.zeros(2), np.full(count, a), np.zeros(count)])[0] for a in np.linspace(0.0, np.pi, 9)]
@@ -65,7 +65,7 @@ def test_runs_of_any_drag_are_those_of_scipys_radau():
 
 
 def test_a_locked_load_is_an_imbalance():
-    """Of 1e-9 kg with drag / mass of 1e9 1/s on a rotor whose imbalance moves the machine."""
+    """The load has 1e-9 kg and drag / mass of 1e9 1/s, on a rotor whose imbalance moves the machine."""
     machine = jv.one_mass(mass=70.0, stiffness=3e4, damping=580.0)
     loads = jv.pendulums(count=1, mass=1e-9, radius=1e-3, drag=1.0)
     run = jv.simulate(jv.Scene(machine, loads, jv.ConstantSpeed(13.0), (jv.StaticImbalance(2.66),)), 8.0, save="window")
@@ -80,7 +80,7 @@ def test_a_run_out_of_steps_names_the_drag():
 
 
 def test_unresolved_runs_are_named(monkeypatch):
-    """Where numbers are unknown the steps given are explicit."""
+    """Explicit steps are given for unknown numbers."""
     from jaxvib.motion import ensemble
 
     monkeypatch.setattr(ensemble, "steps_of", lambda *_: (1.0, False))

@@ -114,8 +114,8 @@ def test_held_quantities_are_corrected_at_every_step(start):
 
 
 def test_the_first_step_goes_along_what_is_held():
-    """Of the gradient's part along x + y = const Adam's first step takes the signs: both numbers by the rate, one up, one
-    down; what was off, the sum by 0.4 of 7, is taken off both alike. A number at its bound stays there."""
+    """Adam's first step takes the signs of the gradient's part along x + y = const: both numbers by the rate, one up, one down;
+    what was off, the sum by 0.4 of 7, is taken off both alike. A number at its bound stays there."""
     total = plain("sum", lambda x, y: x + y)
     problem = problem_of(DesignSpace(SCENE, FREE, [hold(total, 7.0)]), plain("bowl", lambda x, y: bowl(x, y, jnp.log)), [], 2)
     first = run(problem, np.array([[0.2, 0.475], [0.0, 0.725]]), 1).point

@@ -129,7 +129,7 @@ def test_evolutions_begin_anew_with_twice_the_population(monkeypatch):
 
 
 def test_an_evolution_counts_and_tells_what_it_tries():
-    """Of x > 5 alone there is the objective: half of what is drawn at first. Breaking x + y <= 9 costs."""
+    """The condition x > 5 alone has the objective: half of what is drawn at first. Breaking x + y <= 9 costs."""
     problem = problem_of(
         DesignSpace(SCENE, FREE),
         plain("half", lambda x, y: jnp.where(x > 5.0, (x - 6.0) ** 2 + (y - 5.0) ** 2 + 2.0, jnp.nan)),

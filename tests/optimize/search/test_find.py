@@ -1,4 +1,4 @@
-"""From starts to the best designs: which count as the best, which are gone on from, how catalogues are chosen from."""
+"""Search from starts to the best designs: ranking, continuation, choice from catalogues."""
 
 import itertools
 

@@ -14,7 +14,7 @@ from optimize.search.problem import evaluate, problem_of
 
 
 def shape(equalities=0, demands=0, parts=1):
-    """What the model asks of a problem."""
+    """Shape of a problem for the model."""
     return SimpleNamespace(equalities=equalities, demands=(None,) * demands, parts=parts)
 
 
@@ -68,8 +68,8 @@ def test_pieces_about_as_large_as_the_largest_are_at_a_kink():
 
 
 def test_second_derivatives_are_those_of_the_functions():
-    """Of what is held, demands, pieces, half the objective's square: those of JAX. The step of 1e-5 leaves an error of 1e-10 of
-    fourth derivatives, and 1e-16/1e-5 of rounding."""
+    """Second derivatives of held quantities, demands, pieces and half the squared objective are those of JAX. The step of 1e-5
+    leaves an error of 1e-10 of fourth derivatives, and 1e-16/1e-5 of rounding."""
     first = plain("first", lambda x, y: jnp.sin(x) * y**2 + x)
     second = plain("second", lambda x, y: x**2 * y - 30.0)
     demand, held = plain("demand", lambda x, y: jnp.exp(0.3 * x) * y), plain("held", lambda x, y: x * y**2)

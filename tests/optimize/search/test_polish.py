@@ -214,7 +214,7 @@ def test_the_last_step_is_taken_where_rounding_hides_its_fall():
 
 
 def test_trusted_steps_double_where_they_are_too_short():
-    """From x = 1.4 to 8.6, 0.9 of the range: by 0.2, 0.4 and the rest; of steps of 0.2 it would be five."""
+    """Steps from x = 1.4 to 8.6, 0.9 of the range: 0.2, 0.4 and the rest; of steps of 0.2 it would be five."""
     bowl = plain("bowl", lambda x, y: (x - 8.6) ** 2 + (y - 5.0) ** 2 + 1.0)
     problem = problem_of(DesignSpace(SCENE, FREE), bowl, [], starts=2)
     ended = polish(problem, at(problem, (1.4, 5.0), (1.4, 5.0)), 3, lambda *_: None)

@@ -62,7 +62,7 @@ def test_designs_that_are_computed_together_are_a_power_of_two(starts, lanes):
 
 
 def test_all_derivative_modes_agree_with_derivatives_by_hand():
-    """Of one number of six in reverse, which follows nothing further; of as many numbers as there are values forward."""
+    """Reverse mode for one number that depends on six; forward mode for as many numbers as values."""
     machine = scene("three_mass")
     free = {"machine.stiffness": (1e3, 9e4), "machine.link_stiffness": (1e3, 9e4)}
     weights = jnp.arange(1.0, 7.0) * 1e-8

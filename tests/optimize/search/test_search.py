@@ -225,7 +225,7 @@ def test_a_robust_design_is_better_on_machines_it_has_not_seen():
 
 
 def test_influences_on_almost_nothing_are_told_in_its_unit():
-    """At the best machine next to nothing is left, and per cent of that tell nothing."""
+    """The objective nearly vanishes at the best machine, so that per cent of it mean nothing."""
     result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
     lines = [line for line in result.said() if "1 % less / more" in line]
     assert len(lines) == 2
@@ -233,7 +233,7 @@ def test_influences_on_almost_nothing_are_told_in_its_unit():
 
 
 def test_demands_with_room_change_no_search():
-    """Of an objective that vanishes: small multipliers of demands with room would be large beside it."""
+    """The objective vanishes: small multipliers of demands with room would be large beside it."""
     alone = found(DesignSpace(SCENE, FREE), CONE, starts=8)
     beside = found(DesignSpace(SCENE, FREE), CONE, starts=8, subject_to=[FIRST < 8.9e4, SUM > 3e4])
     assert alone.status_name == beside.status_name == "done" and beside.converged == 8

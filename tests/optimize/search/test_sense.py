@@ -1,4 +1,4 @@
-"""What the end of a search says, from designs with known multipliers."""
+"""Sensitivities at the end of a search, from designs with known multipliers."""
 
 import numpy as np
 import pytest

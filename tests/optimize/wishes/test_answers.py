@@ -1,4 +1,4 @@
-"""What quantities ask a scene for."""
+"""Evaluation of the quantities of a scene."""
 
 from types import SimpleNamespace
 
@@ -88,7 +88,7 @@ def test_whose_amplitude_there_is_not(of):
 
 
 def test_amplitudes_and_forces_of_each_tier():
-    """From answers that are known: which of them each quantity takes."""
+    """Each quantity takes the right one of known answers."""
     jam = SimpleNamespace(
         amplitude=jnp.array([3.0, 5.0]), displacement=jnp.array([3.0, 4.0j]), foundation_force=jnp.asarray(7.0)
     )
@@ -126,7 +126,7 @@ def test_what_users_give_is_read():
 
 
 def test_a_mode_is_not_followed_to_another_one(modes):
-    """From the speed of mode 4, where the branch falls: mode 3 lies where it rises."""
+    """The start is the speed of mode 4, where the branch falls; mode 3 lies where it rises."""
     key = ((), ("jam", 3))
     near = {mode: Answers(SCENE, {key: modes.select(mode).omega}) for mode in (3, 4)}
     np.testing.assert_allclose(near[3].orbit(3).omega, jv.jam_orbit(SCENE, mode=3).omega, rtol=1e-9)

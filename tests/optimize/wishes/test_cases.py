@@ -20,7 +20,7 @@ OFF = {"machine.stiffness": 0.1, "machine.link_stiffness": 0.9}
 
 
 def test_samples_fill_a_normal_distribution_evenly():
-    """Of n samples the k-th smallest has the share (k + 1/2)/n below it, two deviations at the tolerance, three at most."""
+    """The k-th smallest of n samples has the share (k + 1/2)/n below it, two deviations at the tolerance, three at most."""
     case = expected(FIRST, OFF, samples=400, seed=3).case
     (place, first), (_, link) = case.factors(SCENE)
     assert place.name == "machine.stiffness" and first.shape == (400, 2) and link.shape == (400, 1)

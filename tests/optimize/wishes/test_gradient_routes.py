@@ -94,7 +94,7 @@ class Routes:
         return jnp.stack([q.read(answers) for q in self.quantities])
 
     def speeds(self, scene):
-        """What a search follows."""
+        """Load speeds that a search follows."""
 
         def of(scene, path, asked):
             if not path:
@@ -105,7 +105,8 @@ class Routes:
         return {(path, asked): of(scene, path, asked) for path, asked in self.keys}
 
     def check(self, scene, tolerance=1e-5):
-        """Whether all agree to the tolerance wherever finite differences are as good; how many derivatives were judged."""
+        """Check agreement to the tolerance wherever finite differences are accurate enough; return the number of compared
+        derivatives."""
         near = self.near(scene)
         value = np.asarray(self.value(scene, near, jnp.zeros(6)))
         if not np.all(np.isfinite(value)):
@@ -138,7 +139,7 @@ def test_routes_agree_on_a_machine():
 @pytest.mark.slow
 @pytest.mark.parametrize(("quantities", "least"), [(LEADING, 0.95), (ROBUST, 0.95), (EXACT, 0.9), (TIME, 0.8)])
 def test_every_route_agrees_on_ten_random_machines(quantities, least, monkeypatch):
-    """To 1e-5, wherever finite differences can tell; in time these are noisy, and derivatives are in forward mode alone. Runs
+    """Agreement to 1e-5 wherever finite differences are accurate enough; runs are noisy and have forward derivatives only. Runs
     are to a tolerance at which what they compute has the derivatives of what they integrate: to 1e-8 the two differ by up to
     6e-5 after 60 periods."""
     monkeypatch.setattr(answers, "simulate", functools.partial(jv.simulate, stepsize_controller=jv.Tolerance(1e-12)))

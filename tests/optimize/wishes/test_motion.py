@@ -15,7 +15,7 @@ SPEED = 7.0
 
 
 def answers(size, force=None):
-    """What a run-up with this amplitude of platform 2 answers; platform 1 rests."""
+    """Answers of a run-up with this amplitude of platform 2; platform 1 rests."""
     y, v = size * jnp.sin(SPEED * TIME), size * SPEED * jnp.cos(SPEED * TIME)
     state = SimpleNamespace(displacement=jnp.stack([0.0 * y, y], axis=1), velocity=jnp.stack([0.0 * v, v], axis=1))
     run = SimpleNamespace(trajectory=SimpleNamespace(state=state, time=TIME, foundation_force=force), omega=jnp.asarray(SPEED))

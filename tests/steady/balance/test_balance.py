@@ -344,7 +344,7 @@ def test_motion_without_a_spring_is_refused():
 
 
 def plain_multipliers(s):
-    """By SciPy's implicit method, from the dense equations; loads at the first arrangement."""
+    """Multipliers by SciPy's implicit method, from the dense equations; loads at the first arrangement."""
     angles, n, nd = jv.balanced_states(s).angles[0], float(s.drive.speed), s.machine.structure().mass.shape[0]
     motion = lambda t: np.concatenate([np.zeros(2 * nd), angles + n * t, np.full(angles.size, n)])  # noqa: E731
     return multipliers(plain(s), motion, 2.0 * np.pi / n)

@@ -50,7 +50,7 @@ def test_neutral_directions_keep_the_sum():
 
 
 def test_growth_is_that_of_the_multipliers_but_the_neutral_ones():
-    """Of exp(2 pi (g + i w)/n) the growth g."""
+    """A multiplier exp(2 pi (g + i w)/n) has the growth g."""
     growth, speed = np.array([0.0, -0.2, 0.3, 0.0]), 50.0
     multipliers = np.exp(2.0 * np.pi * (growth + 1j * np.array([0.0, 3.0, 7.0, 0.0])) / speed)
     np.testing.assert_allclose(_growth_rate(multipliers, speed, 2), 0.3, rtol=1e-10)

@@ -116,7 +116,7 @@ def test_float32_finds_the_published_folds():
 
 
 def test_at_a_fold_the_status_says_so_and_nothing_overflows():
-    """At a fold the two modes that merge are `at_fold` (or already gone); 1e-6 before it the derivative has its digits."""
+    """The two modes that merge at a fold are `at_fold` (or already gone); 1e-6 before it the derivative has its digits."""
     s = published().scene()
 
     def omega(n):

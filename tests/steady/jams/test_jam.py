@@ -232,7 +232,7 @@ def test_loads_too_unlike_to_stay_together_are_not_called_stable():
 
 @pytest.mark.parametrize("friction", [False, True], ids=["drag", "friction"])
 def test_derivatives_at_known_jams_equal_those_of_the_search(friction):
-    """Of numbers of all jams, of which some are absent, by every number of the scene; then of a fold as well."""
+    """Derivatives of all jams, some of them absent, by every number of the scene; then of a fold as well."""
     hung = jv.pendulums(count=2, mass=[0.8, 0.9], radius=0.12, drag=[1.5, 1.4], inertia=1e-3)
     effects = jv.DryFriction(0.01, diameter=0.02) if friction else ()
     s = jv.Scene(machines()["two_mass"], hung if friction else loads()["balls"], jv.ConstantSpeed(120.0), effects)

@@ -9,7 +9,7 @@ from jaxvib.steady.jams.newton import damped_newton
 
 
 def circle_and_line(x, radius):
-    """Where a circle meets a line through its centre, and the angle there."""
+    """Residual of the point where a circle meets a line through its centre, with its angle."""
     return jnp.stack([jnp.sum(x**2) - radius**2, x[1] - 2.0 * x[0]]), jnp.arctan2(x[1], x[0])
 
 

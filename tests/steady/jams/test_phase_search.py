@@ -16,7 +16,7 @@ SCENE = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.0
 
 
 def test_a_branch_is_made_of_the_jams_that_each_drag_has():
-    """Of loads whose drags differ, at unequal phases: speeds and growth are those of the scene with so many times the drag,
+    """Loads with different drags, at unequal phases: speeds and growth are those of the scene with so many times the drag,
     whose jam is solved for by itself."""
     scene = eqx.tree_at(lambda s: s.loads.drag, SCENE, jnp.array([0.04, 0.05]))
     jam = phase_jam(scene, 182.0, jnp.zeros(2))
@@ -55,7 +55,7 @@ def test_a_branch_is_followed_from_its_jam_both_ways(monkeypatch):
 
 @pytest.mark.parametrize("growth", [-100.0, -0.01, 2.0])
 def test_a_branch_has_the_jam_of_the_same_growth(growth):
-    """To a thousandth of it, however large it is."""
+    """The growth agrees to a thousandth, for small and large growth."""
     jam = phase_jam(SCENE, 165.0, jnp.zeros(2))
     branch = phase_branch(SCENE, jam, jnp.atleast_1d(jam.omega))
     branch = eqx.tree_at(lambda b: (b.growth, b.drag_factor), branch, (jnp.full(1, growth), jnp.ones(1)))

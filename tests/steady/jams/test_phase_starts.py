@@ -1,4 +1,4 @@
-"""Where jams at unequal phases are looked for, and what Newton's method says of phases at a load speed."""
+"""Starts of the search for jams at unequal phases, and Newton's method for phases at a load speed."""
 
 import itertools
 
@@ -79,7 +79,7 @@ def test_a_load_alone_needs_what_it_needs():
 
 
 def test_starts_lie_at_the_jams_that_are_known():
-    """Of loads together: where the drag needed is the scene's."""
+    """Coincident loads: the required drag is that of the scene."""
     p = parts()
     omega, phase = starts_of(p, np.zeros((1, 2)))
     assert omega.shape == (len(phase),) and np.all((omega > 0.0) & (omega < 460.0))
@@ -110,7 +110,7 @@ def test_patterns_by_their_resultants(phases, pattern):
 
 
 def test_the_search_is_written_on_single_numbers():
-    """From thousands of starts that takes a third of the time."""
+    """Single numbers take a third of the time for thousands of starts."""
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     p = parts_of(jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0)))
     w, start = jnp.asarray(100.0), jnp.zeros(3)

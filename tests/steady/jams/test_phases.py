@@ -271,7 +271,7 @@ def test_wrong_questions():
 
 
 def test_jams_by_slope_are_judged_for_loads_that_may_part():
-    """On platforms only the jam below a resonance keeps free loads: where the slope calls mode 5 stable, they part."""
+    """On platforms only the jam below a resonance keeps free loads; in mode 5, which is stable by slope, they separate."""
     s = platforms()
     modes = jv.jam_modes(s)
     growth = growth_apart(s, modes.omega)
@@ -289,7 +289,7 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
 
 
 def test_every_jam_is_listed_once_and_in_order():
-    """Of three equal balls on two platforms, whose jams next to the rotor's speed many starts hardly reach."""
+    """Three equal balls on two platforms; many starts hardly reach the jams next to the rotor speed."""
     jams = jv.phase_jams(platforms())
     omega = np.asarray(jams.omega)
     assert omega.size == 6 and np.all(np.diff(omega) < 0.0) and np.min(-np.diff(omega)) > 0.5

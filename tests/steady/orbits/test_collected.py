@@ -157,7 +157,7 @@ def test_loads_that_would_have_to_pull_are_not_stable():
 
 
 def test_contact_forces_are_those_that_trailing_loads_need():
-    """Of a motion that is no balance: the mean over a period of m R cos(phi_j) y'' - b R^2 (n - phi_j'), summed up to each."""
+    """A motion that is no balance: the mean over a period of m R cos(phi_j) y'' - b R^2 (n - phi_j'), summed up to each."""
     model, grid = assembled(side_by_side()), grid_of(33, False)
     deviation = lambda theta: 0.3 * np.sin(theta) + 0.1 * np.cos(2.0 * theta)  # noqa: E731
     orders, omega, speed = np.asarray(grid.orders), 40.0, 55.0

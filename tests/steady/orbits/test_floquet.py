@@ -78,7 +78,7 @@ def test_heavy_loads_lose_stability_at_a_torus_and_by_symmetry():
 
 
 def grows(omega, eps):
-    """Whether a disturbance of 1e-6 grows in 300 periods of the paper's equations, symmetric motions or not."""
+    """True if a disturbance of 1e-6 grows in 300 periods of the paper's equations, symmetric motions or not."""
     orbit = jv.jam_orbit(published(eps=eps).scene(), omega=omega)
     form, n = published(eps=eps), float(orbit.rotor_speed)
     q, velocity, (phi,), (rate,) = orbit.at(0.0)

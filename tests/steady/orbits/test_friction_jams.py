@@ -184,7 +184,7 @@ def test_theories_without_dry_friction_refuse_it():
 
 @pytest.mark.slow
 def test_exact_branch_of_a_gyroscopic_rotor():
-    """Of two forward resonances (127, 149 rad/s) the fold between them, an extremum of the motions themselves."""
+    """The fold between two forward resonances (127, 149 rad/s) is an extremum of the motions themselves."""
     scene = on_a_rotor()
     diagram = jv.branches(scene, exact=True, points=30, least=133.0, most=140.0, accuracy=1e-5)
     assert np.max(diagram.residual) < 1e-12 and np.max(diagram.error) < 1e-5

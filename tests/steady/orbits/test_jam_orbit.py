@@ -58,7 +58,7 @@ def test_the_diagram_begins_at_a_fifth_of_the_lowest_resonance(monkeypatch):
 
 
 def test_swings_are_half_of_what_lies_between_the_extremes():
-    """Of signals that are not symmetric: 3 + cos t + cos 2 t lies between 3 - 9/8 and 5."""
+    """Unsymmetric signals: 3 + cos t + cos 2 t lies between 3 - 9/8 and 5."""
     orders = np.array([0, 1, 2])
     np.testing.assert_allclose(
         _swing(orders, jnp.array([[3.0, 1.0, 1.0], [0.0, 1.0, 0.0]], complex)), [(2.0 + 9.0 / 8.0) / 2.0, 1.0], rtol=1e-12
@@ -68,7 +68,7 @@ def test_swings_are_half_of_what_lies_between_the_extremes():
 
 @pytest.mark.parametrize("orders", [np.arange(1, 16, 2), np.arange(1, 9)], ids=["odd", "all"])
 def test_swings_miss_no_peak(orders):
-    """Of random signals whose harmonics do not fall, against samples so dense that they miss 3e-7 of a peak at most."""
+    """Random signals whose harmonics do not fall, against samples so dense that they miss 3e-7 of a peak at most."""
     harmonics = np.random.default_rng(7).normal(size=(300, orders.size, 2)) @ [1.0, 1.0j]
     dense = np.zeros((300, 2**15 + 1), complex)
     dense[:, orders] = harmonics
@@ -78,7 +78,7 @@ def test_swings_miss_no_peak(orders):
 
 
 def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
-    """Where gravity lets halves of the motion differ."""
+    """A whole turn is needed if gravity makes the halves of the motion differ."""
     half = published().scene()
     whole = jv.Scene(half.machine, half.loads, half.drive, (jv.Gravity(9.81),))
     models = [collected_model(jammed_model(s)) for s in (half, whole)]
@@ -87,7 +87,7 @@ def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
 
 
 def test_a_branch_is_looked_at_once_at_each_point(monkeypatch):
-    """On n = Omega, in whole numbers, some of them given several times; at the rotor speed itself nothing is left over."""
+    """The diagram is evaluated on n = Omega and in whole numbers, some repeated; at the rotor speed itself nothing remains."""
     points = np.concatenate([np.ones(9), np.arange(1.0, jam_orbit._SEARCH + 1)])
     monkeypatch.setattr(jam_orbit, "_fold_points", lambda scene: (points, jnp.array([2.0, 3.0])))
     monkeypatch.setattr(jam_orbit, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))

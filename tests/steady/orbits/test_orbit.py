@@ -212,7 +212,7 @@ def numbers_of(orbit):
 @stored_jit
 @jax.grad
 def weighted_gradient(scene, near, weights):
-    """By reverse mode, of the numbers of a jam at the scene's rotor speed."""
+    """Reverse-mode gradient of weighted numbers of a jam at the scene's rotor speed."""
     return jnp.vdot(weights, numbers_of(jv.jam_orbit(scene, near=near, points=16)))
 
 
@@ -368,8 +368,8 @@ def test_the_highest_of_several_peaks_is_that_between_samples():
 
 
 def test_peaks_are_found_from_samples_that_mislead():
-    """Of two peaks the higher one had the lower of 64 samples beside it, and the best sample lay where the signal bends up: the
-    two of 2000 signals, whose harmonics fall as 1/k and 1/k^2, that came out 1e-3 too low."""
+    """The higher of two peaks had the lower of 64 samples beside it, and the best sample lay at an inflection: the two of 2000
+    signals, whose harmonics fall as 1/k and 1/k^2, that came out 1e-3 too low."""
     random, orders = np.random.default_rng(0), np.arange(1, 16, 2)
     drawn = [random.normal(size=(2000, 8)) + 1j * random.normal(size=(2000, 8)) for _ in range(3)]
     harmonics = np.stack([drawn[1][1126] / orders, drawn[2][240] / orders**2])

@@ -1,4 +1,4 @@
-"""What accuracy costs: every way of computing a quantity is set against one reference."""
+"""Cost of accuracy: all methods for a quantity against one reference."""
 
 import json
 

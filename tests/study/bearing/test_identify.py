@@ -24,7 +24,7 @@ def test_neither_formula_nor_fit_is_biased_by_large_swings(degrees):
 @pytest.mark.parametrize("dry", [0.1, 0.15, 0.3])
 @pytest.mark.parametrize("degrees", [5.0, 15.0, 30.0])
 def test_records_that_end_at_rest_hold_both_frictions(degrees, dry):
-    """Of four records with other noise three at least, each with mu1 5e-4; none has a coefficient below 0 without a word."""
+    """At least three of four records with different noise give mu1 5e-4; no coefficient is below 0 without a message."""
     clean, stop = scipy_swing(ROD, T, np.deg2rad(degrees), 0.0, 5e-4, dry)
     held = 0
     for seed in range(4):
@@ -97,7 +97,7 @@ def trials(count, t, rng, noise, dry=None):
 
 
 def coverage(fit, truth, names, samples):
-    """How many intervals hold the truth, and the spread of (found - truth)/error, for each of the numbers."""
+    """Number of intervals that hold the truth, and the spread of (found - truth)/error, for each of the numbers."""
     out = []
     for k, name in enumerate(names):
         error = np.sqrt(np.asarray(fit.covariance)[:, 4 + k, 4 + k])
@@ -107,7 +107,7 @@ def coverage(fit, truth, names, samples):
 
 
 def test_identification_holds_mu1_in_its_interval():
-    """Of 200 intervals of 95 %, 190 hold the number, give or take 3."""
+    """190 of 200 intervals of 95 %, give or take 3, hold the number."""
     t = np.arange(0.0, 12.0, 0.06)
     records, truth = trials(200, t, np.random.default_rng(11), 3e-3)
     ((held, spread),) = coverage(many(records, t, False), truth, ["viscous"], t.size)

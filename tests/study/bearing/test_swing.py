@@ -137,7 +137,7 @@ def swings_with_slopes(x):
 @pytest.mark.parametrize("wrong", [dict(angle=jnp.nan), dict(dry=jnp.inf), dict(g=-9.81)])
 @no_host_checks()  # a program with these is compiled anew each time
 def test_invalid_swing_leaves_the_others_unchanged(wrong):
-    """As where a fit's step leads into nothing; their stops and slopes are looked for together."""
+    """A step of a fit may lead to such a swing; stops and slopes of all swings are computed together."""
     right = dict(angle=0.3, dry=0.02, g=9.81)
     both = {name: jnp.asarray([value, wrong.get(name, value)]) for name, value in right.items()}
     (value, status), slope = swings_with_slopes(both)

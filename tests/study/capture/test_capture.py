@@ -128,7 +128,7 @@ def test_steps_double_until_borders_stay():
 
 @pytest.mark.parametrize(("gap", "stiff"), [(0.5, True), (5.1, False)])
 def test_first_steps_resolve_friction_up_the_tube(gap, stiff):
-    """In closed form: own frequency w sqrt((R + rho)/(7/5 rho)), friction (k/r) R w^2 R_1/rho over 7/5 of its width 1e-4 w."""
+    """Closed form: natural frequency w sqrt((R + rho)/(7/5 rho)), friction (k/r) R w^2 R_1/rho over 7/5 of its width 1e-4 w."""
     scene, w, rho = published_torus(gap), 140.0, gap * 1e-3
     own = w * np.sqrt((0.2 + rho) / (1.4 * rho))
     friction = 4e-5 / (15e-3 - rho) * 0.2 * w**2 * 15e-3 / rho / (1.4 * 1e-4 * w)
@@ -139,7 +139,7 @@ def test_first_steps_resolve_friction_up_the_tube(gap, stiff):
 
 
 def test_capture_doubles_steps_until_its_threshold_stays(monkeypatch):
-    """From a fifth of the needed steps, which capture nothing: the first doubling brings a threshold, the second keeps it."""
+    """A fifth of the needed steps captures nothing: the first doubling gives a threshold, the second keeps it."""
     scene, speeds = published_torus(3.5), np.linspace(-1.0, -0.1, 4)
     needed = steps_per_second(scene)
     chosen = jv.capture(scene, speeds, turns=150)
@@ -187,7 +187,7 @@ def test_tables_favour_the_printed_lever():
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "finer"), [(0.1, 1), (0.1, 2), (0.05, 1), (0.025, 2)])
 def test_a_threshold_is_that_of_no_step_and_of_no_smoothed_sign(width, finer):
-    """Of the row p = 0.010, where outcomes are not chaotic: to 1e-3 of the rotor's speed."""
+    """The row p = 0.010, without chaotic outcomes: to 1e-3 of the rotor speed."""
     scene = published_torus(2.7, width=width)
     turns, speed = 1000, float(scene.drive.speed)
     radians = 2.0 * np.pi * turns * float(scene.loads.own_frequency(speed)) / speed
@@ -197,7 +197,8 @@ def test_a_threshold_is_that_of_no_step_and_of_no_smoothed_sign(width, finer):
 
 
 THRESHOLD = -0.572
-"""Of the gap of 2.7 in that row, by this package's equations, with the widest sign and the longest steps of the test above."""
+"""Threshold for the gap of 2.7 in that row, by this package's equations, with the widest sign and the longest steps of the test
+above."""
 
 
 BASE = eqx.tree_at(lambda s: s.loads.drag, published_torus(3.5), jnp.asarray(0.5))

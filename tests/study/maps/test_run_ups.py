@@ -30,7 +30,7 @@ def test_published_rotor_at_three_frictions():
 
 @pytest.mark.slow
 def test_published_rotor_over_its_whole_friction():
-    """What the paper reports, what its printed data give, and which readings bring it out; all at once."""
+    """The paper's numbers, the results of its printed data, and the readings that reproduce the numbers, in one run."""
     mu = [5e-5, 9.2e-4, 1.0e-3, 1.02e-2, 1.8e-2, 4.6e-2, 1e-1]
     early, late = rotor_regimes(mu, until=4.0), rotor_regimes(mu, until=12.0)
 
@@ -89,7 +89,7 @@ def test_run_ups_name_each_lane():
 
 
 def test_run_ups_that_fail_are_no_motion():
-    """In single precision, whose tolerance nobody has named; one drag is none at all."""
+    """The tolerance of single precision is the default; one of the drags is 0."""
     with jax.enable_x64(False):
         s = jv.Scene(
             jv.one_mass(mass=20.0, stiffness=4e4, damping=60.0),
