@@ -130,7 +130,7 @@ def _calls(node: ast.Call, name: str) -> Iterator[tuple[ast.expr, str, ast.expr]
         if ast.dump(pair[0]) != ast.dump(pair[1]):
             yield node, "argument", _with(node, args=[*node.args[:i], *pair[::-1], *node.args[i + 2 :]])
     for keyword in node.keywords:
-        if keyword.arg is not None:
+        if keyword.arg not in (None, "strict"):  # zip's check of lengths, which ruff asks for
             yield node, "keyword", _with(node, keywords=[one for one in node.keywords if one is not keyword])
 
 

@@ -11,14 +11,15 @@ A mutant is the package with one change in one line:
 
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
-Each is given to the tests that reach its line, those of the file of its own name first, then of its folder, then the shortest,
-up to `--seconds` of them by their usual time; the first test that fails ends it. The lines that each test reaches are measured
-once for an `--out`, a process for each test file (`coverage`), which traces every program anew; with `--folder` only the test
-files of these folders are measured, unless `--all-tests` is given. Take a new `--out` for changed packages.
+Each is given to the nearest `--files` test files: examples in its own file, then the test file of its name, then those of its
+folder that name something of it, then the smallest. Of these the tests that reach its line run first; the first test that
+fails ends it. The lines that each test of a file reaches are measured (`coverage`) when a mutant needs that file, once for an
+`--out`. Take a new `--out` for changed packages.
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
-Survivors are printed with their changes, to be explained or killed by a new test. All results are kept in `--out`, so that a
-second call goes on where the first was stopped; `--again` runs the survivors anew, after tests were added.
+Survivors, and mutants that no such test reaches, are printed with their changes, to be explained or killed by a new test.
+All results are kept in `--out`, so that a second call goes on where the first was stopped; `--again` runs the survivors anew,
+after tests were added.
 """
 
 from __future__ import annotations
@@ -30,9 +31,11 @@ import itertools
 import json
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 
@@ -41,29 +44,24 @@ from coverage import Coverage, CoverageData
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PACKAGES = ("jaxvib", "optimize")
+ALIVE = ("survived", "not reached")
 
 PYTEST = ("-m", "pytest", "-p", "no:cacheprovider", "-p", "mutants")
 """The arguments of Python that run tests with this module as a plugin."""
 
 
-def drawn(
-    count: int, seed: int, reached: dict[str, set[int]], folders: Sequence[str]
-) -> tuple[list[Mutant], collections.Counter]:
-    """`count` mutants of each folder on lines that a test reaches, and the number of changes on reached and on other lines."""
-    possible, total = collections.defaultdict(list), collections.Counter()
+def drawn(count: int, seed: int, folders: Sequence[str]) -> list[Mutant]:
+    """`count` mutants of each folder, of all kinds alike."""
+    possible = collections.defaultdict(list)
     for file in sources():
         for one in mutants(file, (ROOT / file).read_text()):
-            if one.folder in folders:
-                inside = one.line in reached.get(file, ())
-                total["reached" if inside else "not reached"] += 1
-                if inside:
-                    possible[one.folder, one.kind].append(one)
+            possible[one.folder, one.kind].append(one)
     taken = []
     for folder in folders:
         kinds = [sorted(found, key=lambda one: one.rank(seed)) for (place, _), found in possible.items() if place == folder]
         mixed = [one for row in itertools.zip_longest(*kinds) for one in row if one is not None]
         taken += mixed[:count]
-    return sorted(taken, key=lambda one: one.rank(seed)), total
+    return sorted(taken, key=lambda one: one.file)
 
 
 def sources() -> list[str]:
@@ -79,103 +77,77 @@ def all_folders() -> list[str]:
 # --- tests and the lines that they reach ---
 
 
-def test_files(folders: Sequence[str], everything: bool) -> list[str]:
-    """The test files of folders and their own files with examples; or all.
+def nearest(file: str, count: int) -> list[str]:
+    """The test files nearest to a file of the packages, and the file itself if it has examples."""
+    text, place = (ROOT / file).read_text(), pathlib.Path(file.removeprefix("jaxvib/"))
+    public = re.search(r"^__all__ = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
+    words = [place.stem, *re.findall(r"\w+", public[1] if public else "")]
+    names = re.compile(rf"\b({'|'.join(words)})\b")
 
-    Test files of a folder lie in the test folder of the same name, or their own name begins with the folder's.
-    """
-    files = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "tests").rglob("test_*.py"))
-    examples = [file for file in sources() if ">>>" in (ROOT / file).read_text()]
-    names = {folder.split("/")[0 if folder.startswith("optimize") else -1] for folder in folders}
-    top = [path.stem for package in PACKAGES if package in folders for path in (ROOT / package).glob("*.py")]
-
-    def own(file: str) -> bool:
-        folder, stem = file.split("/")[1], pathlib.Path(file).stem.removeprefix("test_")
-        return folder in names or stem in names or stem in top
-
-    own_examples = [file for file in examples if everything or folder_of(file) in folders]
-    return [file for file in files if everything or own(file)] + own_examples
-
-
-def reach(out: pathlib.Path, workers: int, tests: Sequence[str]) -> dict[str, dict]:
-    """For each test file the seconds of each test, and the tests that reach each line of the packages.
-
-    Tests are numbered; no number means that the line runs at import, for all of them.
-    """
-    folder = out / "reach"
-    folder.mkdir(exist_ok=True)
-
-    def kept(test: str) -> pathlib.Path:
-        return folder / f"{test.replace('/', '-')}.json"
-
-    def one(test: str) -> None:
-        data, home = kept(test).with_suffix(".coverage"), kept(test).with_suffix(".cache")
-        # No traced program is read from the disk: it executes none of the lines that it was traced from.
-        environment = {
-            **os.environ,
-            "COVERAGE_FILE": str(data),
-            "XDG_CACHE_HOME": str(home),
-            **_plugin(ROOT, seconds=kept(test)),
-        }
-        coverage = [sys.executable, "-m", "coverage", "run", f"--source={','.join(PACKAGES)}"]
-        began = time.perf_counter()
-        result = subprocess.run([*coverage, *PYTEST, test], cwd=ROOT, env=environment, capture_output=True, text=True)
-        taken = time.perf_counter() - began
-        shutil.rmtree(home, ignore_errors=True)
-        if result.returncode not in (0, 5):  # 5: all of its tests are slow ones
-            print(f"left out, as it fails without a change: {test}\n{result.stdout[-1000:]}", flush=True)
-            return
-        seconds = json.loads(kept(test).read_text()) if kept(test).exists() else {}
-        numbers = {name: k for k, name in enumerate(seconds)}
-        found, lines = CoverageData(str(data)), {}
-        found.read()
-        for file in found.measured_files():
-            at = {line: [numbers[name] for name in names if name] for line, names in found.contexts_by_lineno(file).items()}
-            lines[str(pathlib.Path(file).relative_to(ROOT))] = at
-        kept(test).write_text(json.dumps({"tests": seconds, "lines": lines}))
-        data.unlink()
-        print(f"{taken:6.1f} s, {len(seconds):4} tests: {test}", flush=True)
-
-    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, [test for test in tests if not kept(test).exists()]))
-    return {test: json.loads(kept(test).read_text()) for test in tests if kept(test).exists()}
-
-
-def tests_of(mutant: Mutant, known: dict[str, dict], seconds: float) -> tuple[list[str], float]:
-    """The tests to run and their usual time: of the file's own name first, then of its folder, then the shortest.
-
-    The tests that reach the line come before the others of their files, which may use a program that the first ones traced.
-    """
-    place = pathlib.Path(mutant.file.removeprefix("jaxvib/"))
-
-    def order(file: str) -> tuple[bool, int, float]:
-        own = pathlib.Path(file).parent.parts[1:]
-        common = [one == other for one, other in zip(place.parent.parts, own, strict=False)]
+    def distance(path: pathlib.Path) -> tuple:
+        own, test = path.relative_to(ROOT / "tests").parent.parts, path.read_text()
+        common = sum(
+            1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(place.parent.parts, own, strict=False))
+        )
+        name = path.stem.removeprefix("test_")
+        same = name == place.stem
         return (
-            pathlib.Path(file).stem not in (f"test_{place.stem}", place.stem),
-            -sum(common),
-            sum(known[file]["tests"].values()),
+            not (same and common),
+            not (name == place.parent.name and common),
+            not same,
+            -common,
+            not names.search(test),
+            len(test),
         )
 
-    ordered, others = [], []
-    for file in sorted((file for file in known if reaches(known[file], mutant)), key=order):
-        numbers = known[file]["lines"][mutant.file][str(mutant.line)]
-        names = list(known[file]["tests"])
-        own = [names[k] for k in numbers] or names
-        ordered += sorted(own, key=known[file]["tests"].__getitem__)
-        others += sorted(set(names) - set(own), key=known[file]["tests"].__getitem__)
-    usual = {name: lasts for entry in known.values() for name, lasts in entry["tests"].items()}
-    taken, total = [], 0.0
-    for name in ordered + others:
-        if not taken or total + usual[name] <= seconds:
-            taken.append(name)
-            total += usual[name]
-    return taken, total
+    tests = sorted((ROOT / "tests").rglob("test_*.py"), key=distance)
+    return [file] * (">>>" in text) + [str(path.relative_to(ROOT)) for path in tests[:count]]
 
 
-def reaches(entry: dict, mutant: Mutant) -> bool:
-    """True if a test of the file reaches the mutant's line."""
-    return bool(entry["tests"]) and str(mutant.line) in entry["lines"].get(mutant.file, ())
+class Reach:
+    """The tests that reach each line of the packages, by test files, measured when they are asked for."""
+
+    def __init__(self, out: pathlib.Path) -> None:
+        self.out = out / "reach"
+        self.out.mkdir(exist_ok=True)
+        self.locks = collections.defaultdict(threading.Lock)
+
+    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str], float]:
+        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line.
+
+        Those that reach the line come before the others, which may use a program that the first ones traced.
+        """
+        with self.locks[file]:
+            kept = self.out / f"{file.replace('/', '-')}.json"
+            if not kept.exists():
+                kept.write_text(json.dumps(self._measured(file)))
+            entry = json.loads(kept.read_text())
+        seconds, reaching = entry["seconds"], entry["lines"].get(mutant.file, {}).get(str(mutant.line))
+        if reaching is None:
+            return [], 0.0
+        return sorted(seconds, key=lambda name: (name not in reaching, seconds[name])), sum(seconds.values())
+
+    def _measured(self, file: str) -> dict[str, dict]:
+        """The seconds of each test and the tests that reach each line; none of them for a line that runs at import."""
+        data, home, seconds = (self.out / f"{file.replace('/', '-')}.{kind}" for kind in ("coverage", "cache", "seconds"))
+        # No traced program is read from the disk: it executes none of the lines that it was traced from.
+        environment = {"COVERAGE_FILE": str(data), "XDG_CACHE_HOME": str(home), **_plugin(ROOT, seconds=seconds)}
+        command = [sys.executable, "-m", "coverage", "run", f"--source={','.join(PACKAGES)}", *PYTEST, file]
+        began = time.perf_counter()
+        result = subprocess.run(command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True)
+        shutil.rmtree(home, ignore_errors=True)
+        if result.returncode != 0 or not seconds.exists():
+            if result.returncode != 5:  # 5: all of its tests are slow ones
+                print(f"left out, as it fails without a change: {file}\n{result.stdout[-1000:]}", flush=True)
+            return {"seconds": {}, "lines": {}}
+        print(f"     measured  {time.perf_counter() - began:6.1f} s {file}", flush=True)
+        found, lines = CoverageData(str(data)), {}
+        found.read()
+        for path in found.measured_files():
+            at = {line: [name for name in names if name] for line, names in found.contexts_by_lineno(path).items()}
+            lines[str(pathlib.Path(path).relative_to(ROOT))] = at
+        data.unlink()
+        return {"seconds": json.loads(seconds.read_text()), "lines": lines}
 
 
 # --- this module as a plugin of pytest ---
@@ -218,34 +190,41 @@ _seconds: collections.Counter = collections.Counter()
 # --- fates ---
 
 
-def fate_of(mutant: Mutant, copy_of: pathlib.Path, known: dict[str, dict], seconds: float) -> dict:
-    """The mutant's fate: "killed", "slow" (too slow, killed), "died" (the process did), "survived"."""
+def fate_of(mutant: Mutant, copy_of: pathlib.Path, reach: Reach, files: int) -> dict:
+    """The mutant's fate: "killed", "slow" (too slow, killed), "died" (the process did), "survived", "not reached"."""
+    fate, by, began = "not reached", "", time.perf_counter()
+    for file in nearest(mutant.file, files):
+        tests, seconds = reach.tests_of(mutant, file)
+        if tests:
+            fate, by = _run(mutant, copy_of, file, tests, seconds)
+            if fate != "survived":
+                break
+    return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1)}
+
+
+def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str], seconds: float) -> tuple[str, str]:
+    """The mutant's fate by tests of one file, and the line about the test that failed."""
     path = copy_of / mutant.file
     whole = path.read_bytes()
-    taken, usual = tests_of(mutant, known, seconds)
-    files = list(dict.fromkeys(name.split("::")[0] for name in taken))
-    began = time.perf_counter()
+    home = str(copy_of.with_suffix(".cache"))  # a mutant's traced programs are of no use to others
+    environment = {"XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1", **_plugin(copy_of, tests=tests)}
     try:
         path.write_bytes(whole[: mutant.start] + mutant.new.encode() + whole[mutant.end :])
-        home = str(copy_of.with_suffix(".cache"))  # a mutant's traced programs are of no use to others
-        environment = {**os.environ, "XDG_CACHE_HOME": home, **_plugin(copy_of, tests=taken)}
         result = subprocess.run(
-            [sys.executable, *PYTEST, "-x", *files],
+            [sys.executable, *PYTEST, "-x", file],
             cwd=copy_of,
-            env={**environment, "PYTHONDONTWRITEBYTECODE": "1"},
+            env={**os.environ, **environment},
             capture_output=True,
             text=True,
-            timeout=3 * usual + 60,
+            timeout=3 * seconds + 60,
             errors="replace",
         )
-        fate = {0: "survived", 1: "killed", 2: "killed"}.get(result.returncode, "died")
-        last = [line for line in result.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-        by = last[0][:200] if last else ""
     except subprocess.TimeoutExpired:
-        fate, by = "slow", ""
+        return "slow", ""
     finally:
         path.write_bytes(whole)
-    return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1), "tests": len(taken)}
+    failed = [line for line in result.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return {0: "survived", 1: "killed", 2: "killed"}.get(result.returncode, "died"), failed[0][:200] if failed else ""
 
 
 def main() -> None:
@@ -254,25 +233,18 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="mutants of each folder (30)")
     parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
-    parser.add_argument("--seconds", type=float, default=180.0, help="tests a mutant is given, by their usual time (180)")
-    parser.add_argument("--all-tests", action="store_true", help="measure all test files, not only those of the folders")
+    parser.add_argument("--files", type=int, default=5, help="test files that a mutant is given, beside its examples (5)")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of the results")
     asked = parser.parse_args()
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
-    everything = asked.all_tests or asked.folder == all_folders()
-    known = reach(out, asked.workers, test_files(asked.folder, everything))
-    reached = collections.defaultdict(set)
-    for entry in known.values():
-        for file, lines in entry["lines"].items():
-            reached[file].update(map(int, lines if entry["tests"] else ()))
-    taken, total = drawn(asked.count, asked.seed, reached, asked.folder)
+    reach, taken = Reach(out), drawn(asked.count, asked.seed, asked.folder)
     kept = out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
     if asked.again:
-        fates = {name: fate for name, fate in fates.items() if fate["fate"] != "survived"}
+        fates = {name: fate for name, fate in fates.items() if fate["fate"] not in ALIVE}
     copies = [out / f"copy{k}" for k in range(asked.workers)]
     for place in copies:
         shutil.rmtree(place, ignore_errors=True)
@@ -282,33 +254,34 @@ def main() -> None:
 
     def one(mutant: Mutant) -> None:
         place = free.popleft()
-        fates[mutant.name] = fate_of(mutant, place, known, asked.seconds)
+        fates[mutant.name] = fate_of(mutant, place, reach, asked.files)
         free.append(place)
         kept.write_text(json.dumps(fates, indent=1))
-        print(f"{len(fates):4} {fates[mutant.name]['fate']:9} {fates[mutant.name]['seconds']:6.1f} s {mutant.name}", flush=True)
+        print(
+            f"{len(fates):4} {fates[mutant.name]['fate']:11} {fates[mutant.name]['seconds']:6.1f} s {mutant.name}", flush=True
+        )
 
     with concurrent.futures.ThreadPoolExecutor(asked.workers) as pool:
         list(pool.map(one, [mutant for mutant in taken if mutant.name not in fates]))
-    report(taken, fates, total)
+    report(taken, fates)
 
 
-def report(taken: list[Mutant], fates: dict[str, dict], total: collections.Counter) -> None:
+def report(taken: list[Mutant], fates: dict[str, dict]) -> None:
     """Killed and survived, by folder and by kind of change, and every survivor."""
-    print(f"\n{total['reached']} changes are possible on lines that tests reach, {total['not reached']} on others")
     for title, key in (
         ("folder", lambda one: one.folder),
         ("kind", lambda one: one.kind),
     ):
         groups = collections.defaultdict(list)
         for mutant in taken:
-            groups[key(mutant)].append(fates[mutant.name]["fate"] != "survived")
+            groups[key(mutant)].append(fates[mutant.name]["fate"] not in ALIVE)
         print(f"\n{title:18} mutants killed")
         for name, killed in sorted(groups.items()):
             print(f"{name:18} {len(killed):7} {sum(killed):6} {100 * sum(killed) / len(killed):5.1f} %")
-    alive = [mutant for mutant in taken if fates[mutant.name]["fate"] == "survived"]
+    alive = [mutant for mutant in taken if fates[mutant.name]["fate"] in ALIVE]
     print(f"\n{len(taken)} mutants, {len(taken) - len(alive)} killed; survivors:")
     for mutant in sorted(alive, key=lambda one: (one.file, one.line)):
-        print(f"  {mutant.name}")
+        print(f"  {fates[mutant.name]['fate']}: {mutant.name}")
 
 
 if __name__ == "__main__":
