@@ -120,7 +120,7 @@ _ARGUMENTS = {
     "study": "a study file, such as `jaxvib new sweep > study.toml` makes",
     "source": "a scene file, or a run.npz that `jaxvib simulate` kept",
 }
-"""What arguments of commands are, where one is missing."""
+"""Descriptions of arguments of commands, for messages about missing ones."""
 
 
 class _Lazy(click.Group):
@@ -130,7 +130,7 @@ class _Lazy(click.Group):
         return sorted(_HOMES)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """What each command does, read from its module's text: importing them all would take a second."""
+        """List the commands with their summaries, read from the text of their modules: importing all would take a second."""
         widest = max(map(len, _HOMES))
         for title, group in _GROUPS.items():
             with formatter.section(title):
@@ -143,7 +143,7 @@ class _Lazy(click.Group):
 
 
 def _first_line(name: str) -> str:
-    """What a command's docstring says first."""
+    """First line of a command's docstring."""
     source = Path(__file__).parent.joinpath(*_HOMES[name].split(".")).with_suffix(".py").read_text(encoding="utf-8")
     for node in ast.parse(source).body:
         if isinstance(node, ast.FunctionDef) and any(_is_command(decorator, name) for decorator in node.decorator_list):

@@ -105,7 +105,7 @@ def simulate(
 
 
 def _long(scene: jv.Scene, until: str) -> bool:
-    """Whether a run takes so long that a bar is worth more than a program kept from the last call, which can have none."""
+    """True if a run takes so long that a progress bar is worth more than a cached program, which cannot have one."""
     from jaxvib.units import number
 
     return bool(number(until, "s", "until") * scene.drive.speed > 1e6)

@@ -14,7 +14,7 @@ from jaxvib.cli.app import Output, app, shared, table
 @click.argument("name", required=False)
 @shared
 def describe(group: str | None, name: str | None, output: Output) -> None:
-    """What a scene file may hold: machines, loads, drives, effects, their arguments with units and defaults."""
+    """List the contents of scene files: machines, loads, drives, effects, their arguments with units and defaults."""
     from jaxvib.report.arguments import GROUPS, arguments_of, described
 
     if group is None:

@@ -1,4 +1,4 @@
-"""What commands that integrate have in common: how steps are chosen, a run as JSON has it."""
+"""Common parts of commands that integrate: choice of steps, JSON documents of runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ APART = click.option(
 
 
 def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Tolerance | jv.Accuracy | None:
-    """How steps are chosen. **Raises** `InputError` where both options are given."""
+    """Step-size controller from the options. **Raises** `InputError` where both options are given."""
     if tolerance is not None and accuracy is not None:
         raise InputError("accuracy", "is given together with tolerance; give one of them")
     if accuracy is not None:
@@ -25,7 +25,7 @@ def chosen_steps(tolerance: float | None, accuracy: float | None) -> jv.Toleranc
 
 
 def measured_document(run: jv.Run | jv.Envelope, scene: jv.Scene) -> dict[str, object]:
-    """How a motion ended, and what was measured over its last turns."""
+    """End of a motion, and values measured over its last turns."""
     structure = scene.machine.structure()
     return {
         "status": run.status_name,

@@ -118,7 +118,7 @@ def modes(
 
 
 def _apart(growth: float) -> str:
-    """What is known of a jam whose loads may part."""
+    """Text about the separation of the loads of a jam."""
     return "not known" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 

@@ -1,4 +1,4 @@
-"""Where a command's results go: stdout, files in a folder, a report."""
+"""Outputs of commands: stdout, files in a folder, a report."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def fields_of(result: object, *names: str) -> dict[str, object]:
 
 
 class Output:
-    """Where a command's results go: a JSON document or text on stdout, files in a folder, a report of one HTML page.
+    """Destination of the results of a command: a JSON document or text on stdout, files in a folder, a report of one HTML page.
 
     **Arguments**: `as_json`; the `folder` of `--out`; the `report` file; the `scene` file that the command is about.
     """

@@ -41,7 +41,7 @@ __all__ = [
 
 
 PARTS = ("speed", "amplitude", "force")
-"""What a branch diagram can show over the rotor's speed."""
+"""Panels of a branch diagram over the rotor speed."""
 
 
 def branch_diagram(
@@ -163,8 +163,8 @@ def _speed_lines(
 def crossings(
     rotor_speed: np.ndarray, stable: np.ndarray, modes: np.ndarray | None, at: float | None
 ) -> list[tuple[int, float, str, bool]]:
-    """Where a branch meets the rotor speed `at`: the point before, the share of the way to the next, the mode's number, and
-    whether it is stable."""
+    """Intersections of a branch with the rotor speed `at`: the point before, the fraction of the way to the next, the number of
+    the mode, and True if it is stable."""
     if at is None:
         return []
     gap = rotor_speed - at
@@ -215,8 +215,8 @@ def stretches(stable: np.ndarray) -> list[tuple[slice, bool]]:
 
 
 def before_after(rows: Sequence[tuple[str, float, float]], *, title: str = "", ax: Axes | None = None) -> Drawn:
-    """For each (name, before, after) a bar from 1 to after/before on a logarithmic axis, so that what falls a thousandfold is
-    as plain as what grows so; the values stand beside it. What has no ratio is written only."""
+    """A bar from 1 to after/before on a logarithmic axis for each (name, before, after), with the values beside it. What has no
+    ratio is written only."""
     figure, (axis,) = panels(1, size=(9.0, 0.42 * len(rows) + 1.5), ax=ax)
     ratios = np.asarray([after / before if before else np.nan for _, before, after in rows])
     drawn = np.isfinite(ratios) & (ratios > 0.0)

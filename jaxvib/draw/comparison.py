@@ -48,8 +48,8 @@ def tiers_chart(
 
 
 class CostPanel(NamedTuple):
-    """What a panel of `cost_chart` shows: `lines` by name, (n, 2) seconds and relative errors each; `floor`, below which the
-    reference itself may be wrong; the `quantity`; `best` (m, 2), the points to ring."""
+    """A panel of `cost_chart`: `lines` by name, (n, 2) seconds and relative errors each; `floor`, below which the reference
+    itself may be wrong; the `quantity`; `best` (m, 2), the points to ring."""
 
     lines: Mapping[str, np.ndarray]
     floor: float
@@ -179,8 +179,9 @@ def audit_chart(
     *,
     ax: Onto = None,
 ) -> Drawn:
-    """What effects (n, by their `labels`) change, relative, a mark for each quantity against the line of the `accuracy`, grey
-    what cannot be told, below the `uncertainty` (n,); and the operations that they add (n,), relative to those of the scene.
+    """The relative changes by effects (n, by their `labels`), a mark for each quantity, with the line of the `accuracy`;
+    changes below the `uncertainty` (n,) are grey. A second panel shows the operations that the effects add (n,), relative to
+    those of the scene.
 
     >>> figure = audit_chart(["gravity"], {"amplitude": np.array([1e-4])}, np.array([1e-6]), 0.01, np.array([0.05]))
     >>> figure.axes[0].get_xlabel()

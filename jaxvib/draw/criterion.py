@@ -1,4 +1,4 @@
-"""Where a prediction of stability agrees with the exact answer."""
+"""Charts of the agreement between predicted and exact stability."""
 
 from __future__ import annotations
 

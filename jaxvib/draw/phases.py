@@ -26,7 +26,7 @@ from jaxvib.draw.style import (
 __all__ = ["drag_diagram"]
 
 _WIDTHS = (2.2, 1.0)
-"""Of stable and unstable lines, so that dashes that lie on each other are not taken for a stable line."""
+"""Widths of stable and unstable lines, so that overlapping dashes are not taken for a stable line."""
 
 
 def drag_diagram(

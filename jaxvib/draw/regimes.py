@@ -1,4 +1,4 @@
-"""Which kinds of motion loads come to, over their drag."""
+"""Chart of the kinds of motion that loads come to, over their drag."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["regime_chart"]
 
 
 HATCHES = ("", "///", "...", "\\\\\\", "xxx", "---", "ooo")
-"""Of areas that lie side by side, so that they are told apart in grey."""
+"""Hatches of neighbouring areas, which distinguish them in grey."""
 
 
 def regime_chart(

@@ -38,16 +38,16 @@ __all__ = [
 ]
 
 SpeedUnit: TypeAlias = Literal["rad/s", "rpm", "Hz"]
-"""In what speeds are drawn."""
+"""Units in which speeds are drawn."""
 
 Onto: TypeAlias = "Axes | Sequence[Axes] | None"
 """The axes that a figure goes onto: one, or as many as it has panels; None for a figure of its own."""
 
 Drawn: TypeAlias = "Figure | Any"
-"""What a plot gives back: its figure, or, where axes were given, what was given: who calls knows which (`Any`)."""
+"""Result of a plot: its figure, or the given axes, whose type the caller knows (`Any`)."""
 
 Look: TypeAlias = dict[str, Any]
-"""How something is drawn: matplotlib's options, each of its own type."""
+"""Drawing style: matplotlib's options, each of its own type."""
 
 COLORS = ("#004488", "#d55e00", "#44aa99", "#e69f00", "#882255", "#88ccee", "#000000", "#b3b3b3")
 """Colours that readers with any colour vision tell apart, and of unlike greys where they follow each other; further series
@@ -83,7 +83,7 @@ _SCALES = {"rad/s": 1.0, "rpm": 30.0 / math.pi, "Hz": 0.5 / math.pi}
 
 
 def speed_scale(unit: str) -> float:
-    """By what speeds in rad/s are multiplied to be drawn in `unit`. **Raises** `InputError` but for "rad/s", "rpm" and "Hz".
+    """Factor from rad/s to `unit`. **Raises** `InputError` but for "rad/s", "rpm" and "Hz".
 
     >>> round(speed_scale("rpm"), 3)
     9.549
@@ -130,7 +130,7 @@ def panels(
 
 
 def log_places(low: float, high: float, most: int = 9) -> LogLocator:
-    """Where a logarithmic axis has ticks: at powers of ten over three decades or more, at most so many, else between them too.
+    """Ticks of a logarithmic axis: powers of ten over three decades or more, at most `most`, otherwise also between them.
 
     >>> [float(x) for x in log_places(0.4, 3.0).tick_values(0.4, 3.0) if 0.4 < x < 3.0]
     [0.5, 1.0, 2.0]

@@ -14,7 +14,7 @@ from jaxvib.draw.style import COLORS, Drawn, log_ticks, panels
 
 __all__ = ["distribution_chart", "label_map", "points_over", "shares_chart", "tornado_chart", "value_map"]
 
-_NONE = "#f4f4f4"
+_NO_ANSWER_COLOR = "#f4f4f4"
 """Colour of cases without an answer."""
 
 _DASHES = {"fold": "-", "torus": "--", "period doubling": "-.", "symmetry": ":"}
@@ -43,12 +43,12 @@ def label_map(
     there = [k for k in range(len(names)) if np.any(codes == k)]
     place = np.full(len(names) + 1, -1)
     place[there] = np.arange(len(there))
-    colours = [_NONE, *(_light(COLORS[k % len(COLORS)]) for k in range(len(there)))]
+    colours = [_NO_ANSWER_COLOR, *(_light(COLORS[k % len(COLORS)]) for k in range(len(there)))]
     norm = BoundaryNorm(np.arange(-1, len(there) + 1) - 0.5, len(colours))
     axis.pcolormesh(x, y, place[codes], cmap=ListedColormap(colours), norm=norm, shading="nearest", rasterized=True)
     entries: list[Patch | Line2D] = [Patch(color=colours[k + 1], label=names[which]) for k, which in enumerate(there)]
     if np.any(codes < 0):
-        entries.append(Patch(color=_NONE, label="no answer"))
+        entries.append(Patch(color=_NO_ANSWER_COLOR, label="no answer"))
     edges = axis.get_xlim(), axis.get_ylim()
     for kind, parts in (lines or {}).items():
         dashes = _DASHES.get(kind, ":")
@@ -149,7 +149,7 @@ def shares_chart(
 
 
 def distribution_chart(edges: np.ndarray, counts: np.ndarray, *, across: str, ax: Axes | None = None) -> Drawn:
-    """How many cases (n,) lie between edges (n + 1,), and the running share of them on an axis of its own.
+    """Histogram of cases (n,) between edges (n + 1,), and their cumulative share on an axis of its own.
 
     >>> import numpy as np
     >>> distribution_chart(np.arange(4.0), np.ones(3), across="force, N").axes[0].get_xlabel()

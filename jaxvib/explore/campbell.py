@@ -27,7 +27,7 @@ _LEGEND = {
     "operating speed": OPERATING,
     "critical speeds (no damping), rpm": _CRITICAL,
 }
-"""What lines and dots look like, by what they are."""
+"""Styles of lines and dots by kind."""
 
 
 def campbell(found: Whirl, at: float) -> str:

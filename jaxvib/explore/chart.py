@@ -26,7 +26,7 @@ _LEGEND = {
     "speed of the rotor": ROTOR,
     "operating speed; numbers: jam modes": OPERATING,
 }
-"""What lines look like, by what they are."""
+"""Styles of lines by kind."""
 
 
 def chart(found: Branches, most: float) -> str:

@@ -20,16 +20,16 @@ WIDE, TALL, FIRST, APART, LAST = 6.3, 3.6, 0.75, 1.1, 0.25
 
 ROTOR = {"color": GUIDE, "lw": 0.8}
 OPERATING = {"color": "black", "lw": 1.0, "ls": "-."}
-"""What the line on which a speed is the rotor's looks like, and that of the operating speed."""
+"""Style of the line at which a speed equals the rotor speed, and of the operating speed."""
 
-_TICKS = 5
-"""So many ticks, at most, an axis has."""
+_MAX_TICKS = 5
+"""Maximum number of ticks of an axis."""
 
-_FINE = 0.03
-"""Points of a line that are nearer to each other than this are left out: two dots."""
+_MIN_POINT_DISTANCE = 0.03
+"""Least distance of two points of a line, two dots; nearer ones are left out."""
 
 _COLUMNS = (0.05, 1.9, 4.6)
-"""Where the columns of the legend begin."""
+"""Left ends of the columns of the legend."""
 
 _GRID = {"color": "#e2e2e2", "lw": 0.6, "zorder": 0.5}
 
@@ -81,10 +81,10 @@ class Panel:
         return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
 
     def _ticks_across(self) -> list[tuple[float, str]]:
-        return _told(MaxNLocator(_TICKS).tick_values(*self.x), self.x)
+        return _told(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
 
     def _ticks_up(self) -> list[tuple[float, str]]:
-        locator = log_places(*self.y, most=_TICKS) if self.log else MaxNLocator(_TICKS)
+        locator = log_places(*self.y, most=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
         return _told(locator.tick_values(*self.y), self.y)
 
 
@@ -96,7 +96,7 @@ def _told(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, s
 def _thinned(points: np.ndarray) -> np.ndarray:
     """A line (n, 2) without the points that are next to others; its ends and those beside a gap (NaN) stay."""
     steps = np.hypot(*np.diff(points, axis=0).T)
-    gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _FINE)
+    gone = np.floor(np.concatenate([[0.0], np.nancumsum(steps)]) / _MIN_POINT_DISTANCE)
     gap = np.isnan(np.concatenate([[np.nan], steps, [np.nan]]))
     keep = gap[1:] | gap[:-1]
     keep[1:] |= gone[1:] != gone[:-1]

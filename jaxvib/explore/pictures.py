@@ -1,4 +1,4 @@
-"""What the page shows of a scene: diagram, moving machine, numbers, file."""
+"""Contents of the page for a scene: diagram, moving machine, numbers, file."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ other takes a second or two the first time. Afterwards it is stored.
 
 Amplitudes and forces are zero to peak. What is seen here is the theory of light loads; `jaxvib simulate` and
 `jaxvib modes --exact` answer for the saved machine exactly."""
-"""What stands below the sliders, as Markdown."""
+"""Text below the sliders, as Markdown."""
 
 _SPEEDS = 81
 """Rotor speeds of a Campbell diagram."""
 
-_PREPARED = 7
-"""So many other numbers of loads are compiled while the page is open."""
+_PREPARED_COUNTS = 7
+"""Number of other numbers of loads that are compiled while the page is open."""
 
 
 class Tried(NamedTuple):
-    """What was asked for, or a sentence that says why there is none."""
+    """Requested scene, or a sentence that says why there is none."""
 
     value: Scene | None
     problem: str
@@ -115,7 +115,7 @@ def prepare_counts(scene: Scene) -> None:
     Meant for a thread beside the page. What cannot be computed is left to the page, which says why."""
     for slider in sliders_of(scene):
         if slider.place is None:
-            others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED]
+            others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED_COUNTS]
             for count in others:
                 moved = tried(functools.partial(scene_at, scene, {slider.name: count})).value
                 if moved is not None:
@@ -131,12 +131,12 @@ def _draw_all(scene: Scene) -> None:
 
 
 def has_branches(scene: Scene) -> bool:
-    """Whether jams of the scene lie on branches over the rotor's speed: whether its machine moves up and down only."""
+    """True if jams of the scene lie on branches over the rotor speed, that is if its machine moves up and down only."""
     return scene.machine.structure().axes == (1,)
 
 
 def heading(scene: Scene) -> str:
-    """What `diagram` shows of this scene, and where the rest is."""
+    """Heading of `diagram` for this scene, with a reference to other results."""
     if has_branches(scene):
         return (
             "Where light loads jam: their speed and the foundation force over the rotor's speed. Solid: stable by slope, for "
@@ -151,7 +151,7 @@ def heading(scene: Scene) -> str:
 
 
 def diagram(scene: Scene, most: float) -> str:
-    """Of a machine that moves up and down, the branch diagram with the force chart; of a rotor, the Campbell diagram.
+    """Branch diagram with the force chart for a machine that moves up and down; Campbell diagram for a rotor.
 
     **Arguments**: `most` the greatest rotor speed shown, rad/s; more where the scene's own speed asks for it.
 

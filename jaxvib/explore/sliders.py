@@ -1,4 +1,4 @@
-"""What of a scene is moved by sliders, over which range, and the scene at their values."""
+"""Numbers of a scene that sliders change, their ranges, and the scene at their values."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["COUNT", "Slider", "scene_at", "sliders_of"]
 COUNT = "loads.count"
 """The name of the slider that changes the number of loads."""
 
-_WIDE = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
+_MACHINE_NUMBERS = ("machine.stiffness", "machine.link_stiffness", "machine.damping", "machine.link_damping")
 """Numbers of a machine that have sliders."""
 
-_MOST = 12
-"""So many sliders stand for numbers of a machine one by one; of a larger one, one slider moves all of a kind."""
+_MAX_SINGLE_SLIDERS = 12
+"""Maximum number of sliders for numbers of a machine one by one; for a larger machine one slider changes all of a kind."""
 
 _DECADES = tuple(np.geomspace(0.1, 10.0, 81).tolist())
 _SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
@@ -44,7 +44,7 @@ class Slider(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What stands at the slider."""
+        """Label of the slider."""
         return f"{self.label}, {self.unit}" if self.unit else self.label
 
 
@@ -67,9 +67,9 @@ def sliders_of(scene: Scene) -> list[Slider]:
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
         found.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
     places = [places_of(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _has(scene, name)]
-    arrays = [places_of(scene, name, "slider") for name in _WIDE if _has(scene, name)]
+    arrays = [places_of(scene, name, "slider") for name in _MACHINE_NUMBERS if _has(scene, name)]
     single = [one for place in arrays for one in _entries(scene, place)]
-    places += single if len(single) <= _MOST else arrays
+    places += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
     return found + [_slider(scene, place, _DECADES) for place in places]
 
 
@@ -105,7 +105,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
 
 
 def _has(scene: Scene, name: str) -> bool:
-    """Whether the scene has that number, not 0, and nothing stands in its place (as a rotor's `stiffness_terms` may)."""
+    """True if the scene has that number, not 0, and no other number replaces it (as a rotor's `stiffness_terms` may)."""
     part, _, field = name.partition(".")
     owner = getattr(scene, part)
     value = getattr(owner, field, None)
@@ -113,7 +113,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 
 def _shared(scene: Scene) -> bool:
-    """Whether a load more is one like the others: all share every number, and none has a station of its own."""
+    """True if an additional load is like the others: all share every number, and none has a station of its own."""
     return scene.machine.structure().stations is None and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 

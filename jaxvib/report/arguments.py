@@ -1,4 +1,4 @@
-"""What the parts of a scene file take: arguments with their units and defaults, read off what builds the parts."""
+"""Arguments of the parts of a scene file, with units and defaults, read from the classes and functions that build the parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "drives": SECTIONS["drive"],
     "effects": EFFECTS,
 }
-"""What a scene file may name, by the word for it."""
+"""Parts that a scene file may name, by their word in the file."""
 
 
 class Argument(NamedTuple):
@@ -117,7 +117,7 @@ def _shown(value: object) -> str:
 
 
 def described(group: str, name: str) -> Callable[..., object]:
-    """What builds the part of that name. **Raises** `InputError` for a group or a name that there is not."""
+    """Class or function that builds the part of that name. **Raises** `InputError` for a group or a name that there is not."""
     if group not in GROUPS:
         raise InputError("group", f"is {quoted(group)}; {closest(group, list(GROUPS))}")
     if name not in GROUPS[group]:

@@ -32,7 +32,7 @@ _LIBRARIES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "nu
 
 @dataclass
 class Report:
-    """What a page is made of.
+    """Contents of a page.
 
     **Arguments**: `title`; the `document`, plain values as in JSON, and the `units` of its numbers by name; the `command` that
     it came from; its `text` as a terminal shows it; the `scene` that it is about and a `sketch` of it; `figures` by name.
@@ -118,7 +118,7 @@ def units_of(result: eqx.Module) -> dict[str, str]:
 
 
 def _of_coordinates(units: Units, scene: Scene) -> dict[str, str]:
-    """Of "m or rad" the unit that all coordinates of the scene's machine have, where they are alike."""
+    """Common unit of all coordinates of the scene's machine from a unit such as "m or rad", if they have one."""
     alike = set(scene.machine.structure().units)
     choice = 0 if alike == {"m"} else 1 if alike == {"rad"} else None
     return {name: unit if choice is None or " or " not in unit else unit.split(" or ")[choice] for name, unit in units.items()}

@@ -26,14 +26,14 @@ WORTH = (
 _HIDDEN = ("scene", "toml")
 """Texts that the page shows in another way."""
 
-_MOST = 12
-"""So many numbers of a list are shown one by one."""
+_MAX_INLINE_ENTRIES = 12
+"""Maximum number of entries of a list that are shown one by one."""
 
-_LONG = 40
-"""A text of more characters than that stands below its row."""
+_MAX_CELL_CHARACTERS = 40
+"""Largest number of characters of a text within a row; a longer text stands below its row."""
 
-_ROWS = 200
-"""So many rows of a table are shown."""
+_MAX_ROWS = 200
+"""Maximum number of rows of a table."""
 
 
 def escaped(text: object) -> str:
@@ -86,9 +86,9 @@ def _words(name: str) -> str:
 
 
 def _plain(value: Plain) -> bool:
-    """Whether a value goes into one cell."""
+    """True if a value fits into one cell."""
     if isinstance(value, list):
-        return len(value) <= _MOST and all(not isinstance(x, (list, dict)) for x in value)
+        return len(value) <= _MAX_INLINE_ENTRIES and all(not isinstance(x, (list, dict)) for x in value)
     return not isinstance(value, dict)
 
 
@@ -109,11 +109,13 @@ def _pairs(pairs: Sequence[tuple[str, Plain]], units: Units) -> str:
 def _rows(rows: Sequence[Mapping[str, Plain]], units: Units) -> str:
     """A row for each entry; what is long stands below it, over the whole width."""
     every = list(dict.fromkeys(name for row in rows for name in row))
-    long = [name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _LONG for row in rows)]
+    long = [
+        name for name in every if any(isinstance(x := row.get(name), str) and len(x) > _MAX_CELL_CHARACTERS for row in rows)
+    ]
     names = [name for name in every if name not in long]
     heads = "".join(f"<th{_side(rows, name)}>{escaped(_words(name))}{_unit_of(name, units)}</th>" for name in names)
     body = ""
-    for row in rows[:_ROWS]:
+    for row in rows[:_MAX_ROWS]:
         body += "<tr>" + "".join(f"<td{_side(rows, name)}>{_cell(row.get(name))}</td>" for name in names) + "</tr>"
         for name in long:
             if row.get(name):
@@ -132,7 +134,7 @@ def _grid(values: Sequence[Plain]) -> str:
     """A long list, or one of lists."""
     rows = [x for x in values if isinstance(x, list) and _plain(x)]
     if len(rows) == len(values):
-        body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_ROWS])
+        body = "".join("<tr>" + "".join(f"<td class='n'>{_cell(x)}</td>" for x in row) + "</tr>" for row in rows[:_MAX_ROWS])
         return f"<div class='wide'><table>{body}</table></div>{_more(len(values))}"
     numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
     if not numbers:
@@ -141,7 +143,7 @@ def _grid(values: Sequence[Plain]) -> str:
 
 
 def _more(count: int) -> str:
-    return f"<p>{count - _ROWS} rows more; --json and --out have them</p>" if count > _ROWS else ""
+    return f"<p>{count - _MAX_ROWS} rows more; --json and --out have them</p>" if count > _MAX_ROWS else ""
 
 
 def _cell(value: Plain) -> str:

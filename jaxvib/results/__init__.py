@@ -1,1 +1,1 @@
-"""What every result has: status and sentence, text and figure, plain and labelled data, files."""
+"""Protocol of results: status and sentence, text and figure, plain and labelled data, files."""

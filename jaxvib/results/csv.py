@@ -1,4 +1,4 @@
-"""What a result holds along one axis, as a table in a file."""
+"""Tables of the fields of a result along one axis, as CSV files."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:
-    """What the k-th of n along an axis is called; the only one needs no name."""
+    """Label of the k-th of n entries along an axis; a single one has no label."""
     known = labels.get(axis, ())
     return str(known[k]) if len(known) == n else "" if n == 1 else str(k + 1)
 
 
 def _own_unit(unit: str, axes: tuple[str, ...], place: tuple[int, ...], units: Sequence[str]) -> str:
-    """Of "m or rad" the unit of this coordinate."""
+    """Unit of this coordinate from a unit such as "m or rad"."""
     choices = unit.split(" or ")
     if len(choices) == 2 and "coordinate" in axes and units:
         return choices[("m", "rad").index(units[place[axes.index("coordinate")]])]

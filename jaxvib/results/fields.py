@@ -1,4 +1,4 @@
-"""What the fields of a result hold: units and axes as metadata, and from them plain and labelled data."""
+"""Fields of results: units and axes as metadata, and plain and labelled data made from them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EACH = "*"
 T = TypeVar("T")
 
 Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | None"
-"""What JSON can hold."""
+"""Values that JSON can represent."""
 
 Labels: TypeAlias = Mapping[str, Sequence[str]]
 """Labels along axes, by the axis's name; of "unit" those of the coordinates."""
@@ -85,7 +85,7 @@ def as_text(write: Callable[[T], str], read: Callable[[str], T], labels: Callabl
 
 
 def is_named_tuple(value: object) -> TypeGuard[NamedTuple]:
-    """Whether a value is a tuple whose entries have names."""
+    """True if a value is a tuple whose entries have names."""
     return isinstance(value, tuple) and hasattr(value, "_fields")
 
 
@@ -169,7 +169,7 @@ def labels_of(result: eqx.Module) -> Labels:
 
 
 def _one_unit(unit: str, units: Sequence[str]) -> str:
-    """Of "m or rad" the unit that all coordinates have, where they are alike."""
+    """Common unit of all coordinates from a unit such as "m or rad", if they have one."""
     choices = unit.split(" or ")
     alike = len(choices) == 2 and len(set(units)) == 1
     return choices[("m", "rad").index(units[0])] if alike else unit

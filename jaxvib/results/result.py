@@ -1,4 +1,4 @@
-"""What every result has."""
+"""Common base of all results."""
 
 # No postponed annotations here: Equinox knows an abstract field by its annotation itself.
 
@@ -40,7 +40,7 @@ class Result(eqx.Module):
     @property
     @final
     def message(self) -> str:
-        """What the status says, a sentence; of several, each sentence once with how many say it."""
+        """Sentence of the status; of several, each sentence once with its number of occurrences."""
         return sentence(self.status)
 
     @property
@@ -51,12 +51,11 @@ class Result(eqx.Module):
 
     @abc.abstractmethod
     def summary(self) -> str:
-        """What came out, for a person to read."""
+        """Text of the result for a reader."""
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """What came out, as a matplotlib figure; `plot(ax=axes)` draws onto axes that are there, one or as many as there are
-        panels, and gives them back."""
+        """Figure of the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
 
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":

@@ -25,7 +25,7 @@ class Computed(eqx.Enumeration):
 
 
 def is_status(value: object) -> TypeGuard[eqx.Enumeration]:
-    """Whether a value is a member of an enumeration, or an array of them."""
+    """True if a value is a member of an enumeration, or an array of members."""
     return isinstance(value, type(Computed.done))
 
 
@@ -63,7 +63,7 @@ def status_name(status: eqx.Enumeration) -> str:
 
 
 def sentence(status: eqx.Enumeration) -> str:
-    """What a status says, a sentence; of several, each sentence once with how many say it.
+    """Sentence of a status; of several, each sentence once with its number of occurrences.
 
     >>> sentence(Computed.done)
     'the answer was computed'

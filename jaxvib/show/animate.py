@@ -33,8 +33,8 @@ _TURN = 0.42
 _SMOOTH = 0.09
 """Turns of the rotor from one picture to the next, where nothing else is said."""
 
-_MOST = 600
-"""Pictures of a film."""
+_MAX_PICTURES = 600
+"""Largest number of pictures of a film."""
 
 
 @validated
@@ -88,7 +88,7 @@ def animate(
     turns = speed * (last - first) / (2.0 * np.pi)
     lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
     wanted = int(np.ceil(turns / _SMOOTH)) if lasts is None else lasts * fps
-    count = round(float(np.clip(wanted, 2, _MOST)))
+    count = round(float(np.clip(wanted, 2, _MAX_PICTURES)))
     if turns / count > _TURN:
         most = first + _TURN * 2.0 * np.pi * count / speed
         problem = f"makes the rotor go on by {turns / count:.3g} turns from one picture to the next, which deceives the eye"
@@ -118,7 +118,7 @@ def _scene_of(motion: object, scene: Scene | None) -> Scene | None:
 
 
 def _stretch(motion: Run | Orbit, begin: Number | None, end: Number | None) -> tuple[float, float]:
-    """From when to when is shown, s."""
+    """Beginning and end of the film, s."""
     if isinstance(motion, Run):
         window = motion.window
         last = float(window.time[-1])

@@ -1,4 +1,4 @@
-"""Where the parts of a machine of platforms stand in a picture, so that no spring crosses what it does not hold."""
+"""Layout of the parts of a machine of platforms in a picture, without springs that cross other parts."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ __all__ = ["Tie", "lanes"]
 
 
 class Tie(NamedTuple):
-    """What holds two platforms together or one on the bed: their levels (`low`, `high`), 0 for the bed; its `stiffness` N/m and
-    `damping` N s/m. The exciter stands on its platform as a tie of that level to itself, without either."""
+    """A link between two platforms, or a support of one on the foundation: their levels (`low`, `high`), 0 for the foundation;
+    its `stiffness` N/m and `damping` N s/m. The exciter stands on its platform as a tie of that level to itself, without
+    either."""
 
     low: int
     high: int
@@ -18,7 +19,7 @@ class Tie(NamedTuple):
 
     @property
     def exciter(self) -> bool:
-        """Whether it is the exciter's place."""
+        """True if it is the place of the exciter."""
         return self.low == self.high
 
 

@@ -16,8 +16,8 @@ from jaxvib.steady.orbits.orbit import Orbit
 
 __all__ = ["Stretch", "of_orbit", "of_run"]
 
-_COARSE = 1.2
-"""Angles, rad, by which a load may go on between two samples of a run for the motion between them to be known."""
+_MAX_ANGLE_BETWEEN_SAMPLES = 1.2
+"""Largest angle, rad, of a load between two samples of a run for which the motion between them is known."""
 
 
 class Stretch(NamedTuple):
@@ -44,8 +44,8 @@ def of_run(run: Run, time: np.ndarray) -> Stretch:
     share = (time - t[k]) / h
     state = kept.state
     rate = np.max(np.abs(np.asarray(state.azimuth_rate)[np.unique(np.concatenate([k, k + 1]))]), initial=0.0)
-    if rate * np.max(h) > _COARSE:
-        most = int(np.ceil(t.size * rate * np.max(h) / _COARSE))
+    if rate * np.max(h) > _MAX_ANGLE_BETWEEN_SAMPLES:
+        most = int(np.ceil(t.size * rate * np.max(h) / _MAX_ANGLE_BETWEEN_SAMPLES))
         problem = f"has {t.size} samples, between which loads turn by up to {rate * np.max(h):.3g} rad"
         raise InputError("run", f"{problem}; simulate with samples={most}, or animate its last turns")
 

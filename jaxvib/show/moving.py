@@ -18,7 +18,7 @@ _FRAMES = 20
 """Poses of a period, between which browsers draw straight lines: circles are true to 1 %."""
 
 _SECONDS = 1.6
-"""What a period lasts in the picture."""
+"""Duration of a period in the picture, s."""
 
 
 def moving(scene: Scene, jam: Jam) -> str:

@@ -58,12 +58,12 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def parts(self, pose: Pose, reach: float) -> list[Part]:
-        """What is drawn, the same parts in the same order for every pose; `reach` drawn units for a metre of displacement."""
+        """Drawn parts, the same in the same order for every pose; `reach` is the number of drawn units for a metre of
+        displacement."""
 
     def magnified(self, displacement: np.ndarray) -> float:
-        """How many times larger than the loads' circle displacements (nt, nd) are drawn so that the largest is well seen; one
-        digit. `parts` takes it times `wheel.scale`.
-        """
+        """Factor, relative to the circle of the loads, at which displacements (nt, nd) are drawn so that the largest is well
+        visible; one digit. `parts` takes it times `wheel.scale`."""
         length = [k for k, unit in enumerate(self.scene.machine.structure().units) if unit == "m"]
         largest = float(np.max(np.abs(displacement[:, length]), initial=1e-300))
         return float(f"{0.3 / largest / self.wheel.scale:.1g}")
@@ -74,11 +74,11 @@ class View(abc.ABC):
 
     @abc.abstractmethod
     def supports(self) -> list[tuple[float, float]]:
-        """Where supports stand on the bed."""
+        """Positions of the supports on the foundation."""
 
     @abc.abstractmethod
     def support_forces(self, pose: Pose) -> np.ndarray:
-        """What each support pushes the bed with, (supports, 2) N across and up, those that are effects left out."""
+        """Force of each support on the foundation, (supports, 2) N across and up, without supports that are effects."""
 
     def arrows(self, pose: Pose, total: np.ndarray, per_newton: float) -> list[Part]:
         """The forces on the bed as arrows: of each support where it stands, and the `total` (nb,) N, darker, beside the

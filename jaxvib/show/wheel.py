@@ -17,7 +17,7 @@ __all__ = ["Pose", "Wheel", "at_rest", "caption", "places_of", "shown"]
 
 
 class Pose(NamedTuple):
-    """Where everything is at an instant: `displacement` (nd,) m and `velocity` (nd,) m/s, of tilts rad and rad/s, the loads'
+    """Positions of all parts at an instant: `displacement` (nd,) m and `velocity` (nd,) m/s, of tilts rad and rad/s, the loads'
     coordinates `angle`, (count,) each, and the angle `turn` of the rotor, rad; `own`, the loads' own positions (count,) each,
     where they are known already."""
 
@@ -60,7 +60,7 @@ def places_of(loads: Loads, angle: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def track_radius(loads: Loads) -> float:
-    """How far from the axis the loads are at rest, m."""
+    """Distance of the loads from the axis at rest, m."""
     return float(jnp.max(loads.arm()))
 
 
@@ -100,7 +100,7 @@ class Wheel:
         self.rim = radius + max(1.15 * self.size, 0.1)
 
     def places(self, pose: Pose) -> list[np.ndarray]:
-        """Where the loads are relative to the axis, in the drawing: across, up, and along where they move there."""
+        """Positions of the loads relative to the axis in the drawing: across, up, and along if they move in that direction."""
         own = places_of(self.loads, pose.angle) if pose.own is None else pose.own
         return [self.scale * np.broadcast_to(x, (self.loads.count,)) for x in own]
 

@@ -44,15 +44,15 @@ _START = {"angle": "rad", "rate": "rad/s", "displacement": "m", "velocity": "m/s
 _KEYS = ["from", "to", "count", "scale"]
 
 _MOST_CORNERS = 10
-"""Of more axes than this only the two opposite corners are looked at."""
+"""Maximum number of axes for which all corners are checked; of more, only the two opposite corners are."""
 
 AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int | str]
 """A list of values, or a table of `from`, `to`, `count` and `scale`; without `count` the number is sampled."""
 
 
 class Spot(NamedTuple):
-    """Where an axis's numbers stand: at a `place` in the scene, or, None, in the start, where they are the entry `entry` (all:
-    None) of the field `field`."""
+    """Place of the numbers of an axis: `place` in the scene; or, if it is None, the entry `entry` (None: all) of the field
+    `field` of the start."""
 
     place: Place | None
     field: str
@@ -101,26 +101,26 @@ class Grid(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """How many cases there are along each dimension."""
+        """Number of cases along each dimension."""
         return (*(axis.values.size for axis in self.axes if axis.values is not None), *([self.samples] if self.samples else []))
 
     @property
     def cases(self) -> int:
-        """How many cases there are."""
+        """Number of cases."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
     def tiles(self) -> tuple[int, ...]:
-        """How many tiles there are along each dimension."""
+        """Number of tiles along each dimension."""
         return tuple(-(-n // t) for n, t in zip(self.shape, self.tile, strict=True))
 
     @property
     def chunks(self) -> int:
-        """How many tiles there are."""
+        """Number of tiles."""
         return int(np.prod(self.tiles, dtype=np.int64))
 
     def region(self, chunk: int) -> tuple[slice, ...]:
-        """Where the cases of a chunk lie along the dimensions."""
+        """Slices of the cases of a chunk along the dimensions."""
         first = [k * t for k, t in zip(np.unravel_index(chunk, self.tiles), self.tile, strict=True)]
         return tuple(slice(int(a), min(int(a) + t, n)) for a, t, n in zip(first, self.tile, self.shape, strict=True))
 
@@ -192,7 +192,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
 
 
 def _where(scene: Scene, name: str) -> tuple[Spot, str]:
-    """Where the numbers of that name stand, in the scene or in the start, and their unit."""
+    """Place of the numbers of that name, in the scene or in the start, and their unit."""
     if not str(name).startswith("start."):
         place = places_of(scene, name, "axes")
         return Spot(place, "", None), place.unit
@@ -255,7 +255,8 @@ def corners(axes: Sequence[Axis]) -> np.ndarray:
 
 
 def tile_of(shape: Sequence[int], most: int) -> tuple[int, ...]:
-    """How many cases along each dimension make a chunk of `most` at most, the last dimension first, tiles nearly alike."""
+    """Number of cases along each dimension of a chunk with at most `most` cases, the last dimension first, with tiles of nearly
+    equal size."""
     tile, room = [], most
     for n in reversed(shape):
         parts = -(-n // max(min(n, room), 1))

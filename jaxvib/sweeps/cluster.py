@@ -23,7 +23,7 @@ _AHEAD = 2
 """Chunks that are given out for each worker: one that it computes, one that waits."""
 
 _STUDIES: dict[str, Study] = {}
-"""On a worker, the study whose program is compiled already."""
+"""Studies whose program this worker has compiled."""
 
 
 def on_a_cluster(
@@ -89,7 +89,8 @@ def on_a_cluster(
 
 
 def _remote(study: Study, chunk: int, key: str, wanted: dict[str, str], precise: bool) -> Chunk | str:
-    """On a worker: a chunk's cases, or why it may not compute them: its versions are others than the store's."""
+    """Cases of a chunk, computed on a worker, or the reason why it may not compute them: its versions are others than the
+    store's."""
     for name, version in versions().items():
         if wanted[name] != version:
             return f"has {name} {version}, and the store was begun with {wanted[name]}: digits would differ"

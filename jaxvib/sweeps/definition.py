@@ -83,7 +83,7 @@ class Study:
 
     @property
     def spots(self) -> tuple[Spot, ...]:
-        """Where the axes' numbers stand."""
+        """Places of the numbers of the axes."""
         return tuple(axis.spot for axis in self.grid.axes)
 
     @property
@@ -97,8 +97,8 @@ class Study:
 
     @property
     def size(self) -> int:
-        """How many cases the program computes at a time: whole groups of lanes, for in the rest of one that does not fill the
-        processor's vectors a case would be computed by other instructions."""
+        """Number of cases that the program computes at a time: whole groups of lanes, because cases in a partial group would be
+        computed by other instructions."""
         return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // LANES) * LANES
 
     @property
@@ -135,5 +135,5 @@ class Study:
         return None
 
     def nothing(self, cases: int) -> list[np.ndarray]:
-        """What stands for measures of cases that have none: NaN, of whole numbers -1."""
+        """Placeholders of measures of cases without a value: NaN, for whole numbers -1."""
         return [np.full((cases, *f.shape), np.nan if np.issubdtype(f.dtype, np.inexact) else -1, f.dtype) for f in self.forms]

@@ -14,7 +14,7 @@ __all__ = ["Progress", "Report", "in_this_process", "timed"]
 
 
 class Progress(NamedTuple):
-    """How far a sweep is: `done` cases of `cases`, those of former calls included; `rate` cases a second and `left` seconds to
+    """Progress of a sweep: `done` cases of `cases`, those of former calls included; `rate` cases a second and `left` seconds to
     go, as this call went so far."""
 
     done: int
@@ -24,7 +24,7 @@ class Progress(NamedTuple):
 
 
 Report = Callable[[Progress], None]
-"""What is called after every chunk."""
+"""Function that is called after every chunk."""
 
 
 def in_this_process(study: Study, todo: Iterable[int]) -> Generator[tuple[int, Chunk], None, None]:

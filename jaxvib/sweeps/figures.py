@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["figures", "plot_distribution", "plot_map", "plot_shares", "plot_sweep", "plot_tornado", "wilson"]
 
-_MOST = 1500
-"""Cases along an axis of a figure; of more every so many-th is drawn: a figure has no more dots."""
+_MAX_DOTS = 1500
+"""Largest number of cases along an axis of a figure; of more, only every k-th is drawn."""
 
 _ROWS = 9
 """Values of the other axis at which folds and torus points are computed."""
@@ -177,7 +177,8 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
 
 
 def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """How a measure is distributed over all cases that have one. **Returns** a matplotlib figure, or the given `ax`."""
+    """Plot the distribution of a measure over all cases that have a value. **Returns** a matplotlib figure, or the given
+    `ax`."""
     from jaxvib.draw.sweeps import distribution_chart
 
     opened = Store(Path(store))
@@ -195,7 +196,7 @@ def plot_distribution(store: str | Path, measure: str | None = None, *, ax: Axes
 
 
 def plot_tornado(store: str | Path, measure: str | None = None, *, ax: Axes | None = None) -> Drawn:
-    """What a measure is on average where each of the numbers that change is in the lowest and the highest fifth of its range.
+    """Plot the mean of a measure over the lowest and the highest fifth of the range of each number that changes.
 
     **Returns** a matplotlib figure, or the given `ax`, the number with the largest influence on top.
     """
@@ -239,7 +240,7 @@ def _dims(store: Store) -> list[str]:
 def _thinned(store: Store, axis: str) -> tuple[np.ndarray, int]:
     """An axis's values, no more than can be drawn, and every how many-th they are."""
     values = store.read(axis)
-    step = -(-values.size // _MOST)
+    step = -(-values.size // _MAX_DOTS)
     return values[::step], step
 
 
@@ -298,7 +299,7 @@ def _labels(store: Store, region: slice | tuple[slice, ...]) -> _Table:
 def _theory(
     store: Store, across: str, up: str, xs: np.ndarray, ys: np.ndarray
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """Where exact jams of the stored scene fold or lose their stability, as lines in the plane, by kind.
+    """Lines in the plane on which exact jams of the stored scene fold or lose their stability, by kind.
 
     Only over the rotor's speed. Where the other axis is a number of the start, which steady motions do not depend on, lines are
     straight; where it is one of the scene, they go through the points found at some of its values.

@@ -1,4 +1,4 @@
-"""What is measured in each case: quantities of the optimizer, and what a run from a start comes to."""
+"""Measures of a case: quantities of the optimizer, and quantities of a run from a start."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from optimize.wishes.quantity import Quantity
 
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
 
-_NEAR = 0.01
-"""Loads whose mean speed differs from their last one by less, in the rotor's speed, have settled."""
+_SETTLED_SPEED_SHARE = 0.01
+"""Largest difference of a mean load speed from the last one, relative to the rotor speed, of settled loads."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class RunMeasure:
 
     @property
     def words(self) -> str:
-        """What is measured, in words."""
+        """Description of the measure."""
         return self.name.replace("_", " ").removeprefix("run.")
 
 
 Measure: TypeAlias = Quantity | RunMeasure
-"""What a study measures."""
+"""Measure of a study."""
 
 
 def _regime(run: WatchedRun) -> Array:
@@ -54,9 +54,9 @@ def _regime(run: WatchedRun) -> Array:
 def _settling(run: WatchedRun) -> Array:
     """The end of the last part in which the speed of some load is not yet near its last one."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
-    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _NEAR * jnp.abs(rotor), axis=1)
+    away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
     late = jnp.max(jnp.where(away, jnp.arange(1, away.shape[0] + 1), 0)) * run.part_length
-    return jnp.where(run.regime.change < _NEAR, late, run.window.time[-1])
+    return jnp.where(run.regime.change < _SETTLED_SPEED_SHARE, late, run.window.time[-1])
 
 
 def _mode(run: WatchedRun) -> Array:
@@ -101,13 +101,13 @@ RUN_MEASURES = {
         RunMeasure("run.settling_time", "s", _settling),
     )
 }
-"""What can be read off a run, by name: its regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor,
-amplitudes and foundation force zero to peak, ripple, drift as in `AbstractMeasured`, and the time, to a 64th of the run, after
-which the loads' speeds stay within 1 % of the rotor's of their last ones."""
+"""Measures of a run by name: its regime (see `regime`) and jam mode (0: not jammed), speeds of loads and rotor, amplitudes and
+foundation force zero to peak, ripple, drift as in `AbstractMeasured`, and the time, to a 64th of the run, after which the
+loads' speeds stay within 1 % of the rotor's of their last ones."""
 
 
 def measure_of(given: Measure | str, field: str) -> Measure:
-    """What is measured, by name where it is a text. **Raises** `InputError` for what is no measure."""
+    """Measure, looked up by name if it is a text. **Raises** `InputError` for what is no measure."""
     if isinstance(given, (Quantity, RunMeasure)):
         return given
     if isinstance(given, str) and given in RUN_MEASURES:

@@ -135,7 +135,7 @@ def compute(study: Study, chunk: int) -> Chunk:
 def _computed(
     study: Study, values: np.ndarray, which: np.ndarray, errors: dict[int, str]
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """What is found in the cases `which` of a chunk, NaN (labels: -1) in the others and in those that raise an error."""
+    """Results of the cases `which` of a chunk; NaN (labels: -1) in the others and in those that raise an error."""
     filled = np.repeat(values[which[:1]], study.size, axis=0)
     filled[which] = values[which]
     try:

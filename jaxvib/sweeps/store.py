@@ -38,10 +38,10 @@ from jaxvib.sweeps.program import Chunk
 __all__ = ["ChunkState", "Store", "require_zarr", "versions"]
 
 _FORMAT = 2
-"""Of the store; another number is another layout."""
+"""Number of the layout of the store."""
 
 _PACKAGES = ("jaxvib", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
-"""Whose versions may change the last digits of a result."""
+"""Packages whose versions may change the last digits of a result."""
 
 
 class ChunkState(IntEnum):

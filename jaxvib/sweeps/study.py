@@ -26,7 +26,7 @@ from optimize.wishes.quantity import TIERS, Quantity, Tier
 __all__ = ["TEMPLATE", "Measures", "load_study", "study"]
 
 Measures: TypeAlias = Sequence[Measure | str] | Mapping[str, Measure | str]
-"""What is measured, or by the names that it shall have."""
+"""Measures, or a mapping from names to measures."""
 
 _CHUNK = {"leading": 16384, "exact": 512, "time": 1024}
 """Cases of a chunk: about a second's work, less than that is taken up by keeping books."""

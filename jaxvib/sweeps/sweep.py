@@ -42,7 +42,7 @@ _MAX_WORKERS = 16
 
 
 class CaseCount(NamedTuple):
-    """How many `cases` ended with a `status`, a name of `CaseStatus`."""
+    """Number of `cases` that ended with a `status`, a name of `CaseStatus`."""
 
     status: str
     cases: int
@@ -83,7 +83,7 @@ class Sweep(Result):
         return scene_from_toml(Store(Path(self.store)).record["scene"])
 
     def summary(self) -> str:
-        """How far the study is, how its cases ended, and how long it took, for a person to read."""
+        """Text of the progress of the study, the outcome of its cases and its duration."""
         lines = [f"{self.message}: {self.cases} cases in {self.store}"]
         for name, cases in self.counts:
             lines.append(f"  {cases} {name}: {sentence(member(CaseStatus, name))}")

@@ -22,7 +22,7 @@ _VARY = click.option(
 _OMEGA = click.option(
     "--omega", nargs=2, required=True, metavar="FROM TO", help="Range of load speeds, such as '20 rad/s' '60 rad/s'."
 )
-_POINTS = click.option("--points", type=int, default=300, show_default=True, help="Load speeds of each diagram.")
+_POINTS_OPTION = click.option("--points", type=int, default=300, show_default=True, help="Load speeds of each diagram.")
 
 
 @app.command("stability-map")
@@ -30,7 +30,7 @@ _POINTS = click.option("--points", type=int, default=300, show_default=True, hel
 @_VARY
 @click.option("--value", "values", multiple=True, required=True, help="Of that number, with its unit, repeatable.")
 @_OMEGA
-@_POINTS
+@_POINTS_OPTION
 @WITHOUT
 @shared
 def stability_map(
@@ -42,7 +42,7 @@ def stability_map(
     without: tuple[str, ...],
     output: Output,
 ) -> None:
-    """Where exact jams of SCENE are stable as one of its numbers grows; --out draws the map."""
+    """Map the stability of exact jams of SCENE over one of its numbers; --out draws the map."""
     make, read = _varied(loaded_scene(scene, without), vary)
     x = [read(value, "--value") for value in values]
     found = jv.stability_map(make, x, omega=_range(omega), points=points)
@@ -73,7 +73,7 @@ def _special(points: list[dict]) -> str:
 @click.option("--kind", required=True, help="What begins: fold, torus, symmetry or another kind of special point.")
 @click.option("--between", nargs=2, required=True, metavar="LOW HIGH", help="A value without it and one with it.")
 @_OMEGA
-@_POINTS
+@_POINTS_OPTION
 @click.option("--accuracy", type=float, default=1e-3, show_default=True, help="Of the value, relative.")
 @WITHOUT
 @shared
@@ -88,7 +88,7 @@ def onset(
     without: tuple[str, ...],
     output: Output,
 ) -> None:
-    """From which value of one of its numbers on an exact diagram of SCENE has a torus bifurcation, or another special point."""
+    """Find the value of a number at which an exact diagram of SCENE gets a torus bifurcation, or another special point."""
     make, read = _varied(loaded_scene(scene, without), vary)
     low, high = (read(value, "--between") for value in between)
     found = jv.stability_onset(make, kind, (low, high), omega=_range(omega), points=points, accuracy=accuracy)
@@ -97,7 +97,7 @@ def onset(
 
 
 def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable[[str, str], float]]:
-    """What makes the scene at a value of the number of that name, and what reads such a value."""
+    """Function that makes the scene at a value of the number of that name, and function that reads such a value."""
     import jax.numpy as jnp
 
     from optimize.space.numbers import changed, places_of, value_of

@@ -44,7 +44,8 @@ def audit(
     without: tuple[str, ...],
     output: Output,
 ) -> None:
-    """What each effect of SCENE changes and costs, and each tier; what it could leave out, and what it may lack.
+    """Report the change and the cost of each effect and each tier of SCENE: negligible effects, and effects that may be
+    missing.
 
     Each effect is taken out, and each that the scene has not and could have is put in with usual numbers. --out adds the
     figure."""

@@ -45,7 +45,7 @@ def capture(
     turning: Turning,
     output: Output,
 ) -> None:
-    """From which initial speeds the balls in a torus of SCENE come to turn with the rotor; --out adds pictures."""
+    """Find the initial speeds from which the balls in a torus of SCENE reach the rotor speed; --out adds pictures."""
     import numpy as np  # slow to import, and --help needs none of it
 
     if not -1.0 <= low < high <= 0.0:

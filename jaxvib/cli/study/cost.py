@@ -43,7 +43,7 @@ def cost(
     speed: str | None,
     output: Output,
 ) -> None:
-    """What accuracy costs in time on SCENE: error against seconds, in every way; --out adds the figure."""
+    """Measure the cost of accuracy on SCENE: error against seconds for every method; --out adds the figure."""
     found = jv.work_precision(
         loaded_scene(scene, speed=speed), quantity, mode=mode, until=until, solvers=solvers or _SOLVERS, repeats=repeats
     )

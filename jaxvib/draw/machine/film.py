@@ -23,8 +23,8 @@ __all__ = ["Film"]
 _COLORS = 64
 """Colours of a film."""
 
-_NEAR = 10
-"""Levels, of 255, by which two of them differ at least."""
+_MIN_COLOR_DIFFERENCE = 10
+"""Least difference of two colours of the palette, in levels of 255."""
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -114,7 +114,7 @@ class Film(FuncAnimation):
         chosen: list[np.ndarray] = []
         for colour in colours[np.argsort(-often, kind="stable")].astype(int):
             # Those next to a colour that is there would only take another's place.
-            if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _NEAR for other in chosen):
+            if len(chosen) < _COLORS and all(np.max(np.abs(colour - other)) > _MIN_COLOR_DIFFERENCE for other in chosen):
                 chosen.append(colour)
         palette = Image.new("P", (1, 1))
         palette.putpalette([int(level) for colour in chosen for level in colour])

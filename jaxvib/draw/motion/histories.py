@@ -12,10 +12,10 @@ from jaxvib.draw.style import COLORS, STROKES, Drawn, Onto, SpeedUnit, legend_ab
 __all__ = ["amplitude_histories", "band", "last_periods", "period_of", "time_histories"]
 
 _BINS = 300
-"""So many pieces of a run at most are drawn as a band between the least and the greatest value in each."""
+"""Maximum number of pieces of a run that are drawn as a band between the least and the greatest value of each."""
 
-_FEW = 40
-"""Up to so many periods a run is drawn as it is."""
+_MAX_PLAIN_PERIODS = 40
+"""Number of periods up to which a run is drawn without bands."""
 
 _SHOWN = 3
 """Periods at the end that are drawn as they are."""
@@ -53,7 +53,7 @@ def period_of(time: np.ndarray, values: np.ndarray) -> float:
 
 
 def last_periods(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Which samples (nt,) lie in the last periods of signals (nt, k)."""
+    """Mask (nt,) of the samples in the last periods of signals (nt, k)."""
     return time >= time[-1] - _SHOWN * period_of(time, values)
 
 
@@ -86,7 +86,7 @@ def time_histories(
     period = period_of(end[0], end[1])
     # A piece holds a whole period, or the band would follow the vibration.
     periods = (whole[0][-1] - whole[0][0]) / period
-    bins = min(_BINS, int(periods / 1.25)) if periods > _FEW else whole[0].size
+    bins = min(_BINS, int(periods / 1.25)) if periods > _MAX_PLAIN_PERIODS else whole[0].size
     part = [values[last_periods(end[0], end[1])] for values in end]
     depth = np.argsort(np.argsort(-np.ptp(whole[1], axis=0)))  # the widest lowest, so that none hides another
     for row, (kind, label) in enumerate(kinds):

@@ -13,7 +13,7 @@ from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, SpeedUnit, legend_a
 __all__ = ["path_chart", "spectrum_chart", "waterfall_chart"]
 
 _DECADES = 1e-4
-"""What is so much weaker than the strongest is not told apart."""
+"""Lower end of the scale relative to the strongest component."""
 
 
 def spectrum_chart(
