@@ -1,4 +1,4 @@
-"""What each trick of the integration engine buys: time without it, as a multiple of the time with it.
+"""Gain by each technique of the integration engine: time without it, as a multiple of the time with it.
 
     python benchmarks/ablation.py [--quick] [--only WORD ...]
 

@@ -59,8 +59,8 @@ def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:
 
 
 def bearing() -> list[tuple[float, float, float]]:
-    """Of the published rotor's pendulums, turning evenly at some speeds on a shaft that does not move: the speed, the largest
-    change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), per cent."""
+    """Radial loads of the published rotor's pendulums, which turn evenly at some speeds on a shaft at rest: the speed, the
+    largest change of the radial load by gravity over a turn (`normal_force`), and g/(l Omega^2), per cent."""
     machine = jv.one_mass(mass=1e9, stiffness=1e15, damping=0.0)
     length = float(published_rotor().loads.radius)
     loads = jv.pendulums(count=1, mass=0.05, radius=length, drag=0.0)

@@ -1,4 +1,4 @@
-"""What accuracy costs in time on four scenes: every tier, method, tolerance and dtype against one reference each.
+"""Cost of accuracy in time on four scenes: every tier, method, tolerance and dtype against one reference each.
 
     python benchmarks/cost.py [--only jam fold run_up friction gradient] [--quick] [--out FOLDER]
 

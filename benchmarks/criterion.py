@@ -1,4 +1,4 @@
-"""How long it takes to judge 100,000 random machines by the criterion; compile and run time apart.
+"""Time of judging 100,000 random machines by the criterion; compile and run time separately.
 
     python benchmarks/criterion.py [count | --quick]
 

@@ -1,4 +1,4 @@
-"""What the optimizer finds and what it takes, on machines whose best is known or published.
+"""Results and cost of the optimizer on machines whose optimum is known or published.
 
     python benchmarks/design.py [--only PART ...]
 

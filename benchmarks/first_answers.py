@@ -1,4 +1,4 @@
-"""What an answer takes the first time: in a fresh process with an empty cache, in one with a warm cache, and when asked again.
+"""Time of first answers: in a fresh process with an empty cache, in one with a warm cache, and when asked again.
 
     python benchmarks/first_answers.py [--only WORD ...]
 
@@ -105,7 +105,7 @@ def commanded(name: str, cache: str) -> float:
 
 
 def process(command: list[str], cache: str) -> str:
-    """What a process prints that starts in the example's folder with this cache. **Raises** `SystemExit` where it fails."""
+    """Output of a process that starts in the example's folder with this cache. **Raises** `SystemExit` where it fails."""
     ours = ("XLA_FLAGS", "EQX_ON_ERROR", "JAX_COMPILATION_CACHE_DIR")
     clean = {key: value for key, value in os.environ.items() if key not in ours} | {"XDG_CACHE_HOME": cache}
     done = subprocess.run(command, env=clean, cwd=EXAMPLE, capture_output=True, text=True, check=False)

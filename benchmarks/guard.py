@@ -1,4 +1,4 @@
-"""Whether something became slow: times of what users wait for, as ratios in one run, beside recorded ones.
+"""Guard against slowdowns: times of what users wait for, as ratios in one run, beside recorded ones.
 
     python benchmarks/guard.py [--record] [--limit 3]
 
@@ -98,7 +98,7 @@ def many_runs() -> Call:
 
 
 def small_program() -> Call:
-    """What compile times are measured by: 120 operations that have nothing to do with jaxvib, compiled anew at each call."""
+    """Unit of compile times: 120 operations that have nothing to do with jaxvib, compiled anew at each call."""
     matrix = np.eye(7)
 
     def chain(x: jax.Array) -> jax.Array:
@@ -123,7 +123,7 @@ RUNS: dict[str, Callable[[], Call]] = {
     "envelope": lambda: lambda: jv.envelope(published(eps=1e-3), 1000.0).foundation_force,
     "jam_modes": lambda: lambda: jv.jam_modes(platforms()).foundation_force,
 }
-"""What is timed in units of a native run; the first call of each is not counted."""
+"""Questions that are timed in units of a native run; the first call of each is not counted."""
 
 FIRST_CALLS = {
     "jam_modes, first call": lambda: jax.jit(lambda s: jv.jam_modes(s).foundation_force).lower(platforms()).compile() and (),

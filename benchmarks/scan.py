@@ -85,7 +85,7 @@ DRIVES = {
 
 
 class Cost(NamedTuple):
-    """What a scene costs: operations of its field, seconds of the processor a step and a sample."""
+    """Cost of a scene: operations of its field, seconds of the processor a step and a sample."""
 
     operations: int
     step: float
@@ -109,7 +109,7 @@ def scene(machine: str, load: str, effect: str, drive: str) -> jv.Scene:
 
 
 def allowed(*choice: str) -> bool:
-    """Whether there is such a scene."""
+    """True if there is such a scene."""
     try:
         scene(*choice)
     except InputError:

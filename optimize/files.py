@@ -24,7 +24,7 @@ __all__ = ["TEMPLATE", "Design", "load_design", "quantity_from_table"]
 _QUANTITIES = {
     name: getattr(module, name) for module in (jams, machine, motion) for name in module.__all__ if name != "between"
 }
-"""What files may ask for, by name."""
+"""Quantities of design files by name."""
 
 _STATISTICS = {"expected": expected, "worst": worst}
 _SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", "search"]

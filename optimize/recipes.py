@@ -78,7 +78,7 @@ def anti_resonance(scene: Scene, *, mode: int, range_: float = 5.0) -> Design:
 
 
 def retune(scene: Scene, objective: Quantity, *, range_: float = 3.0, starts: int = 16) -> list[tuple[str, Synthesis]]:
-    """Which one spring of an existing machine to exchange: for every spring the best machine that differs in it alone.
+    """Find the one spring of an existing machine to exchange: for every spring the best machine that differs in it alone.
 
     **Arguments**: `objective` what shall be small; `range_` the factor by which a spring may differ; `starts` of each search.
 

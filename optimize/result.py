@@ -1,4 +1,4 @@
-"""What a search found, and what a person reads of it."""
+"""Result of a search, and its text and tables."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _LEAST_MOVE = 1e-6
 
 
 class SynthesisStatus(eqx.Enumeration):
-    """How a search ended; the members are the sentences a user reads."""
+    """Outcomes of a search; the members are the sentences a user reads."""
 
     done = "the search ended where no free number can improve the objective"
     not_converged = "the best design that was found could still be improved: allow more polishing or more iterations"
@@ -107,7 +107,7 @@ class Limit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """How much a free number matters: `what` in words; the objective's change in per cent where it is 1 % `less` and `more`,
+    """Influence of a free number: `what` in words; the objective's change in per cent where it is 1 % `less` and `more`,
     nothing else changed."""
 
     what: str
@@ -124,7 +124,7 @@ class Machine(NamedTuple):
 
 
 class Synthesis(Result):
-    """What a search found.
+    """Result of a search.
 
     **Attributes**
 

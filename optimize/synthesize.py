@@ -1,4 +1,4 @@
-"""From a design space and a wish to a machine, checked by the exact motion and by time integration."""
+"""Search for a machine in a design space, with verification by the exact motion and by time integration."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from optimize.wishes.quantity import Demand, Pair, Quantity, Tier, require_quant
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
 _CONVERGED = 1e-6
-"""By how much, in relation to its value, the objective may still be above its least value nearby."""
+"""Largest decrease of the objective, relative to its value, that a converged design may still allow nearby."""
 
 _SAME = 1e-3
-"""How near two designs must be, relative to the ranges of the free numbers, to count as the same machine."""
+"""Largest distance of two designs that count as the same machine, relative to the ranges of the free numbers."""
 
 _SPREAD = 1e-3
 """Largest angle by which loads start beside the exact motion, rad."""
@@ -301,7 +301,7 @@ def _beside(orbit: Orbit) -> State:
 
 
 def _standard(scene: Scene, mode: int | None, of: Pair) -> list[tuple[str, Quantity]]:
-    """What a table of a machine in a jam mode tells besides."""
+    """Additional rows of a table of a machine in a jam mode."""
     if mode is None:
         return []
     rows = [("jam frequency", jam_frequency(mode=mode))]

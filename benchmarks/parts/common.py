@@ -1,4 +1,4 @@
-"""What benchmarks share: the machine that is measured, the clock, the rows of the table, and who measured."""
+"""Common parts of benchmarks: the measured machine, the clock, the rows of the table, the processor."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def published(speed: float = 5.1779, eps: float = 0.05, damping: float = 0.01) -
 
 
 def thrown() -> jv.State:
-    """Where the runs of that machine start from."""
+    """Initial state of the runs of that machine."""
     return jv.State(jnp.asarray([-1.0, 1.0]), jnp.zeros(2), (jnp.zeros(1),), (jnp.ones(1),))
 
 
@@ -137,7 +137,7 @@ def as_first_written(task: str, **given: Any) -> list[list[Any]]:
 
 
 def cpu_name() -> str:
-    """What the processor calls itself."""
+    """Name of the processor."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
             return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))

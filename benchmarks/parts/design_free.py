@@ -35,14 +35,14 @@ _LARGEST_POPULATION = 30
 
 
 class Course(NamedTuple):
-    """How a search went: seconds and evaluations, and the least value by then."""
+    """Progress of a search: seconds and evaluations, and the least value by then."""
 
     seconds: list[float]
     evaluations: list[int]
     values: list[float]
 
     def reached(self, value: float) -> str:
-        """When the search came to a value."""
+        """Text of the time at which the search reached a value."""
         for s, n, v in zip(*self, strict=True):
             if v <= value:
                 return f"{n} evaluations, {s:.1f} s"

@@ -1,4 +1,4 @@
-"""What a run-up costs at 1 % error in amplitude: the averaged equations against the full ones.
+"""Cost of a run-up at 1 % error in amplitude: the averaged equations against the full ones.
 
     python benchmarks/engine.py --only envelope
 

@@ -1,4 +1,4 @@
-"""What 1, 10, 100, 1000 loads cost: an evaluation of the vector field, and a time integration; no more than their number.
+"""Cost of 1, 10, 100, 1000 loads: an evaluation of the vector field, and a time integration; no more than their number.
 
     python benchmarks/engine.py --only loads
 

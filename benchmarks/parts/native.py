@@ -137,7 +137,7 @@ def run(y, speeds, par, end, steps):
 
 
 def simd_ensemble(lanes: int = 16) -> Callable[..., np.ndarray]:
-    """As `scalar_ensemble`, blocks of `lanes` runs stepped together, each statement a loop over the lanes."""
+    """Ensemble like `scalar_ensemble`, blocks of `lanes` runs stepped together, each statement a loop over the lanes."""
     body = step_source()
     source = f"""
 def run(y, speeds, par, end, steps):

@@ -51,7 +51,7 @@ _BALL = """
     yx{j} = B{j} * cf{j} * fx{j} + py{j} * ax{j}
     yy{j} = 1.0 + B{j} * cf{j} * fy{j} + py{j} * ay{j}
 """
-"""Of ball j: f'' = F + fx x'' + fy y'', a'' = A + ax x'' + ay y'', and what it is to the rotor."""
+"""Coefficients of ball j: f'' = F + fx x'' + fy y'', a'' = A + ax x'' + ay y'', and its reaction on the rotor."""
 
 _ROTOR = """
     gx = imb * w * w * cturn - k * x - c * vx + m * (o1 * cf1 + k1 * sf1 + o2 * cf2 + k2 * sf2)

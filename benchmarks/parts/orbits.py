@@ -1,4 +1,4 @@
-"""What exact jams cost: collocation with the carrier eliminated against other ways to the same orbits, at the same accuracy.
+"""Cost of exact jams: collocation with the carrier eliminated against other ways to the same orbits, at the same accuracy.
 
     python benchmarks/engine.py --only orbits
 
@@ -309,7 +309,7 @@ def by_differentiation(scene: jv.Scene, quick: bool) -> None:
 
 
 def value_and_gradient(quick: bool, runs: int) -> None:
-    """At a given rotor speed, with respect to every number of the machine."""
+    """Value and gradient at a given rotor speed, with respect to every number of the machine."""
     group, base = "exact orbit and its gradient", None
     print(f"{group}; error: of the load speed, to 16 points")
     for platforms in (2,) if quick else (2, 20):

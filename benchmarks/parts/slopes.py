@@ -21,7 +21,7 @@ NAMES = ("stiffness", "damping", "link_stiffness", "link_damping")
 
 
 def gradient(quick: bool = False) -> None:
-    """What a user writes: `simulate` under `jit`, `jacfwd` and `grad`; a displacement at the end by 6 numbers."""
+    """Gradient as a user writes it: `simulate` under `jit`, `jacfwd` and `grad`; a displacement at the end by 6 numbers."""
     end = 40.0 if quick else 200.0
     scene, start = published(), thrown()
     values = jnp.concatenate([getattr(scene.machine, name) for name in NAMES])

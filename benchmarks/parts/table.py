@@ -1,4 +1,4 @@
-"""What engine.py measured, as a markdown table and as figures; from its JSON alone too.
+"""Results of engine.py as a markdown table and as figures; from its JSON alone too.
 
 PYTHONPATH=benchmarks python -m parts.table out/engine.json      # writes engine.md, engine.png, memory.png beside it
 """
@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from jaxvib.draw.style import COLORS, panels
 
 OWN = ("jaxvib", "envelope", "the run itself", "forward", "reverse")
-"""How the names of jaxvib's own ways begin, where a group compares it with others."""
+"""Beginnings of the names of jaxvib's own methods, if a group compares it with others."""
 
 
 def _groups(document: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:

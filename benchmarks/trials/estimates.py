@@ -1,4 +1,4 @@
-"""How often a run's estimated error is below its true one, and how often an accuracy that was asked for is broken silently.
+"""Reliability of error estimates: share of runs whose estimated error is below the true one, and of broken accuracies.
 
     python benchmarks/trials/estimates.py --scenes 30 --out out
 
@@ -132,7 +132,8 @@ def measured(kind: str, seed: int, dtype: type) -> dict[str, float | str | int]:
 
 
 def table(rows: list[dict]) -> str:
-    """For each kind and dtype: runs, share and worst ratio of errors above estimates, and of accuracies broken silently."""
+    """Table for each kind and dtype: runs, share and worst ratio of errors above estimates, and of accuracies broken
+    silently."""
     lines = [f"{'':20s}{'':9s}{'runs':>5s}{'above':>8s}{'worst':>7s}{'broken':>8s}{'worst':>7s}{'refused':>8s}{'median':>8s}"]
     for kind in [*KINDS, "all"]:
         for dtype in ("float64", "float32"):

@@ -119,7 +119,7 @@ def record(rng: np.random.Generator) -> str:
 
 
 def read_file(seed: int, folder: pathlib.Path, texts: dict[str, str]) -> str:
-    """How reading one mutated file ends."""
+    """Outcome of reading one mutated file."""
     rng = np.random.default_rng([seed, 2])
     names = [*texts, "record"]
     name = names[int(rng.integers(len(names)))]
@@ -331,7 +331,7 @@ QUESTIONS: dict[str, Callable[[jv.Scene, np.random.Generator], str]] = {
 
 
 def ended(ask: Callable[[], str]) -> str:
-    """How a question ends, failures by their last line."""
+    """Outcome of a question, failures by their last line."""
     begun = time.process_time()
     try:
         with warnings.catch_warnings():

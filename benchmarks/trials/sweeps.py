@@ -1,4 +1,4 @@
-"""What sweeps cost, and what they survive: a map of captures, killed runs, a killed worker, a million cases.
+"""Cost and robustness of sweeps: a map of captures, killed runs, a killed worker, a million cases.
 
     python benchmarks/trials/sweeps.py map --out out
     python benchmarks/trials/sweeps.py killed
@@ -91,7 +91,7 @@ def since(begun: tuple[float, float]) -> str:
 
 
 def same(one: pathlib.Path, other: pathlib.Path) -> bool:
-    """Whether two stores hold the same numbers, bit for bit."""
+    """True if two stores hold the same numbers, bit for bit."""
     first, second = jv.open_sweep(one).data, jv.open_sweep(other).data
     return all(first[name].values.tobytes() == second[name].values.tobytes() for name in first if name != "error")
 
@@ -167,7 +167,7 @@ def killed(folder: pathlib.Path, out: pathlib.Path) -> None:
 
 
 def watched(told: str):
-    """What a worker does for a chunk, and a line in a file for each: the process, when it began and ended, processor time."""
+    """Computation of a chunk by a worker, with a line in a file for each: the process, begin, end, processor time."""
     real = jaxvib.sweeps.cluster._remote
 
     def remote(*given):

@@ -1,1 +1,1 @@
-"""Who searches: many starts at once, a descent on optax, sequential quadratic programming, catalogues by branch and bound."""
+"""Search methods: many starts at once, a descent on optax, sequential quadratic programming, catalogues by branch and bound."""

@@ -23,7 +23,7 @@ STRETCH = 25
 """Steps of the descent between two looks at it from outside."""
 
 _ON_THE_WAY = 0.1
-"""How well what is held must be kept during the descent, where every step corrects what the one before left."""
+"""Allowed violation of held quantities during the descent, in which every step corrects the violation of the one before."""
 
 _UPDATE = 20
 """Steps after which the multipliers of demands are set anew."""
@@ -48,7 +48,7 @@ class _Lane(NamedTuple):
 
 
 class Descended(NamedTuple):
-    """Where the descent ended, a `Point`, the multipliers of the demands there and the objective on the way (steps, starts)."""
+    """End of the descent, a `Point`, the multipliers of the demands there and the objective on the way (steps, starts)."""
 
     point: Point
     multipliers: np.ndarray
@@ -165,7 +165,7 @@ def descend(problem: Problem, point: Point, steps: int, rate: float, tell: Calla
 
 
 def _point(lanes: _Lane) -> Point:
-    """Where the lanes are; the objective's pieces are not asked on the way."""
+    """Point at which the lanes are, without pieces of the objective."""
     z, values, slopes = (np.asarray(each) for each in lanes[:3])
     nothing = np.zeros((len(z), 0))
     return Point(z, values, slopes, lanes.known, lanes.reach, nothing, np.zeros((*nothing.shape, z.shape[1])))

@@ -19,19 +19,19 @@ from optimize.search.problem import Known, Point, Problem, evaluate, looked_up
 __all__ = ["Evolved", "Followed", "evolve", "require_cma"]
 
 _PRICE = 10.0
-"""What breaking a demand by its own size costs, in typical values of the objective."""
+"""Penalty of a demand that is violated by its own size, in typical values of the objective."""
 
 _LANES = 8
 """Designs that are computed together: populations are small, and few of them are lost at a time."""
 
 _REMEMBERED = 200
-"""So many last designs' jams are known."""
+"""Number of last designs whose jams are kept."""
 
 _KEPT = 8
 """Designs that go on to be polished."""
 
 _APART = 1e-2
-"""How far these are apart in one free number at least, in parts of its range."""
+"""Least distance of these in one free number, relative to its range."""
 
 _NOWHERE = 1e12
 """The merit of a design whose objective does not exist."""
@@ -69,7 +69,7 @@ class Followed:
         """The last designs, and the speeds that were followed there."""
 
     def of(self, z: np.ndarray) -> np.ndarray:
-        """Those of the designs z (s, d), NaN where something does not exist."""
+        """Values of the designs z (s, d), NaN if a quantity does not exist."""
         if self.seen is None:
             values, known = self._at(z, looked_up(self.problem, z))
         else:

@@ -1,4 +1,4 @@
-"""From random starts to the best designs: the continuous search, and choices from catalogues by branch and bound."""
+"""Search from random starts to the best designs: the continuous search, and choices from catalogues by branch and bound."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _FEW = 8
 Tell = Callable[[str, float], None]
 
 Searcher = Literal["gradients", "cma"]
-"""What leads from the bounds to where polishing begins: Adam from many starts, or CMA-ES."""
+"""Method of the first phase, before polishing: Adam from many starts, or CMA-ES."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a search goes, see `synthesize`."""
+    """Options of a search, see `synthesize`."""
 
     starts: int
     seed: int
@@ -47,8 +47,8 @@ class Options:
 
 
 class Found(NamedTuple):
-    """Where searches ended, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was
-    `interrupted`; the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
+    """Ends of searches, see `Polished`; `drawn` designs, of which `existing` had the objective; whether it was `interrupted`;
+    the bounds (d,) of the space it ended in, SI; how many `nodes` a choice from catalogues took."""
 
     point: Point
     history: np.ndarray
@@ -106,7 +106,7 @@ def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
 
 
 def _spread(problem: Problem) -> bool:
-    """Whether tolerances count."""
+    """True if tolerances count."""
     every = [problem.objective, *(q for d in problem.demands for q in (d.quantity, d.limit))]
     return any(isinstance(part, Robust) for q in every for part in walk(q))
 
@@ -231,7 +231,7 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
 
 def _away(values: tuple[float, ...], x: float) -> float:
-    """How far a number is from the nearest value of its catalogue, relative to it."""
+    """Relative distance of a number from the nearest value of its catalogue."""
     nearest = min(values, key=lambda v: abs(v - x))
     return abs(x - nearest) / max(abs(nearest), 1e-300)
 

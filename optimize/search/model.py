@@ -52,8 +52,8 @@ def _pieces(problem: Problem, point: Point) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unlike(point: Point, shares: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """By how much, in parts of `size` (s,), the objective's pieces that have `shares` (s, parts) differ from the one that has
-    most, (s, k), and the derivatives (s, k, d); 0 for those that have none."""
+    """Differences, in parts of `size` (s,), of the objective's pieces that have `shares` (s, parts) from the one with the
+    largest share, (s, k), and their derivatives (s, k, d); 0 for pieces without a share."""
     most = np.argsort(-shares, axis=1)[:, : point.z.shape[1] + 1]
     values, met = (np.take_along_axis(a, most, axis=1) for a in (point.pieces, shares > _COUNTS))
     tilts = np.take_along_axis(point.tilts, most[:, :, None], axis=1)
@@ -177,8 +177,8 @@ def _active(found: Solved, demands: tuple[np.ndarray, np.ndarray]) -> np.ndarray
 
 
 def fall(problem: Problem, point: Point, bend: np.ndarray, model: Step, size: np.ndarray) -> np.ndarray:
-    """By how much the objective may fall yet, as the model has it, in parts of its value; of an objective that is about 0, in
-    parts of what it changes by over the bounds."""
+    """Decrease of the objective that the model predicts, relative to its value; for an objective of about 0, relative to its
+    change over the bounds."""
     values, slopes = _pieces(problem, point)
     along = np.max(values - point.values[:, :1] + np.einsum("spd,sd->sp", slopes, model.p), axis=1)
     dual = np.concatenate([model.held, model.demands], axis=1) * size[:, None]

@@ -58,7 +58,7 @@ class Problem(eqx.Module):
 
     @property
     def equalities(self) -> int:
-        """How many quantities are held."""
+        """Number of held quantities."""
         return len(self.space.held)
 
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
@@ -96,19 +96,19 @@ class Problem(eqx.Module):
 
     @property
     def forward_only(self) -> bool:
-        """Whether a quantity has derivatives in forward mode only."""
+        """True if a quantity has derivatives in forward mode only."""
         every = [self.objective, *(q for d in self.demands for q in (d.quantity, d.limit))]
         return any(q.forward_only for q in every) or any(h.quantity.forward_only for h in self.space.held)
 
 
 def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
-    """What a search follows, and of how many smooth pieces its objective is the largest."""
+    """Load speeds that a search follows, and the number of smooth pieces of which its objective is the largest."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
     return _asked((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
 
 def _hard(quantity: Quantity) -> bool:
-    """Whether some of it is not computed to leading order."""
+    """True if part of the quantity is not computed to leading order."""
     return any(isinstance(q, Asking) and q.tier != "leading" for q in walk(quantity))
 
 
@@ -126,7 +126,7 @@ class Point(NamedTuple):
     tilts: np.ndarray
 
     def exists(self) -> np.ndarray:
-        """Whether everything has a value and derivatives there (s,)."""
+        """True if everything has a value and derivatives there (s,)."""
         return np.all(np.isfinite(self.values), axis=1) & np.all(np.isfinite(self.slopes), axis=(1, 2))
 
     def where(self, chosen: np.ndarray, other: Point) -> Point:
@@ -148,7 +148,7 @@ class Point(NamedTuple):
         return jax.tree.map(one, self, new)
 
     def ahead(self, z: np.ndarray) -> Known:
-        """Where the followed speeds are about at other designs."""
+        """Approximate followed speeds at other designs."""
         step = z - self.z
         guess = []
         for k, r in zip(self.known, self.reach, strict=True):
@@ -258,7 +258,7 @@ def made(problem: Problem, numbers: np.ndarray) -> Scene:
 
 
 class _Shapes(NamedTuple):
-    """What a scene is but for its numbers."""
+    """Structure of a scene without its numbers."""
 
     tree: Any
     leaves: tuple[tuple[tuple[int, ...], np.dtype], ...]
@@ -271,7 +271,8 @@ class _Shapes(NamedTuple):
 
 @functools.lru_cache(maxsize=256)
 def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
-    """What these quantities of a scene follow, and of how many smooth pieces the first one is the largest."""
+    """Load speeds that these quantities of a scene follow, and the number of smooth pieces of which the first one is the
+    largest."""
     recorder = Recorder()
 
     def ask(scene: Scene) -> tuple[Array, list[Array]]:
@@ -284,7 +285,7 @@ def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key
 
 
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
-    """What these quantities follow."""
+    """Load speeds that these quantities follow."""
     return _asked(tuple(quantities), _Shapes.of(scene))[0]
 
 

@@ -1,4 +1,4 @@
-"""What the end of a search says: which limits hinder, which numbers matter, which machines there are."""
+"""Sensitivities at the end of a search: active limits, influential numbers, different machines."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def neighbours(problem: Problem, found: Found) -> np.ndarray:
 
 
 def influences_of(problem: Problem, values: np.ndarray) -> tuple[Influence, ...]:
-    """How much each free number matters, from the objective (1 + 2 d,) of the `neighbours`."""
+    """Influence of each free number, from the objective (1 + 2 d,) of the `neighbours`."""
     d = problem.space.size
     if not values[0]:
         return ()

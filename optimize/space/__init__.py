@@ -1,4 +1,4 @@
-"""What may change: numbers of a scene by name, bounds, ties, catalogues, held quantities."""
+"""Design space: free numbers of a scene by name, bounds, ties, catalogues, held quantities."""
 
 from optimize.space.space import DesignSpace, Held, hold
 

@@ -27,7 +27,7 @@ Bounds = tuple[Number, Number] | tuple[Number, Number, str]
 """(low, high), or (low, high, "log" or "even")."""
 
 Source = str | tuple[str, float | Literal["keep"]]
-"""What a number is tied to: the name of another one, with a factor, or "keep" for the ratio that they have."""
+"""Source of a tied number: the name of another one, with a factor, or "keep" for their present ratio."""
 
 
 class Held(eqx.Module):
@@ -163,7 +163,7 @@ class DesignSpace(eqx.Module):
 
     @property
     def size(self) -> int:
-        """How many numbers are free."""
+        """Number of free numbers."""
         return sum(place.size for place in self.places)
 
     def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
@@ -210,7 +210,7 @@ class DesignSpace(eqx.Module):
         return {p.name: (p.leaf(scene) if p.entry is None else p.leaf(scene)[p.entry]).tolist() for p in self.places}
 
     def words(self) -> list[tuple[str, str]]:
-        """What a designer calls each free number, and its unit."""
+        """Name in a designer's words and unit of each free number."""
         return [(word, place.unit) for place in self.places for word in names_of(self.scene, place)]
 
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
@@ -218,7 +218,7 @@ class DesignSpace(eqx.Module):
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
 
     def residuals(self, answers: Answers) -> Array:
-        """By how much each held quantity is off, relative to the value it is held at (m,)."""
+        """Deviation of each held quantity, relative to the value at which it is held (m,)."""
         off = [held.quantity.read(answers) / held.value - 1.0 for held in self.held if held.value is not None]
         return jnp.stack(off) if off else jnp.zeros((0,))
 

@@ -1,1 +1,1 @@
-"""What can be wanted of a machine: quantities, their arithmetic, demands on them."""
+"""Quantities of a machine, their arithmetic, and demands on them."""

@@ -1,4 +1,4 @@
-"""What quantities ask a scene for, each question answered once; jams are followed from a machine that is near."""
+"""Results that quantities need of a scene, each computed once; jams are followed from a similar machine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jaxvib.units import traced
 __all__ = ["Answers", "Asked", "Case", "Key", "Recorder", "guesses"]
 
 _NO_FOLD = 10.0
-"""Where no fold ends a mode on the side of higher rotor speeds, this times the scene's stands for it."""
+"""Factor of the rotor speed that stands for the fold of a mode that no fold ends on the side of higher rotor speeds."""
 
 _SAMPLES = 4000
 """States of a run-up that are looked at."""
@@ -41,15 +41,15 @@ class Case(Protocol):
 
     @property
     def several(self) -> bool:
-        """Whether it stands for several scenes."""
+        """True if it stands for several scenes."""
         ...
 
 
 Asked = tuple[str, int]
-"""What is followed: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
+"""Followed jam or fold: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
 
 Key = tuple[tuple[Case, ...], Asked]
-"""Of which scene (the cases that lead there from the design's own), and what."""
+"""Scene (the cases that lead there from the design's own), and the followed jam or fold."""
 
 
 class Recorder:
@@ -65,7 +65,7 @@ class Recorder:
 
 
 class Answers:
-    """What is known of one scene. Questions are answered when they are first asked.
+    """Results of one scene. Questions are answered when they are first asked.
 
     **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the
     whole branch is looked at; `found` the load speeds that came out.

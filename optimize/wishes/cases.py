@@ -51,7 +51,7 @@ class Sampled:
     several = True
 
     def factors(self, scene: Scene) -> list[tuple[Place, np.ndarray]]:
-        """Of each number the factors (samples, entries), normal, within three deviations: a Latin hypercube, in which every
+        """Factors of each number (samples, entries), normal, within three deviations: a Latin hypercube, in which every
         number's samples fill the distribution evenly, in an order of their own."""
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
@@ -129,7 +129,7 @@ class Robust(_OfPart):
         return self._sampled(answers, self.parts[0].pieces).reshape(-1)
 
     def _sampled(self, answers: Answers, question: Callable[[Answers], Array]) -> Array:
-        """What every sample answers, (samples, ...)."""
+        """Answers of all samples, (samples, ...)."""
         scenes, path = answers.under(self.case)
         known, keys = answers.known, []
         near: tuple[Array, ...] | None = None

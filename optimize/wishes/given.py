@@ -1,4 +1,4 @@
-"""What users give: functions, units, numbers in a unit."""
+"""Values from users: functions, units, numbers in a unit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["arguments", "number_in", "same_unit"]
 
 
 def arguments(function: Callable[..., object]) -> int:
-    """How many arguments a function must be given; 1 where nobody says."""
+    """Number of required arguments of a function; 1 if it is unknown."""
     try:
         given = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):

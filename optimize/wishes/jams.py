@@ -36,7 +36,8 @@ _SLIP = 1e-4
 
 
 def between(scene: Scene, of: Pair = None) -> int | tuple[int, int]:
-    """Whose amplitude is meant: `of`, or, if it is None, platform 1 against 2, and the only platform where there is one.
+    """Platform, or pair of platforms, whose amplitude is meant: `of`, or, if it is None, platform 1 against 2, and the only
+    platform if there is one.
 
     **Raises** `InputError` for a platform that is not there.
     """
@@ -118,8 +119,8 @@ def _amplitude(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
 
 @validated
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
-    """By how much two platforms are out of phase in a jam mode, rad: 0 in phase, pi in antiphase; of the exact motion that of
-    their first harmonics.
+    """Phase difference of two platforms in a jam mode, rad: 0 in phase, pi in antiphase; of the exact motion that of their
+    first harmonics.
 
     **Arguments**: `mode` number of the jam mode; `of` the two platforms; `tier` "leading" or "exact".
 
@@ -240,7 +241,7 @@ def _frequency(answers: Answers, tier: Tier, mode: int) -> Array:
 
 @validated
 def fold_margin(*, mode: int) -> Quantity:
-    """By how much the rotor's speed may change, up or down, before a jam mode vanishes at a fold, rad/s, to leading order.
+    """Change of the rotor speed, up or down, at which a jam mode vanishes at a fold, rad/s, to leading order.
 
         margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
 

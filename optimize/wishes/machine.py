@@ -144,7 +144,7 @@ def _mass(answers: Answers, tier: Tier) -> Array:
 
 @validated
 def static_deflection(of: int | None = None) -> Quantity:
-    """How far a platform sags under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
+    """Static deflection of a platform under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
 
     **Arguments**: `of` the platform; default: the largest deflection of all platforms.
 

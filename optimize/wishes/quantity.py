@@ -22,10 +22,10 @@ from optimize.wishes.given import arguments, number_in, same_unit
 __all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "require_quantity", "walk"]
 
 Pair = int | tuple[int, int] | None
-"""Whose amplitude: a platform's own, or that of one platform relative to another; None: see `between`."""
+"""Platform whose amplitude is meant, or pair of platforms for a relative amplitude; None: see `between`."""
 
 Tier: TypeAlias = Literal["leading", "exact", "time"]
-"""How a quantity is computed: to leading order of light loads, from the exact periodic motion, or by time integration."""
+"""Method of a quantity: leading order of light loads, the exact periodic motion, or time integration."""
 
 TIERS: tuple[Tier, ...] = ("leading", "exact", "time")
 
@@ -90,7 +90,7 @@ class Quantity:
 
     @property
     def forward_only(self) -> bool:
-        """Whether derivatives are had in forward mode only."""
+        """True if derivatives exist in forward mode only."""
         return any(part.forward_only for part in self.parts)
 
     def at_tier(self, tier: Tier) -> Quantity:
@@ -100,8 +100,8 @@ class Quantity:
 
     @property
     def easy(self) -> Quantity:
-        """What is searched first in its place, since it takes less time and its best machines are near: to leading order,
-        without tolerances."""
+        """Quantity that is searched first in its place, since it takes less time and its best machines are near: to leading
+        order, without tolerances."""
         return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
 
     def named(self, name: str) -> Quantity:
@@ -161,7 +161,7 @@ class Asking(Quantity):
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
     parted: Callable[..., Array] | None = None
-    """What gives its `pieces`: a function of the answers, the sign, the tier and the settings."""
+    """Function of the answers, the sign, the tier and the settings that returns its `pieces`."""
 
     def __post_init__(self) -> None:
         require_one_of(self.tier, TIERS, "tier")
@@ -288,8 +288,7 @@ class Demand:
         return replace(self, limit=limit, shown="")
 
     def excess(self, answers: Answers, constant: Array) -> Array:
-        """By how much the demand is not met, in its unit, negative where there is room; `constant` is its limit where that is a
-        number."""
+        """Violation of the demand in its unit, negative if it is met; `constant` is its limit if that is a number."""
         value = self.quantity.read(answers)
         limit = constant if self.constant is not None else self.limit.read(answers)
         return value - limit if self.sense == "at most" else limit - value

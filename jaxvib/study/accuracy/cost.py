@@ -44,7 +44,7 @@ class CostRow(NamedTuple):
 
 
 class Cost(Result):
-    """What a quantity costs: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
+    """Cost of a quantity: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
     (`reference_error`, relative), the `rows`, and which tiers are `left_out`, a sentence with the reason for each."""
 
     status = Computed.done

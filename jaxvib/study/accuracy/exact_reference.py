@@ -30,7 +30,8 @@ class ExactJam(NamedTuple):
     coarse: Orbit
 
     def length(self, scene: Scene, tolerance: float) -> float:
-        """How long a run takes to forget its start to the tolerance, s, the measuring window after that; of a stable jam."""
+        """Duration, s, after which a run has forgotten its start to the tolerance, with the measuring window; for a stable
+        jam."""
         rate = -np.log(float(self.fine.multiplier)) * float(self.fine.omega) / (2.0 * np.pi)
         window = slow_period(scene) * SLOW_PERIODS
         return min(window + np.log(1.0 / tolerance) / rate, slow_period(scene) * MOST_PERIODS)
@@ -60,7 +61,7 @@ def usual_mode(scene: Scene) -> int:
 
 
 def collocation_points(scene: Scene, points: int) -> int:
-    """So many points on half a period, or as close together on a whole one where that is needed."""
+    """Number of points on half a period, or with the same spacing on a whole one if that is needed."""
     return points if has_half_turn(scene.effects) else 2 * points + 1
 
 
@@ -71,6 +72,6 @@ def slow_period(scene: Scene) -> float:
 
 
 def unstable(tiers: str, jam: ExactJam) -> str:
-    """Why tiers that integrate in time cannot answer for an unstable jam, a sentence."""
+    """Sentence that says why tiers that integrate in time cannot answer for an unstable jam."""
     largest = f"largest Floquet multiplier {float(jam.fine.multiplier):.4g}"
     return f"{tiers}: jam mode {jam.mode} is unstable ({largest}), a run leaves it"

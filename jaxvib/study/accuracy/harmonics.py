@@ -1,4 +1,4 @@
-"""How many harmonics an exact jam asks for."""
+"""Convergence of exact jams with the number of harmonics."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ __all__ = ["HarmonicConvergence", "harmonic_convergence"]
 
 
 class HarmonicConvergence(Result):
-    """What the number of harmonics leaves: `harmonics` (n,) highest one of the carrier; of the jams at `omega` (w,) rad/s the
-    relative `error` (n, w) of the rotor speed against twice as many points as the last, and the estimate of it that each jam
-    comes with, `known` (n, w)."""
+    """Errors of jams with a limited number of harmonics: `harmonics` (n,) highest one of the carrier; of the jams at `omega`
+    (w,) rad/s the relative `error` (n, w) of the rotor speed against twice as many points as the last, and the estimate of it
+    that each jam comes with, `known` (n, w)."""
 
     status = Computed.done
 

@@ -94,4 +94,4 @@ TIERS = (
         lambda scene, mode, until: settle(scene, mode=mode, throw=False),
     ),
 )
-"""From the cheapest to the one that answers for every scene."""
+"""Tiers in order of cost; the last one answers for every scene."""

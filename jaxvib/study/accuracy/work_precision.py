@@ -183,7 +183,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
 
 
 def _at_the_end(ask: _Ask, quantity: str, end: float | None, reason: str) -> Cost:
-    """Of a motion that is no jam: as measured at the end of a run from rest."""
+    """Quantity of a motion that is no jam: measured at the end of a run from rest."""
     end = SLOW_PERIODS * slow_period(ask.scene) if end is None else end
 
     def read(found: Result) -> Array:

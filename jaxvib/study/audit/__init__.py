@@ -1,1 +1,1 @@
-"""What effects and tiers are worth on a scene: what each changes, what it costs, which are missing."""
+"""Audit of effects and tiers on a scene: their changes, their cost, and missing effects."""

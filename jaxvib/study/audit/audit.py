@@ -1,4 +1,4 @@
-"""What each effect and each tier is worth on a scene: what it changes, what it costs, and which effects may be missing."""
+"""Audit of each effect and each tier on a scene: changes, cost, and effects that may be missing."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = ["Audit", "AuditStatus", "audit"]
 
 
 class AuditStatus(eqx.Enumeration):
-    """What is known of an audit; the members are the sentences a user reads."""
+    """Outcomes of an audit; the members are the sentences a user reads."""
 
     done = "what each effect changes was computed"
     unsettled = "the motion had not settled to the accuracy that was asked for: smaller changes cannot be told; run longer"
@@ -42,7 +42,7 @@ class AuditStatus(eqx.Enumeration):
 
 
 class Audit(Result):
-    """What each effect and each tier is worth on a scene.
+    """Changes and cost of each effect and each tier on a scene.
 
     **Attributes**: `accuracy` that was asked for, relative; `question` that was asked, in words; the scene's own `kind` of
     motion, `omega` rad/s, `amplitude` (nd,) m, of tilts rad, `foundation_force` N and `fold` rad/s; `operations` of its
@@ -72,7 +72,7 @@ class Audit(Result):
         return [row.effect for row in self.effects if row.advice == advice]
 
     def summary(self) -> str:
-        """What the scene calls for, what it could leave out, and what it may lack, for a person to read."""
+        """Text with the needed, negligible and missing effects of the scene."""
         lines = [f"{self.question}: {self.kind}; {self.message}"]
         for row in self.effects:
             change = "no change is known" if math.isnan(row.change) else f"changes up to {100.0 * row.change:.3g} %"
@@ -86,9 +86,8 @@ class Audit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """What each effect changes against the accuracy asked for, and what it costs, onto two axes `ax` if given.
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
+        """Plot the change by each effect against the requested accuracy, and its cost, onto two axes `ax` if given. **Returns**
+        a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 
         told = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
@@ -111,7 +110,7 @@ def audit(
     tiers: bool = True,
     repeats: int = 3,
 ) -> Audit:
-    """What each effect changes and costs on a scene, and each tier; what the scene could leave out, and what it may lack.
+    """Compute the change and the cost of each effect and each tier on a scene; find negligible and missing effects.
 
     Each effect of the scene is taken out, each that it has not and could have is put in, with usual numbers
     (`Effect.typical`), and the same question is asked of both scenes: of a scene that jams at a constant rotor speed, its jam,

@@ -132,7 +132,7 @@ def field_operations(scene: Scene) -> int:
 
 
 def relative_changes(new: Values, old: Values, own: Values, units: tuple[str, ...]) -> dict[str, float]:
-    """What changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
+    """Changes from `old` to `new`, relative to the values `own`, by the names in `CHANGES`; see `EffectRow`."""
     moved, size = np.asarray(new.amplitude) - np.asarray(old.amplitude), own.magnified * np.asarray(own.amplitude)
     largest = {unit: max(x for x, u in zip(size, units, strict=True) if u == unit) for unit in units}
     shares = [float(d) / largest[u] if largest[u] > 0.0 else math.nan for d, u in zip(moved, units, strict=True)]

@@ -74,7 +74,7 @@ def _arm(scene: Scene) -> float:
 
 
 def _own_radius(scene: Scene) -> tuple[float, str] | None:
-    """That of the loads, or of steel balls of their mass, and where it is from; None for loads on bearings."""
+    """Radius of the loads, or of steel balls of their mass, and its origin; None for loads on bearings."""
     own = getattr(scene.loads, "own_radius", None)
     if own is not None:
         return float(own), ""

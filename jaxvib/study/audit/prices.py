@@ -1,4 +1,4 @@
-"""What effects, drives and coordinates cost where a scene has them: operations of the traced equations of motion."""
+"""Cost of effects, drives and coordinates: operations that they add to the traced equations of motion."""
 
 from __future__ import annotations
 

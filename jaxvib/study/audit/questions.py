@@ -76,7 +76,7 @@ class JamQuestion(NamedTuple):
     mode: int
 
     def can(self, scene: Scene) -> bool:
-        """Whether the exact orbit answers."""
+        """True if the exact orbit answers."""
         try:
             require_collected(scene)
         except InputError:
@@ -103,7 +103,7 @@ class JamQuestion(NamedTuple):
         )
 
     def state(self, scene: Scene) -> State:
-        """On the exact jam without what theories of jams leave out, loads a little apart; NaN where there is none."""
+        """State on the exact jam without the parts that theories of jams leave out, with separated loads; NaN without a jam."""
         n = scene.loads.count
         orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
@@ -111,7 +111,7 @@ class JamQuestion(NamedTuple):
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> Values:
-        """By the full equations, from near the exact jam, until nothing changes."""
+        """Values of the full equations, from near the exact jam until they are settled."""
         run = settle(scene, start=self.state(scene), throw=False)
         return _read(scene, run, fold_speed(admitted(scene), float(run.omega)))
 
@@ -142,7 +142,7 @@ class RunQuestion(NamedTuple):
         raise NotImplementedError
 
     def full(self, scene: Scene) -> Values:
-        """By the full equations."""
+        """Values of the full equations."""
         start = self.state(scene)
         run = simulate(scene, self.until, start=start, save="window", turns=_WINDOW, estimate=False, throw=False)
         return _read(scene, run, math.nan)

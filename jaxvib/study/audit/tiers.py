@@ -1,4 +1,4 @@
-"""What each tier can answer for a scene, how far it is off, and what it costs."""
+"""Comparison of tiers on a scene: values, errors, cost."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _row(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Val
 
 
 def _call(tier: Tier, scene: Scene, question: JamQuestion | RunQuestion, own: Values) -> Callable[[], JamValues | Values] | str:
-    """What asks the tier, or why it cannot be asked."""
+    """Function that evaluates the tier, or the reason why it cannot be evaluated."""
     timeless = tier.name in ("leading order", "exact orbit")
     if isinstance(question, JamQuestion):
         if not timeless and "unstable" in own.kind:

@@ -1,4 +1,4 @@
-"""How fast a recorded swing decays from one turning point to the next: the formula of ten periods."""
+"""Decay of a recorded swing from one turning point to the next: the formula of ten periods."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Estimate(NamedTuple):
 
 
 class TurningPoints(NamedTuple):
-    """Where a swing turns: `time` (K,) s, `angle` (K,) rad, its standard `error` (K,) rad, and a sample's `noise` rad."""
+    """Turning points of a swing: `time` (K,) s, `angle` (K,) rad, its standard `error` (K,) rad, and a sample's `noise` rad."""
 
     time: np.ndarray
     angle: np.ndarray

@@ -93,7 +93,7 @@ class Record(eqx.Module):
 
     @property
     def samples(self) -> int:
-        """How many there are."""
+        """Number of samples."""
         return self.time.size
 
     @validated

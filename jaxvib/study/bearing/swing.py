@@ -85,7 +85,7 @@ class BearingPendulum(eqx.Module):
 
 
 class SwingStatus(eqx.Enumeration):
-    """How a swing ended; the members are the sentences a user reads."""
+    """Outcomes of a swing; the members are the sentences a user reads."""
 
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction brought the pendulum to a stop and holds it"
@@ -109,7 +109,7 @@ class Swing(Result):
     steps: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
-        """How the swing ended, for a person to read."""
+        """Text of the end of the swing."""
         when = f" at {float(self.stopped_at):.6g} s" if np.isfinite(self.stopped_at) else ""
         first, last = (f"{float(np.rad2deg(self.angle[k])):.4g} deg at {float(self.time[k]):.6g} s" for k in (0, -1))
         return f"{self.message}{when}; from {first} to {last}, {int(self.steps)} steps"

@@ -1,4 +1,4 @@
-"""Which initial speeds of the balls bring them to the rotor's speed: success fractions and the threshold."""
+"""Capture of balls over their initial speed: captured fractions and the threshold."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SCAN = 32
 
 
 class CaptureStatus(eqx.Enumeration):
-    """What is known of a threshold; the members are the sentences a user reads."""
+    """Outcomes of a search for a threshold; the members are the sentences a user reads."""
 
     found = "from the threshold up every start was captured"
     all_captured = "every start was captured: the threshold lies below the speeds that were tried"
@@ -88,7 +88,8 @@ class Capture(Result):
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Of the fraction, (S,), by Agresti and Coull: also where all starts, or none, were captured it is not 0."""
+        """Standard error of the fraction, (S,), by Agresti and Coull: also where all starts, or none, were captured it is not
+        0."""
         n = self.captured.shape[1]
         share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
         return np.sqrt(share * (1.0 - share) / (n + 4.0))
@@ -301,7 +302,7 @@ def _judged(
 
 
 def capture_time(run: Run, within: float = 0.05) -> Array:
-    """When the last load came to within a share of the rotor's speed for good, s.
+    """Time at which the last load comes to within a share of the rotor speed and stays there, s.
 
     The last time in the run's trajectory at which a load's speed differs from the rotor's by more than `within` times the
     rotor's, linear between the states that were kept. Derivatives go through it, forward and reverse; they hold as long as the

@@ -1,4 +1,4 @@
-"""Where the criterion of auto-balancing is right: against exact stability over rotor speed, load mass and drag."""
+"""Comparison of the criterion of auto-balancing with exact stability over rotor speed, load mass and drag."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def criterion_map(
 
 
 def _shifts(exact: np.ndarray, grid: np.ndarray, boundary: np.ndarray) -> np.ndarray:
-    """How far the ends of each interval of the criterion are from those of the exact one that it shares most with.
+    """Distances of the ends of each interval of the criterion from those of the exact interval with the largest overlap.
 
     The longest, because a sliver of stability can stay at a resonance when the interval itself has moved away from it.
     """

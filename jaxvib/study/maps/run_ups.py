@@ -44,7 +44,7 @@ _FEWEST = 2**20
 
 
 class RunUps(Result):
-    """What became of run-ups over nd drags and ns starts.
+    """Outcomes of run-ups over nd drags and ns starts.
 
     **Attributes**: `drag` (nd,) b_W N s/m; `angle` (ns, count) rad, where the loads started; `regime` a `Regime` whose arrays
     have the leading axes (nd, ns); `kind` (nd, ns) the regime's word, or "failed" where the run did not reach its end; `omega`

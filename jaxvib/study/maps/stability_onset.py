@@ -67,7 +67,7 @@ class StabilityMap(Result):
 def stability_map(
     make: Callable[[float], Scene], values: Sequence[float], *, omega: tuple[float, float], points: int = 300
 ) -> StabilityMap:
-    """Where exact jams are stable as a design number grows, such as the mass of the loads.
+    """Map the stability of exact jams as a design number grows, such as the mass of the loads.
 
     **Arguments**: `make` the scene at x; `values` of x, ascending; `omega` the range of load speeds, rad/s; `points` of each
     diagram.
