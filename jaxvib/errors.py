@@ -130,7 +130,7 @@ def written(path: Path) -> Iterator[Path]:
     finally:
         if part is not None:
             with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+                part.unlink()  # not there after a move
 
 
 def open_regular(path: str | Path) -> IO[bytes]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from jax.typing import ArrayLike as JaxLike
 from numpy.typing import ArrayLike
 from scenes import scene
 
@@ -94,6 +95,27 @@ def test_arguments_of_the_right_types_pass():
     more = dict(make=len, sizes=(1.0, np.float64(2.0)), pair=(1, 2), shares={"a": 1}, array=jnp.ones(2), speed="3 rpm")
     assert question(**kept, **more) == question(sizes=np.ones(3), rows=[[1.0], [2.0]], pair=3) == "answered"
     assert jax.jit(lambda x: x * (question(size=x, array=x, sizes=[x]) == "answered"))(2.0) == 2.0
+
+
+@validated
+def passed(*, array: Array | None = None, either: Array | Sequence[float] = (), rows: JaxLike | None = None) -> object:
+    return next(value for value in (array, rows, either) if value is not None)
+
+
+def test_a_list_for_an_array_becomes_an_array_of_floats():
+    for given in ([1, 2], (1, 2)):
+        found = passed(array=given)
+        assert isinstance(found, np.ndarray) and found.dtype == float and found.tolist() == [1.0, 2.0]
+    assert passed(array=decimal.Decimal("1.5")) == np.asarray(1.5)
+    assert passed(either=[1, 2]) == [1, 2] and passed(rows=[[1], [2]]).tolist() == [[1.0], [2.0]]
+    with pytest.raises(jv.InputError, match=r"^rows is \[\[1\], 2\]; it must be an array of numbers"):
+        passed(rows=[[1], 2])
+
+
+def test_whole_numbers_fit_into_an_array():
+    assert question(count=2**63 - 1) == question(count=1 - 2**63) == "answered"
+    with pytest.raises(jv.InputError, match=r"^count is 9223372036854775808; it must be a whole number"):
+        question(count=2**63)
 
 
 @validated

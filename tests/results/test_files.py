@@ -132,6 +132,18 @@ def test_a_changed_array_is_refused(modes, tmp_path):
         jv.load(path)
 
 
+def test_one_compressed_entry_is_refused(modes, tmp_path):
+    path = modes.save(tmp_path / "modes")
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    for packed in entries:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in entries.items():
+                archive.writestr(name, content, zipfile.ZIP_DEFLATED if name == packed else zipfile.ZIP_STORED)
+        with pytest.raises(jv.InputError, match=LOST):
+            jv.load(path)
+
+
 def test_a_zip_bomb_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(zipfile.ZipFile, "read", lambda *_: pytest.fail("unpacked"))
     path = tmp_path / "bomb.npz"
@@ -164,6 +176,14 @@ def test_texts_of_more_than_16_mb_are_refused(tmp_path):
         file.truncate((1 << 24) + 1)
     with pytest.raises(jv.InputError, match="is larger than 16 MB; give the path of a TOML file"):
         jv.load_scene(path)
+
+
+def test_a_text_of_the_allowed_size_is_read_whole(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("0123456789")
+    assert read_text(path, "a file", most=10) == "0123456789"
+    with pytest.raises(jv.InputError, match="is larger than 0 MB; give the path of a file"):
+        read_text(path, "a file", most=9)
 
 
 def test_control_characters_never_reach_a_message(tmp_path):
