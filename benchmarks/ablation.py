@@ -41,7 +41,7 @@ from jaxvib.ode import dopri8, dopri8_loop, replay, scalarize  # noqa: E402
 from jaxvib.ode.dopri8 import UnrolledDopri8  # noqa: E402
 from jaxvib.ode.dopri8_loop import LoopDopri8  # noqa: E402
 
-LANES, STEP = 64, 0.2
+BATCH_SIZE, STEP = 64, 0.2
 
 NONE = contextlib.nullcontext
 OFF: dict[str, Callable[[], Any]] = {
@@ -62,9 +62,9 @@ OFF: dict[str, Callable[[], Any]] = {
 }
 
 
-def ended(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: bool, solver: Any = None) -> jv.State:
+def ended(s: jv.Scene, start: jv.State, steps: int, step: float, batch: bool, solver: Any = None) -> jv.State:
     """The state after so many equal steps."""
-    packed = PackedSystem(jv.vector_field(s), start, lanes=lanes)
+    packed = PackedSystem(jv.vector_field(s), start, batch=batch)
     ended = diffrax.diffeqsolve(
         packed.term,
         packed.method() if solver is None else solver,
@@ -81,12 +81,12 @@ def ended(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: bool, so
     return packed.unpack(ended.ys)
 
 
-def runs(s: jv.Scene, start: jv.State, steps: int, step: float, lanes: int) -> Callable[[], Any]:
+def runs(s: jv.Scene, start: jv.State, steps: int, step: float, batch: int) -> Callable[[], Any]:
     """One run, or so many together at rotor speeds apart."""
-    if lanes == 1:
+    if batch == 1:
         call = jax.jit(lambda s: ended(s, start, steps, step, False))
         return lambda: call(s)
-    speeds = s.drive.speed * jnp.linspace(0.9, 1.1, lanes)
+    speeds = s.drive.speed * jnp.linspace(0.9, 1.1, batch)
     many = jax.jit(jax.vmap(lambda speed: ended(eqx.tree_at(lambda s: s.drive.speed, s, speed), start, steps, step, True)))
     return lambda: many(speeds)
 
@@ -102,9 +102,9 @@ def row(name: str, call: Callable[[], Any], base: float | None = None) -> float:
 
 
 def steps(quick: bool) -> None:
-    for lanes in (1, LANES):
-        print(f"\n{lanes} run{'s together' * (lanes > 1)}, 6 numbers, {50 if quick else 1000} steps")
-        make = lambda lanes=lanes: runs(published(), thrown(), 50 if quick else 1000, STEP, lanes)  # noqa: E731
+    for batch in (1, BATCH_SIZE):
+        print(f"\n{batch} run{'s together' * (batch > 1)}, 6 numbers, {50 if quick else 1000} steps")
+        make = lambda batch=batch: runs(published(), thrown(), 50 if quick else 1000, STEP, batch)  # noqa: E731
         base = row("as it is", make())
         for name, off in OFF.items():
             with off():
@@ -113,8 +113,8 @@ def steps(quick: bool) -> None:
 
 def batches(quick: bool) -> None:
     s = balls(3)
-    print(f"\n{LANES} runs together, 10 numbers, the step looped over its stages")
-    make = lambda: runs(s, apart(s), 20 if quick else 200, 1e-3, LANES)  # noqa: E731
+    print(f"\n{BATCH_SIZE} runs together, 10 numbers, the step looped over its stages")
+    make = lambda: runs(s, apart(s), 20 if quick else 200, 1e-3, BATCH_SIZE)  # noqa: E731
     base = row("as it is", make())
     with mock.patch.object(dopri8_loop, "_advanced", dopri8_loop._advance):
         row("batch_last: as vmap lays it out", make(), base)

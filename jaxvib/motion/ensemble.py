@@ -23,8 +23,8 @@ from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
-from jaxvib.motion.integrate import fastest_and_slowest, is_finite, wrap_angles
-from jaxvib.motion.lanes import LANES, advance, side_by_side, stretches
+from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
+from jaxvib.motion.integrate import frequency_bounds, is_finite, wrap_angles
 from jaxvib.motion.start import initial_state, require_start, with_spin
 from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
 from jaxvib.motion.stiffness import fastest_decay, is_unresolved, steps_of
@@ -139,16 +139,16 @@ def ensemble(
     *,
     stepsize_controller: EqualSteps | None = None,
     estimate: bool = True,
-    lanes: int = LANES,
+    batch: int = BATCH_SIZE,
     equations: Equations = vector_field,
 ) -> Ensemble:
     """Integrates many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
-    Runs advance together, `lanes` at a time, every number of the state a contiguous array over them, and chunks are spread over
+    Runs advance together, `batch` at a time, every number of the state a contiguous array over them, and chunks are spread over
     all cores, or all graphics processors; under a JAX transformation they follow each other. Equal steps keep runs together
     that would wait for each other otherwise; near the boundary between two outcomes they also keep the choice of steps from
     deciding. Other values need no new program where `make` is the same function and the same numbers are shared by all runs,
-    nor does the integration of another number of runs above `lanes`; a function written in the call is another one each time.
+    nor does the integration of another number of runs above `batch`; a function written in the call is another one each time.
     In single precision angles are kept within a turn while time is integrated, so that long runs keep their phase.
 
     **Arguments**
@@ -161,7 +161,7 @@ def ensemble(
       radian of what moves fastest, and more if loads decay by drag, or the carrier by damping, faster than these resolve: from
       100 times as fast on all runs take implicit steps, 32 for each radian
     - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
-    - `lanes`: how many runs advance together
+    - `batch`: how many runs advance together
     - `equations`: a function that gives a scene's equations of motion, a module that is called as `vector_field`'s; another one
       where a printed model is to be compared with the scene's own
 
@@ -185,7 +185,7 @@ def ensemble(
         raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
     ((runs,),) = sizes
     end = number(until, "s", "until", low=0.0, open_low=True)
-    lanes = min(count(lanes, "lanes"), runs)
+    batch = min(count(batch, "batch"), runs)
     scenes, states, allowed = _made(make, values)
     made = scenes, states
     require_start(made[0], made[1].angle)
@@ -217,7 +217,7 @@ def ensemble(
     def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
         return _together(own, common, end, counts, tuple(shared), form, equations, implicit)
 
-    ends = in_chunks(lanes, together, own, shared=(common, end, counts))
+    ends = in_chunks(batch, together, own, shared=(common, end, counts))
     last, load_speed, apart, finite, detached, taken = ends
     # What a method of order 3 would leave of the difference; this one is of order 8.
     share = (coarse / each) ** 3
@@ -258,7 +258,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
 @cached
 def _rates(scenes: Scene) -> tuple[Array, Array]:
     """The fastest of the motion, rad/s, and of the decay, 1/s, of each scene."""
-    return jax.vmap(lambda scene: (fastest_and_slowest(scene)[0], fastest_decay(scene)))(scenes)
+    return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)
 
 
 @cached
@@ -291,9 +291,9 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     single, together = wrap_angles(scene, state.displacement.dtype)
     watched = scene.loads.one_sided
     field = field_of(equations, scene)
-    field = _Watching(field, scene) if watched else field
-    state = _watched(state, jnp.zeros_like(state.azimuth)) if watched else state
-    motion = side_by_side(field, state, single, together, implicit=implicit)
+    field = _FieldWithDetachment(field, scene) if watched else field
+    state = _with_detachment(state, jnp.zeros_like(state.azimuth)) if watched else state
+    motion = pack_batch(field, state, single, together, implicit=implicit)
     length = end / _PARTS
 
     def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
@@ -310,7 +310,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
     angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).azimuth
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))
-    detached = last.missing != 0.0 if isinstance(last, _Watched) else jnp.zeros(last.azimuth.shape, dtype=bool)
+    detached = last.missing != 0.0 if isinstance(last, _StateWithDetachment) else jnp.zeros(last.azimuth.shape, dtype=bool)
     last, other = (_plain(state) for state in (last, other))
     finite, apart = is_finite(last), scaled_error(last, other, error_scale(last, natural_units(scene)))
     # A run whose coarser one did not stay finite has an error that nobody knows.
@@ -318,7 +318,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     return last, (angle[1] - angle[0]) / length, apart, finite, detached, taken[0]
 
 
-class _Watched(State):
+class _StateWithDetachment(State):
     """A state, and for each load what its track would have had to pull it with so far, summed over time, (count,) N s.
 
     It is exactly 0 where N was nowhere negative, whatever the weights of the method's stages.
@@ -327,7 +327,7 @@ class _Watched(State):
     missing: Array = eqx.field(kw_only=True)
 
 
-class _Watching(eqx.Module):
+class _FieldWithDetachment(eqx.Module):
     """The equations of motion, and beside them missing' = max(-N, 0)."""
 
     equations: Callable[[Array, State], State]
@@ -338,11 +338,13 @@ class _Watching(eqx.Module):
         pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
         assert pressing is not None
         force = pressing.at(scene.machine.carrier().point_rates(change.velocity))
-        return _watched(change, jnp.maximum(-force, 0.0))
+        return _with_detachment(change, jnp.maximum(-force, 0.0))
 
 
-def _watched(state: State, missing: Array) -> _Watched:
-    return _Watched(state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin, missing=missing)
+def _with_detachment(state: State, missing: Array) -> _StateWithDetachment:
+    return _StateWithDetachment(
+        state.displacement, state.velocity, state.angle, state.rate, state.rotor, state.spin, missing=missing
+    )
 
 
 def _plain(state: State) -> State:

@@ -19,7 +19,7 @@ from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turn
 from jaxvib.motion.integrate import whole_turns, wrap_angles
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, simulate
-from jaxvib.motion.start import Start, initial_state, whole_state
+from jaxvib.motion.start import Start, initial_state, validate_state
 from jaxvib.motion.steps import Tolerance, require_known
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -149,7 +149,7 @@ def growth(
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
     given = isinstance(start, State)
-    state = whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart)
+    state = validate_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart)
     stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
     separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))

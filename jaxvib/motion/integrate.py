@@ -25,7 +25,7 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "added_rate", "fastest_and_slowest", "integrate", "is_finite", "whole_turns"]
+__all__ = ["PER_TURN", "WINDOW", "StepControl", "effects_rate", "frequency_bounds", "integrate", "is_finite", "whole_turns"]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -45,7 +45,7 @@ class StepControl(eqx.Module):
     max_steps: Array | np.ndarray | None = None
 
 
-def each_coordinate(unit: State, number: int) -> State:
+def repeat_per_coordinate(unit: State, number: int) -> State:
     """Natural units with one for each of so many coordinates of a load."""
     spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.twist, unit.spin.slip * number)
     return State(unit.displacement, unit.velocity, unit.angle * number, unit.rate * number, unit.rotor, spin)
@@ -60,7 +60,7 @@ def _controller(motion: PackedSystem, state: State, natural: State, control: Ste
     one, number = jnp.ones(()), len(state.angle)
     spin = jax.tree.map(jnp.ones_like, state.spin)
     relative = State(one, one, (jnp.zeros(()),) * number, (one,) * number, rotor, spin)
-    unit = each_coordinate(natural, number)
+    unit = repeat_per_coordinate(natural, number)
     dtype = state.displacement.dtype
 
     def spread(tree: State) -> State:
@@ -81,7 +81,7 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
     return diffrax.ClipStepSizeController(controller, jump_ts=jax.lax.stop_gradient(jnp.stack(jump_ts)))
 
 
-def added_rate(scene: Scene) -> Array:
+def effects_rate(scene: Scene) -> Array:
     """The fastest that effects add to the loads' motion, see `Effect.own_rate`; 0 where there is none."""
     rates = (effect.own_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
     found = [jnp.max(rate) for rate in rates if rate is not None]
@@ -89,7 +89,7 @@ def added_rate(scene: Scene) -> Array:
 
 
 @cached
-def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
+def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     """The greatest and least of the rotor's speed and the natural frequencies, rad/s; a free carrier's 0 does not count.
 
     Among the greatest are the loads' own frequency, where they have one, and what effects add to it.
@@ -99,7 +99,7 @@ def fastest_and_slowest(scene: Scene) -> tuple[Array, Array]:
     own = scene.loads.own_frequency(speed)
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
-    fastest = jnp.maximum(fastest, added_rate(scene))
+    fastest = jnp.maximum(fastest, effects_rate(scene))
     return fastest, jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
 
 
@@ -126,7 +126,7 @@ def integrate(
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
-    (fastest, slowest), unit = fastest_and_slowest(scene), natural_units(scene)
+    (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
     longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
     window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
@@ -171,7 +171,7 @@ def integrate(
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
     ended = solution.result == diffrax.RESULTS.successful
-    bounded = jnp.where(ended, is_finite(states), ~_grew(unit, state, last))
+    bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
     unknown = jnp.full_like(end, jnp.nan)
     return Run(
@@ -195,7 +195,7 @@ def _is_together(angle: Array) -> Array:
     return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
 
 
-def _grew(unit: State, first: State, last: State) -> Array:
+def _diverged(unit: State, first: State, last: State) -> Array:
     """Whether the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]

@@ -16,10 +16,10 @@ from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
-from jaxvib.motion.integrate import fastest_and_slowest, whole_turns
+from jaxvib.motion.integrate import frequency_bounds, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, simulate
-from jaxvib.motion.start import APART, Start, initial_state, whole_state
+from jaxvib.motion.start import APART, Start, initial_state, validate_state
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former, require_known
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
@@ -119,11 +119,11 @@ def settle(
     chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
     start = ("rest" if mode is None else "jam") if start is None else start
     if isinstance(start, State):
-        state = whole_state(scene, start, mode, apart)
+        state = validate_state(scene, start, mode, apart)
     else:
         apart = APART if apart is None and start == "jam" else apart
         state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
-    _, slowest = fastest_and_slowest(scene)
+    _, slowest = frequency_bounds(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     slow = float(slowest) or float(scene.drive.speed)  # 0 where programs are compiled only, see `compiled_together`
     stretch = whole_turns(scene, 2.0 * math.pi * periods / slow)

@@ -23,9 +23,9 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
-from jaxvib.motion.integrate import PER_TURN, StepControl, fastest_and_slowest, integrate, whole_turns, wrap_angles
+from jaxvib.motion.integrate import PER_TURN, StepControl, frequency_bounds, integrate, whole_turns, wrap_angles
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
-from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
+from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
 from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
 from jaxvib.motion.stiffness import advice, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -129,12 +129,12 @@ def simulate(
     samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _control(end, stepsize_controller, estimate)
-    asked, scene = scene, brought_up(scene, end, start, spin_up)
+    asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     given = isinstance(start, State)
     state = (
-        whole_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+        validate_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     )
-    fastest = functools.cache(lambda: fastest_and_slowest(scene)[0])
+    fastest = functools.cache(lambda: frequency_bounds(scene)[0])
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
     stiff = stiff_solver(scene, state, fastest()) if solver is None and concrete else None
     max_steps = enough_steps((1.0 if stiff is None else 16.0) * fastest(), end) if max_steps is None else max_steps
@@ -256,7 +256,7 @@ def _estimated(
     evaluations: tuple[Array, Array | np.ndarray],
 ) -> tuple[Array, Array]:
     """The estimated error of a run, from its window and the states and the status of a coarser one, and the sum of these
-    `evaluations`; `fastest` see `fastest_and_slowest`."""
+    `evaluations`; `fastest` see `frequency_bounds`."""
     # A run that is compared with itself, or with one that failed, has an error that nobody knows.
     found = status == RunStatus.done
     if control.steps is not None:

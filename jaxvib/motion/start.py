@@ -23,7 +23,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, known_number, numbers, traced
 
-__all__ = ["APART", "Start", "Turning", "brought_up", "initial_state", "require_start", "whole_state", "with_spin"]
+__all__ = ["APART", "Start", "Turning", "initial_state", "require_start", "validate_state", "with_spin", "with_spin_up_drive"]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
@@ -189,7 +189,7 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     )
 
 
-def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
+def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
     """The scene; for the start "spin_up" with a drive that rises over the time `spin_up` (s), half of `end` unless said.
 
     **Raises** `InputError` for a time that goes with another start or is longer than the run, and for another drive.
@@ -206,7 +206,7 @@ def brought_up(scene: Scene, end: Array, start: Start | State, spin_up: Number |
     return eqx.tree_at(lambda s: s.drive, scene, drive)
 
 
-def whole_state(scene: Scene, state: State, mode: int | None, apart: Number | None = None) -> State:
+def validate_state(scene: Scene, state: State, mode: int | None, apart: Number | None = None) -> State:
     """Return a user's initial state, completed by the loads' own rotation.
 
     **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `apart` is given beside it.

@@ -13,7 +13,7 @@ from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.sliding import kinematics
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.numerics.linalg import hermitian_modes, relative_to
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.runtime.programs import cached
@@ -86,7 +86,7 @@ def is_unresolved(decay: Array | np.ndarray, step: Array | float) -> Array | np.
 
 def advice(scene: Scene) -> str:
     """The cause of short steps of a run, as the end of a sentence; empty if decay is no faster than the motion."""
-    decay, motion = float(fastest_decay(scene)), float(fastest_and_slowest(scene)[0])
+    decay, motion = float(fastest_decay(scene)), float(frequency_bounds(scene)[0])
     if not decay > 10.0 * motion:
         return ""
     carrier = float(np.max(np.asarray(_carrier_decay(scene))))

@@ -48,7 +48,7 @@ class PackedSystem(eqx.Module):
     single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
 
     **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
-    the same turns, so that their differences stay; `lanes` whether many runs advance together; the `solver` that integrates
+    the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that integrates
     them, if it is not `method`.
 
     **Attributes**: `program` the equations, on numbers where `is_scalarized`, else on arrays, None where JAX lets nobody read
@@ -65,7 +65,7 @@ class PackedSystem(eqx.Module):
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
     together: bool = eqx.field(static=True)
-    lanes: bool = eqx.field(static=True)
+    batch: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -74,24 +74,24 @@ class PackedSystem(eqx.Module):
         *,
         wrapped: bool = False,
         together: bool = False,
-        lanes: bool = False,
+        batch: bool = False,
         solver: diffrax.AbstractSolver | None = None,
     ):
-        self.wrapped, self.together, self.lanes = wrapped, together, lanes
+        self.wrapped, self.together, self.batch = wrapped, together, batch
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
         is_written = self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
-        # Across the angles of many loads vectors are as full as across lanes.
-        is_small = self.size <= MAX_SCALARS and (lanes or max(leaf.size for leaf in leaves) < _LONG)
+        # Across the angles of many loads vectors are as full as across runs.
+        is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG)
         program = scalarized_program(_rates_of, *given) if is_small else None
         self.is_scalarized = program is not None
         self.program = arrays_program(_rates_of, *given) if program is None else program
         if program is not None:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
             self.args = scalars_of(field)
-        self.apart = self.is_scalarized and (lanes or is_written)
+        self.apart = self.is_scalarized and (batch or is_written)
         self.fences = self.apart and solver is None
 
     @property
@@ -104,7 +104,7 @@ class PackedSystem(eqx.Module):
         # Without the equations' numbers: a method holds no traced arrays.
         wrap = eqx.tree_at(lambda system: system.args, self, None)._wrap if self.wrapped else None
         if self.size <= _MOST_WRITTEN:
-            return UnrolledDopri8(lanes=self.lanes, wrap=wrap)
+            return UnrolledDopri8(batch=self.batch, wrap=wrap)
         return LoopDopri8(reuse=adjoint is None or isinstance(adjoint, diffrax.ForwardMode), wrap=wrap)
 
     def pack(self, state: State) -> Held:

@@ -171,7 +171,7 @@ class UnrolledDopri8(AbstractDopri8):
 
     Compiling takes longer than for `LoopDopri8`, several times as long where derivatives are taken.
 
-    **Arguments**: `lanes` whether many runs advance together, each number of the state an array over them: fences are then
+    **Arguments**: `batch`: true if many runs advance together, each number of the state an array over them: fences are then
     those for arrays, otherwise those for single numbers; `wrap` what is done to the state after each step, such as taking whole
     turns out of its angles.
 
@@ -185,7 +185,7 @@ class UnrolledDopri8(AbstractDopri8):
     Source: P. J. Prince and J. R. Dormand, J. Comp. Appl. Math. 7 (1981) 67; interpolation as in diffrax.
     """
 
-    lanes: bool = eqx.field(static=True, default=False)
+    batch: bool = eqx.field(static=True, default=False)
     interpolation_cls: ClassVar[Callable[..., Dopri8Interpolation]] = Dopri8Interpolation
 
     def init(self, terms: Terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> VF:
@@ -220,7 +220,7 @@ class UnrolledDopri8(AbstractDopri8):
         leaves, rest = jax.tree.flatten(values)
         new = [k for k, leaf in enumerate(leaves) if not any(leaf is each for each in jax.tree.leaves(known))]
         found = [leaves[k] for k in new]
-        if self.lanes or any(jnp.ndim(leaf) for leaf in found):
+        if self.batch or any(jnp.ndim(leaf) for leaf in found):
             found = [fence(leaf, one) for leaf in found]
         elif found:
             found = through_memory(found, one)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxvib.machine.files import scene_to_toml
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.lanes import LANES, Plan
+from jaxvib.motion.batch import BATCH_SIZE, BatchPlan
 from jaxvib.motion.start import Start
 from jaxvib.results.fields import Plain
 from jaxvib.runtime.compat import enumeration_names
@@ -74,7 +74,7 @@ class Study:
     names: tuple[str, ...]
     measures: tuple[Measure, ...]
     identities: dict[str, Plain]
-    plan: Plan | None
+    plan: BatchPlan | None
     start: Start
     mode: int | None
     tier: Tier
@@ -87,7 +87,7 @@ class Study:
         return tuple(axis.spot for axis in self.grid.axes)
 
     @property
-    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], Plan | None, Start, int | None, str]:
+    def program(self) -> tuple[tuple[Spot, ...], tuple[Measure, ...], BatchPlan | None, Start, int | None, str]:
         """Static arguments of the compiled program, beside the scene and the cases.
 
         The digest of the measures' identities is one of them: a function equals itself although a number that it refers to
@@ -97,9 +97,9 @@ class Study:
 
     @property
     def size(self) -> int:
-        """Number of cases that the program computes at a time: whole groups of lanes, because cases in a partial group would be
+        """Number of cases that the program computes at a time: whole batches, because cases in a partial batch would be
         computed by other instructions."""
-        return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // LANES) * LANES
+        return -(-int(np.prod(self.grid.tile, dtype=np.int64)) // BATCH_SIZE) * BATCH_SIZE
 
     @property
     def record(self) -> dict[str, Plain]:

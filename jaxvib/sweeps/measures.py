@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import closest
 from jaxvib.motion.analysis.regime import REGIMES
-from jaxvib.motion.lanes import WatchedRun
+from jaxvib.motion.lanes import BatchRun
 from optimize.wishes.quantity import Quantity
 
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
@@ -24,15 +24,15 @@ _SETTLED_SPEED_SHARE = 0.01
 
 @dataclass(frozen=True)
 class RunMeasure:
-    """A number that is read off a run from the start to the end, see `WatchedRun`.
+    """A number that is read off a run from the start to the end, see `BatchRun`.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `WatchedRun` that gives a scalar, or an array over `axis`, the
+    **Arguments**: `name`; `unit`, "" for none; `function` of a `BatchRun` that gives a scalar, or an array over `axis`, the
     name of a further dimension ("coordinate", "load"); `meanings`, the words for the values 0, 1, ... of one that is a label.
     """
 
     name: str
     unit: str
-    function: Callable[[WatchedRun], Array]
+    function: Callable[[BatchRun], Array]
     axis: str = ""
     meanings: tuple[str, ...] = ()
 
@@ -46,12 +46,12 @@ Measure: TypeAlias = Quantity | RunMeasure
 """Measure of a study."""
 
 
-def _regime(run: WatchedRun) -> Array:
+def _regime(run: BatchRun) -> Array:
     (which,) = jax.tree.leaves(run.regime.name)
     return which
 
 
-def _settling(run: WatchedRun) -> Array:
+def _settling(run: BatchRun) -> Array:
     """The end of the last part in which the speed of some load is not yet near its last one."""
     last, rotor = run.measured.load_speed, run.window.rotor_speed[-1]
     away = jnp.any(jnp.abs(run.part_speed - last[None]) > _SETTLED_SPEED_SHARE * jnp.abs(rotor), axis=1)
@@ -59,31 +59,31 @@ def _settling(run: WatchedRun) -> Array:
     return jnp.where(run.regime.change < _SETTLED_SPEED_SHARE, late, run.window.time[-1])
 
 
-def _mode(run: WatchedRun) -> Array:
+def _mode(run: BatchRun) -> Array:
     return run.regime.mode
 
 
-def _load_speed(run: WatchedRun) -> Array:
+def _load_speed(run: BatchRun) -> Array:
     return run.measured.omega
 
 
-def _amplitude(run: WatchedRun) -> Array:
+def _amplitude(run: BatchRun) -> Array:
     return run.measured.amplitude
 
 
-def _force(run: WatchedRun) -> Array:
+def _force(run: BatchRun) -> Array:
     return run.measured.foundation_force
 
 
-def _ripple(run: WatchedRun) -> Array:
+def _ripple(run: BatchRun) -> Array:
     return run.regime.ripple
 
 
-def _rotor_speed(run: WatchedRun) -> Array:
+def _rotor_speed(run: BatchRun) -> Array:
     return run.regime.rotor_speed
 
 
-def _drift(run: WatchedRun) -> Array:
+def _drift(run: BatchRun) -> Array:
     return run.measured.drift
 
 

@@ -11,8 +11,8 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest
-from jaxvib.motion.lanes import LANES, PARTS, Plan, watched_run
+from jaxvib.motion.batch import BATCH_SIZE, PARTS, BatchPlan, run_in_batch
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.start import APART, Start, initial_state
 from jaxvib.motion.stiffness import fastest_decay, steps_of
 from jaxvib.runtime.programs import cached
@@ -52,7 +52,7 @@ def _each(
     values: Array,
     spots: tuple[Spot, ...],
     measures: tuple[Measure, ...],
-    plan: Plan | None,
+    plan: BatchPlan | None,
     start: Start,
     mode: int | None,
     identities: str,
@@ -66,7 +66,7 @@ def _each(
         if plan is not None:
             apart = APART if start == "jam" else None  # at one angle, no run would show that a jam is unstable
             state = put_start(initial_state(this, start, mode=mode, apart=apart, throw=False), spots, value)
-            run = watched_run(this, state, plan)
+            run = run_in_batch(this, state, plan)
 
         def read(measure: Measure) -> Array:
             if not isinstance(measure, RunMeasure):
@@ -76,7 +76,7 @@ def _each(
 
         return tuple(jnp.asarray(read(measure)) for measure in measures), jnp.asarray(True) if run is None else run.finite
 
-    return jax.lax.map(one, values, batch_size=LANES)
+    return jax.lax.map(one, values, batch_size=BATCH_SIZE)
 
 
 _cases = cached(_each)
@@ -86,12 +86,12 @@ _cases = cached(_each)
 def _speeds(scene: Scene, values: Array, spots: tuple[Spot, ...]) -> tuple[Array, Array, Array, Array]:
     def one(value: Array) -> tuple[Array, Array, Array, Array]:
         this = put(scene, spots, value)
-        return (*fastest_and_slowest(this), fastest_decay(this), this.drive.speed)
+        return (*frequency_bounds(this), fastest_decay(this), this.drive.speed)
 
     return jax.vmap(one)(values)
 
 
-def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> Plan:
+def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: float, steps: int | None) -> BatchPlan:
     """The same steps and the same window for all cases: by the fastest and the slowest of the `corners` (n, axes) of the study.
 
     Frequencies grow with each stiffness and fall with each mass, so that no case between the corners is faster or slower.
@@ -107,7 +107,7 @@ def planned(scene: Scene, corners: np.ndarray, spots: tuple[Spot, ...], until: f
     each, between = (until - window) / (PARTS * step), window / ((_SAMPLES - 1) * step)
     # a number that is whole but for rounding stays what it is
     counts = (int(np.ceil(x - 1e-9)) or 1 for x in (each, between))
-    return Plan(until, window, _SAMPLES, *counts, implicit=implicit)
+    return BatchPlan(until, window, _SAMPLES, *counts, implicit=implicit)
 
 
 def shapes(study: Study) -> list[jax.ShapeDtypeStruct]:

@@ -11,7 +11,7 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.scaled_error import natural_units
-from jaxvib.motion.integrate import _grew, _status, is_finite
+from jaxvib.motion.integrate import _diverged, _status, is_finite
 from jaxvib.ode.control import PIController
 from jaxvib.ode.dopri8 import UnrolledDopri8
 
@@ -44,12 +44,12 @@ def test_a_lane_whose_start_does_not_exist_says_so():
 
     @stored_jit
     @eqx.filter_vmap
-    def lanes(speed):
+    def batch(speed):
         there = eqx.tree_at(lambda x: x.drive.speed, s, speed)
         run = jv.simulate(there, 20.0, start="jam", mode=4, save="window", max_steps=4096)
         return run.status == jv.RunStatus.no_start, run.omega, run.steps
 
-    missing, omega, steps = lanes(jnp.array([1.2, 3.0]))
+    missing, omega, steps = batch(jnp.array([1.2, 3.0]))
     assert missing.tolist() == [True, False]
     assert jnp.isnan(omega).tolist() == [True, False]
     assert int(steps[0]) < 4096
@@ -162,10 +162,10 @@ def test_a_motion_has_grown_where_one_platform_alone_has():
         size = float(getattr(unit, name))
         for last, grown in (([0.0, 1.1e8], True), ([-1.1e8, 0.0], True), ([0.9e8, 0.9e8], False)):
             there = eqx.tree_at(lambda y, name=name: getattr(y, name), first, size * jnp.asarray(last))
-            assert bool(_grew(unit, first, there)) == grown
+            assert bool(_diverged(unit, first, there)) == grown
     far = eqx.tree_at(lambda y: y.displacement, first, float(unit.displacement) * jnp.asarray([0.0, 1e3]))
-    assert not bool(_grew(unit, far, eqx.tree_at(lambda y: y.displacement, first, 1e8 * far.displacement)))
-    assert bool(_grew(unit, first, eqx.tree_at(lambda y: y.rate, first, (jnp.full(3, jnp.inf),))))
+    assert not bool(_diverged(unit, far, eqx.tree_at(lambda y: y.displacement, first, 1e8 * far.displacement)))
+    assert bool(_diverged(unit, first, eqx.tree_at(lambda y: y.rate, first, (jnp.full(3, jnp.inf),))))
 
 
 def test_one_number_that_is_not_finite_makes_a_state_that_is_not():

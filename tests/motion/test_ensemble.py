@@ -1,4 +1,4 @@
-"""Ensembles: many runs in lanes, their errors and their seconds."""
+"""Ensembles: many runs in batches, their errors and their seconds."""
 
 import logging
 
@@ -22,7 +22,7 @@ def test_an_ensemble_is_a_loop_of_runs():
     def make(n):
         return eqx.tree_at(lambda x: x.drive.speed, s, n), start
 
-    many = jv.ensemble(make, speeds, 20.0, stepsize_controller=jv.EqualSteps(4000), lanes=3)
+    many = jv.ensemble(make, speeds, 20.0, stepsize_controller=jv.EqualSteps(4000), batch=3)
     for k in (0, 3, 6):
         run = jv.simulate(
             make(speeds[k])[0], 20.0, start=start, stepsize_controller=jv.Tolerance(1e-12), save="window", estimate=False
@@ -193,7 +193,7 @@ def test_single_precision_keeps_its_phase():
     [
         (dict(values=jnp.zeros(())), "values has leading axes"),
         (dict(values=(jnp.zeros(2), jnp.zeros(3))), "values has leading axes"),
-        (dict(lanes=0), "lanes is 0"),
+        (dict(batch=0), "batch is 0"),
         (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),
         (dict(make=lambda v: v), "make gives"),
         (dict(make=int), "make needs the value of a number that JAX traces"),
@@ -213,8 +213,8 @@ def test_ensembles_that_cannot_be(change, says):
     assert says in str(caught.value)
 
 
-@pytest.mark.parametrize(("lanes", "together"), [(2, 2), (64, 3)])
-def test_so_many_runs_advance_together_as_is_asked(monkeypatch, lanes, together):
+@pytest.mark.parametrize(("batch", "together"), [(2, 2), (64, 3)])
+def test_so_many_runs_advance_together_as_is_asked(monkeypatch, batch, together):
     """At most the number of runs, so that nothing is computed for runs that do not exist."""
     seen = []
 
@@ -224,5 +224,5 @@ def test_so_many_runs_advance_together_as_is_asked(monkeypatch, lanes, together)
 
     monkeypatch.setattr("jaxvib.motion.ensemble.in_chunks", in_chunks)
     with pytest.raises(InterruptedError):
-        jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(8), lanes=lanes)
+        jv.ensemble(make, values(), 5.0, stepsize_controller=jv.EqualSteps(8), batch=batch)
     assert seen == [together]

@@ -15,7 +15,7 @@ from small_machine import small_machine, small_run, small_start
 from stored_jit import stored_jit
 
 import jaxvib as jv
-from jaxvib.motion.integrate import StepControl, added_rate, fastest_and_slowest, integrate
+from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate
 from jaxvib.motion.simulate import (
     _control,
     _enough_samples,
@@ -61,9 +61,9 @@ def test_steps_resolve_what_effects_add_to_the_fastest_load():
         SimpleNamespace(own_rate=lambda loads, speed, rate=rate: rate) for rate in (jnp.array([9.0, 30.0, 20.0]), None)
     )
     motion = SimpleNamespace(effects=(none, quick), loads=None, drive=jv.ConstantSpeed(5.0))
-    assert added_rate(motion) == 30.0
+    assert effects_rate(motion) == 30.0
     motion.effects = (none,)
-    assert added_rate(motion) == 0.0
+    assert effects_rate(motion) == 0.0
 
 
 @pytest.mark.parametrize("s", [scene("two_mass", "balls"), torus.scene()], ids=["angles", "angles and places in a tube"])
@@ -115,7 +115,7 @@ def test_a_scan_of_parameters_is_one_compilation():
 def test_what_moves_fastest_and_slowest(speed):
     """The rotor or the platform, sqrt(4e4 / (50 + 2.4)) rad/s with three balls of 0.8 kg on it, whichever it is."""
     own = np.sqrt(4e4 / 52.4)
-    found = fastest_and_slowest(scene("one_mass", "balls", speed=speed))
+    found = frequency_bounds(scene("one_mass", "balls", speed=speed))
     np.testing.assert_allclose(found, [max(own, speed), own], rtol=1e-12)
 
 
@@ -123,7 +123,7 @@ def test_what_moves_fastest_and_slowest(speed):
 def test_a_run_may_take_500_steps_a_turn(turns, steps):
     """And 4096 besides, rounded up to a power of 2."""
     s = scene("one_mass", "balls", speed=100.0)
-    assert enough_steps(fastest_and_slowest(s)[0], jnp.asarray(2.0 * np.pi * turns / 100.0)) == steps
+    assert enough_steps(frequency_bounds(s)[0], jnp.asarray(2.0 * np.pi * turns / 100.0)) == steps
 
 
 @pytest.mark.parametrize(("turns", "samples"), [(1000, 16384), (1100, 262144)])

@@ -9,7 +9,7 @@ from rotors import case, rotor_state
 from scenes import loads, machines, scene, some_state
 
 import jaxvib as jv
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.dopri8 import UnrolledDopri8
 from jaxvib.ode.dopri8_loop import LoopDopri8
@@ -18,13 +18,13 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 @pytest.mark.parametrize("machine", ["one_mass", "two_mass", "three_mass"])
 @pytest.mark.parametrize("load", sorted(loads()))
 @pytest.mark.parametrize("effects", [(), (jv.Gravity(),)])
-@pytest.mark.parametrize("lanes", [False, True])
-def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effects, lanes):
+@pytest.mark.parametrize("batch", [False, True])
+def test_as_they_are_integrated_the_equations_are_the_same(machine, load, effects, batch):
     """Numbers in a batch, and arrays if one run has several loads."""
     s = jv.Scene(machines()[machine], loads()[load], jv.ConstantSpeed(120.0), effects)
     state, field = some_state(s), jv.vector_field(s)
-    motion = PackedSystem(field, state, lanes=lanes)
-    assert motion.is_scalarized is (lanes or s.loads.count < 4)
+    motion = PackedSystem(field, state, batch=batch)
+    assert motion.is_scalarized is (batch or s.loads.count < 4)
     rates = motion.term.vf(jnp.asarray(0.3), motion.pack(state), motion.args)
     ours = motion.unpack(jax.tree.map(lambda x: x[None], rates))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(field(jnp.asarray(0.3), state)), strict=True):
@@ -36,7 +36,7 @@ def test_equations_are_the_same_on_numbers(name):
     """The equations as they are integrated."""
     s = case(name)
     state, t = rotor_state(s, 5), jnp.asarray(0.7)
-    motion = PackedSystem(jv.vector_field(s), state, lanes=True)
+    motion = PackedSystem(jv.vector_field(s), state, batch=True)
     assert motion.is_scalarized
     rates = motion.term.vf(t, motion.pack(state), motion.args)
     ours = motion.unpack(jax.tree.map(lambda x: x[None], rates))
@@ -47,7 +47,7 @@ def test_equations_are_the_same_on_numbers(name):
 def test_equations_of_many_operations_stay_on_arrays():
     s = case("friction, exact, dc")
     state = rotor_state(s, 5)
-    motion, t = PackedSystem(jv.vector_field(s), state, lanes=True), jnp.asarray(0.7)
+    motion, t = PackedSystem(jv.vector_field(s), state, batch=True), jnp.asarray(0.7)
     assert not motion.is_scalarized
     ours = motion.unpack(motion.term.vf(t, motion.pack(state), motion.args)[None])
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jv.vector_field(s)(t, state)), strict=True):
@@ -95,8 +95,8 @@ def test_the_fastest_and_the_slowest_of_rotor_and_resonances():
     machine, balls = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0)
     resonance = np.sqrt(4e4 / 50.0)
     for speed in (10.0, 100.0):
-        found = fastest_and_slowest(jv.Scene(machine, balls, jv.ConstantSpeed(speed)))
+        found = frequency_bounds(jv.Scene(machine, balls, jv.ConstantSpeed(speed)))
         np.testing.assert_allclose(found, (max(speed, resonance), resonance), rtol=1e-12)
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     two = jv.Scene(machine, balls, jv.ConstantSpeed(30.0))
-    np.testing.assert_allclose(fastest_and_slowest(two), (jv.natural_frequencies(two)[1], jv.natural_frequencies(two)[0]))
+    np.testing.assert_allclose(frequency_bounds(two), (jv.natural_frequencies(two)[1], jv.natural_frequencies(two)[0]))

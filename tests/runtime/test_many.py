@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scenes import scene
 
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.runtime import many
 from jaxvib.runtime.cache import keep_programs
 from jaxvib.runtime.rehearsal import begin_others
@@ -66,7 +66,7 @@ def test_other_threads_begin_when_a_known_program_runs_again(monkeypatch, tmp_pa
     threads, both = [], threading.Event()
 
     def computed(x):
-        fastest_and_slowest(asked)
+        frequency_bounds(asked)
         threads.append(threading.current_thread())
         if len(set(threads)) == 2:
             both.set()

@@ -26,7 +26,7 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
-from jaxvib.motion.start import Start, brought_up, initial_state, whole_state
+from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
 from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require, small_number
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, moved_on
@@ -185,9 +185,9 @@ def envelope(
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if isinstance(chosen, Tolerance):
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
-    asked, scene = scene, brought_up(scene, end, start, spin_up)
+    asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     if isinstance(start, State):
-        state = whole_state(scene, start, mode, apart)
+        state = validate_state(scene, start, mode, apart)
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
         known = start in ("rest", "spin_up") and mode is None and apart is None

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.machine.scene import Scene
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
@@ -77,7 +77,7 @@ def gradient_precision(scene: Scene, jam: ExactJam, end: float | None, repeats: 
 def _by_runs(scene: Scene, at: Callable[[Array], Scene], jam: ExactJam, end: float | None) -> list[_Way]:
     """The gradient by runs of the scene `at` some stiffnesses that start near a stable jam."""
     until = jam.length(scene, _GRADIENT_TOLERANCE) if end is None else end
-    max_steps = min(enough_steps(fastest_and_slowest(scene)[0], jnp.asarray(until)), _MOST_NOTED)
+    max_steps = min(enough_steps(frequency_bounds(scene)[0], jnp.asarray(until)), _MOST_NOTED)
 
     def full(k: Array, adjoint: diffrax.AbstractAdjoint | None = None) -> Array:
         run = simulate(

@@ -19,7 +19,7 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error, turned
 from jaxvib.motion.envelope.envelope import envelope
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state
@@ -224,7 +224,7 @@ def _integrated(
 def _full(ask: _Ask, start: State, length: Callable[[float], float], error: Callable[[Run], float]) -> list[CostRow]:
     """Full runs by every solver to every tolerance, in double and (the default method) in single precision."""
     ends = {tolerance: length(tolerance) for tolerance in ask.tolerances}
-    fastest, _ = fastest_and_slowest(ask.scene)
+    fastest, _ = frequency_bounds(ask.scene)
     steps = enough_steps(fastest, jnp.asarray(max(ends.values())))  # one for all: it is a part of the program
 
     def rows(scene: Scene, start: State, name: str, dtype: str, least: float = 0.0) -> list[CostRow]:

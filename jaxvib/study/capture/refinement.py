@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, field_of
-from jaxvib.motion.integrate import added_rate
+from jaxvib.motion.integrate import effects_rate
 from jaxvib.motion.start import with_spin
 from jaxvib.runtime.programs import cached
 
@@ -99,7 +99,7 @@ def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float
     values = np.linalg.eigvals(np.asarray(_jacobian(scene, equations)))
     own = scene.loads.own_frequency(scene.drive.speed)
     oscillation = max(np.max(np.abs(values.imag)), float(scene.drive.speed if own is None else jnp.max(own)))
-    decay, added = np.max(-values.real, initial=0.0), float(added_rate(scene))
+    decay, added = np.max(-values.real, initial=0.0), float(effects_rate(scene))
     return float(max(_STEPS_PER_RADIAN * oscillation, decay / _DECAY_PER_STEP, _STEPS_PER_ADDED_RADIAN * added))
 
 

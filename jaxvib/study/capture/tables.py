@@ -357,7 +357,7 @@ def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.
         values = jax.tree.map(lambda x, y, filled=filled: jnp.concatenate([x[filled], y]), runs, other)
         steps = EqualSteps(max(16, math.ceil(end * needed[block[0]])))
         ran = ensemble(
-            model.make, values, end, stepsize_controller=steps, estimate=False, lanes=_LANES, equations=model.equations
+            model.make, values, end, stepsize_controller=steps, estimate=False, batch=_LANES, equations=model.equations
         )
         slip = np.abs(np.asarray(ran.load_speed) / speed - 1.0)
         captured[block] = (np.all(slip < CAUGHT, axis=1) & np.asarray(ran.finite))[: block.size]

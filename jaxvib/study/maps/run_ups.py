@@ -17,7 +17,7 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
-from jaxvib.motion.integrate import fastest_and_slowest
+from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.simulate import enough_steps, simulate
 from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
@@ -181,7 +181,7 @@ def run_ups(
     if stepsize_controller is None and end.dtype.itemsize >= 8:
         stepsize_controller = _TOLERANCE
     if max_steps is None:
-        max_steps = max(_FEWEST, enough_steps(fastest_and_slowest(scene)[0], end))
+        max_steps = max(_FEWEST, enough_steps(frequency_bounds(scene)[0], end))
 
     def together(drags: Array, angles: Array) -> tuple[Regime, Array, Array]:
         return _together(scene, end, drags, angles, stepsize_controller, max_steps)

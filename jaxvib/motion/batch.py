@@ -1,4 +1,4 @@
-"""Many runs side by side with equal steps: how they advance, and one that is watched until its end."""
+"""Runs that advance side by side with equal steps, and measurements along each until its end."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as Held
 from jaxvib.runtime.compat import short_end
 
-__all__ = ["LANES", "PARTS", "Plan", "WatchedRun", "advance", "side_by_side", "stretches", "watched_run"]
+__all__ = ["BATCH_SIZE", "PARTS", "BatchPlan", "BatchRun", "advance", "pack_batch", "run_in_batch", "stretches"]
 
-LANES = 64
-"""Cases side by side on a core: so many that vectors are full, so few that a step's stages stay in its cache."""
+BATCH_SIZE = 64
+"""Runs side by side on a core: enough to fill its vectors, few enough that the stages of a step stay in its cache."""
 
 PARTS = 64
-"""Into so many equal parts a watched run is cut before its window; over each the loads' mean speeds are taken."""
+"""Equal parts of a run before its window, over each of which the loads' mean speeds are taken."""
 
 
 _DOUBLINGS = 40
@@ -76,17 +76,17 @@ def stretches(
     return held, begins.at[0].set(step), lengths.at[0].add(-step)
 
 
-def side_by_side(
+def pack_batch(
     field: Callable[[Array, State], State], state: State, single: bool, together: bool, *, implicit: bool
 ) -> PackedSystem:
     """The equations of many runs that advance together; an implicit method takes the numbers of each run as a vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
-    return PackedSystem(field, state, wrapped=single, together=together, lanes=True)
+    return PackedSystem(field, state, wrapped=single, together=together, batch=True)
 
 
-class Plan(NamedTuple):
-    """How watched runs advance, the same for all that go side by side.
+class BatchPlan(NamedTuple):
+    """Steps of runs that advance side by side, the same for all of them.
 
     **Attributes**: `until` s, the end; `window` s, the stretch before it that is measured; `samples` states in it, evenly
     apart; `each` steps in each of the `PARTS` before it; `between` steps from one sample to the next; `implicit` true if decay
@@ -101,8 +101,8 @@ class Plan(NamedTuple):
     implicit: bool = False
 
 
-class WatchedRun(NamedTuple):
-    """A run and what was seen of it.
+class BatchRun(NamedTuple):
+    """A run with its measurements.
 
     **Attributes**: `scene` that ran; `window` its last stretch; `measured` and `regime` of the window; `part_speed` (PARTS,
     count) rad/s, the loads' mean speeds over the equal parts before it, each `part_length` s long; `finite` whether the motion
@@ -118,7 +118,7 @@ class WatchedRun(NamedTuple):
     finite: Array
 
 
-def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
+def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     """Integrates the full equations from a state with equal steps, and measures the window at the end as `simulate` does.
 
     Under `vmap` all runs make the same steps, so that none waits for another and no result depends on the runs beside it.
@@ -126,7 +126,7 @@ def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
     dtype = state.displacement.dtype
     single, together = wrap_angles(scene, dtype)
     field = vector_field(scene)
-    motion = side_by_side(field, state, single, together, implicit=plan.implicit)
+    motion = pack_batch(field, state, single, together, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
 
@@ -151,4 +151,4 @@ def watched_run(scene: Scene, state: State, plan: Plan) -> WatchedRun:
     window = trajectory(scene, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
     found = measure(scene, field, times, states, natural_units(scene)), regime(scene, window)
-    return WatchedRun(scene, window, *found, speed, jnp.asarray(length, dtype), is_finite(states))
+    return BatchRun(scene, window, *found, speed, jnp.asarray(length, dtype), is_finite(states))
