@@ -11,10 +11,10 @@ A mutant is the package with one change in one line:
 
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
-Each is given to the nearest `--files` test files: examples in its own file, then the test file of its name, then those of its
-folder that name something of it, then the smallest. Of these the tests that reach its line run first; the first test that
-fails ends it. The lines that each test of a file reaches are measured (`coverage`) when a mutant needs that file, once for an
-`--out`. Take a new `--out` for changed packages.
+Each is given to the nearest `--files` test files, first the test file of its name, then those of its folder that name something
+of it, then the smallest; and to the examples in its own file. Of these the tests that reach its line run first; the first test
+that fails ends it. The lines that each test of a file reaches are measured (`coverage`) when a mutant needs that file, once for
+an `--out`. Take a new `--out` for changed packages.
 
 A mutant is killed when a test fails, when the tests take three times their usual time and a minute, or when the process dies.
 Survivors, and mutants that no such test reaches, are printed with their changes, to be explained or killed by a new test.
@@ -101,22 +101,25 @@ def nearest(file: str, count: int) -> list[str]:
         )
 
     tests = sorted((ROOT / "tests").rglob("test_*.py"), key=distance)
-    return [file] * (">>>" in text) + [str(path.relative_to(ROOT)) for path in tests[:count]]
+    first, *others = [str(path.relative_to(ROOT)) for path in tests[:count]]
+    return [first, *[file] * (">>>" in text), *others]
 
 
 class Reach:
     """The tests that reach each line of the packages, by test files, measured when they are asked for."""
 
-    def __init__(self, out: pathlib.Path) -> None:
-        self.out = out / "reach"
+    def __init__(self, out: pathlib.Path, measures: bool) -> None:
+        self.measures, self.out = measures, out / "reach"
         self.out.mkdir(exist_ok=True)
         self.locks = collections.defaultdict(threading.Lock)
 
-    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str], float]:
-        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line.
+    def tests_of(self, mutant: Mutant, file: str) -> tuple[list[str] | None, float]:
+        """The tests of a file to run for a mutant, and their seconds; none if none reaches its line, None for all.
 
         Those that reach the line come before the others, which may use a program that the first ones traced.
         """
+        if not self.measures:
+            return None, 600.0
         with self.locks[file]:
             kept = self.out / f"{file.replace('/', '-')}.json"
             if not kept.exists():
@@ -195,14 +198,14 @@ def fate_of(mutant: Mutant, copy_of: pathlib.Path, reach: Reach, files: int) -> 
     fate, by, began = "not reached", "", time.perf_counter()
     for file in nearest(mutant.file, files):
         tests, seconds = reach.tests_of(mutant, file)
-        if tests:
+        if tests != []:
             fate, by = _run(mutant, copy_of, file, tests, seconds)
             if fate != "survived":
                 break
     return {"fate": fate, "by": by, "seconds": round(time.perf_counter() - began, 1)}
 
 
-def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str], seconds: float) -> tuple[str, str]:
+def _run(mutant: Mutant, copy_of: pathlib.Path, file: str, tests: list[str] | None, seconds: float) -> tuple[str, str]:
     """The mutant's fate by tests of one file, and the line about the test that failed."""
     path = copy_of / mutant.file
     whole = path.read_bytes()
@@ -234,13 +237,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="order of the draw (0)")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time (2)")
     parser.add_argument("--files", type=int, default=5, help="test files that a mutant is given, beside its examples (5)")
+    parser.add_argument("--whole-files", action="store_true", help="measure no lines: cheaper for one mutant in a file")
     parser.add_argument("--again", action="store_true", help="run the survivors anew")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/mutants"), help="folder of the results")
     asked = parser.parse_args()
     out = asked.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
 
-    reach, taken = Reach(out), drawn(asked.count, asked.seed, asked.folder)
+    reach, taken = Reach(out, not asked.whole_files), drawn(asked.count, asked.seed, asked.folder)
     kept = out / "fates.json"
     fates = json.loads(kept.read_text()) if kept.exists() else {}
     if asked.again:
