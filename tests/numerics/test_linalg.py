@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.numerics.linalg import eigenvalues_in_turn, small_solve, solve_definite
+from jaxvib.numerics.linalg import eigenvalues_in_turn, hermitian_modes, relative_to, small_solve, solve_definite
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 17])
@@ -63,3 +63,29 @@ def test_definite_equations_are_solved(n):
     root, b = rng.normal(size=(n, n)), rng.normal(size=n)
     a = root.T @ root + 0.1 * np.eye(n)
     np.testing.assert_allclose(solve_definite(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_modes_of_a_symmetric_matrix_are_numpys(n):
+    rng = np.random.default_rng(n)
+    matrices = [np.zeros((n, n)), np.eye(n), np.diag([1e6, 1.0, 1e-3, 2.0][:n]), np.ones((n, n))]
+    for a in [*matrices, *(root + root.T for root in rng.normal(size=(20, n, n)))]:
+        values, vectors = map(np.asarray, hermitian_modes(jnp.asarray(a)))
+        size = np.max(np.abs(a)) + 1e-300
+        np.testing.assert_allclose(values, np.linalg.eigvalsh(a), atol=1e-14 * size)
+        np.testing.assert_allclose(a @ vectors, vectors * values, atol=2e-14 * size)  # each column with its value
+        np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), atol=1e-13)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_metric_is_divided_out_in_its_own_precision(n, precision):
+    rng = np.random.default_rng(n)
+    root, other = rng.normal(size=(2, n, n))
+    metric, matrix = (jnp.asarray(a, precision) for a in (root @ root.T + np.eye(n), other + other.T))
+    square, inverse = relative_to(metric, matrix)
+    assert square.dtype == inverse.dtype == precision
+    digits = 30.0 * np.finfo(precision).eps
+    np.testing.assert_allclose(inverse @ metric @ inverse.T, np.eye(n), atol=digits)
+    np.testing.assert_allclose(np.triu(inverse, 1), 0.0, atol=0.0)
+    np.testing.assert_allclose(square, inverse @ matrix @ inverse.T, atol=digits * float(jnp.max(jnp.abs(square))))
