@@ -124,7 +124,10 @@ def _apart(growth: float) -> str:
 
 def _left_out(scene: jv.Scene) -> list[str]:
     """A line on the effects that a table of light loads' jams leaves out; none where the rotor is balanced."""
-    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if effect.has_imbalance)
+    from jaxvib.machine.effects.base import has_term
+    from jaxvib.machine.effects.terms import RotorImbalance
+
+    named = " and ".join(effect.kind.replace("_", " ") for effect in scene.effects if has_term([effect], RotorImbalance))
     return [f"amplitudes and forces are the loads' alone: the {named} shakes at the rotor's own speed, on top"] if named else []
 
 

@@ -45,13 +45,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.equations.linear import LinearModel, linear_model, require_effects, turning_loads
+from jaxvib.equations.linear import LinearModel, linear_model, turning_loads
 from jaxvib.machine.drive import Drive
+from jaxvib.machine.effects.terms import GravityField, LoadPotential
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import eigenvalues_in_turn, magnitude, small_solve, times, written_inverse
 
 __all__ = [
+    "AVERAGED_TERMS",
     "Amplitudes",
     "Averaged",
     "amplitudes_of",
@@ -61,6 +63,9 @@ __all__ = [
     "averaged_model",
     "mean_torque",
 ]
+
+AVERAGED_TERMS = (GravityField, LoadPotential)
+"""Terms that the averaged equations include: potentials, whose mean torque is 0."""
 
 _CIRCLE = (1.0, -1.0j)
 
@@ -157,16 +162,8 @@ class Averaged(eqx.Module):
 
 
 def averaged_loads(scene: Scene) -> CircularLoads:
-    """The scene's loads, where the scene holds nothing that is not averaged here.
-
-    **Raises** `InputError`, besides what `turning_loads` refuses, for effects that `has_imbalance` or `couples_loads`.
-    """
-    loads = turning_loads(scene)
-    for name in ("has_imbalance", "couples_loads"):
-        require_effects(
-            [effect.kind for effect in scene.effects if getattr(effect, name)], f"is|are not averaged (property {name})"
-        )
-    return loads
+    """Return the loads of a scene that the averaged equations include. **Raises** `InputError` as `turning_loads`."""
+    return turning_loads(scene, AVERAGED_TERMS)
 
 
 def averaged_field(scene: Scene) -> Averaged:

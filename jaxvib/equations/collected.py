@@ -10,12 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.linear import JammedModel, jammed_loads, require_effects
-from jaxvib.machine.effects.base import Effect, has_half_turn, total_gravity
+from jaxvib.equations.linear import JAM_TERMS, JammedModel, jammed_loads, require_terms
+from jaxvib.machine.effects.base import Effect, has_half_turn, has_term, terms_of, total_gravity
+from jaxvib.machine.effects.terms import ContactFriction, LoadPotential, RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["CollectedModel", "Points", "collected_model", "light_friction", "require_collected"]
+__all__ = ["COLLECTED_TERMS", "CollectedModel", "Points", "collected_model", "light_friction", "require_collected"]
+
+COLLECTED_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
+"""Terms that exact jams include. Forces between loads cancel in the torque on loads that lie together."""
 
 Points = Array | np.ndarray
 
@@ -57,16 +61,17 @@ class CollectedModel(eqx.Module):
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
         at = dict(zip(self.linear.carrier.axes, a, strict=True))
         gravity = total_gravity(self.effects)
-        found = (effect.friction(loads, u, rates, speed, gravity) for effect in self.effects)
+        found = (term.friction(loads, u, rates, speed, gravity) for term in terms_of(self.effects, ContactFriction))
         torque = loads.resistance(u, rates, speed)[0]
-        return sum((friction.torque(at) for friction in found if friction is not None), torque)
+        return sum((friction.torque(at) for friction in found), torque)
 
     def torque_of_each(self, phi: Points, rate: Array, speed: Array, a: Array) -> Array:
         """The torque of the rotor and of effects on loads at angles `phi`, N m; `a` as in `rotor_torque`."""
-        # Side by side, loads in contact press on each other, which turns the group as a whole nowhere.
-        acting = (effect for effect in self.effects if not effect.couples_loads)
-        forces = (effect.load_force(self.loads, (jnp.asarray(phi),)) for effect in acting)
-        return sum((force[0] for force in forces if force is not None), self.rotor_torque(phi, rate, speed, a))
+        torque, u = self.rotor_torque(phi, rate, speed, a), (jnp.asarray(phi),)
+        for term in terms_of(self.effects, LoadPotential):
+            ((force,),) = term.forces(self.loads, u, (rate,))
+            torque = torque + force
+        return torque
 
     def torque(self, phi: Points, rate: Array, speed: Array, a: Array, of_each: Callable[..., Array] | None = None) -> Array:
         """The torque on the bodies at angles `phi` (G, M), N m, the sum `of_each` (`torque_of_each`) over the loads of each,
@@ -84,7 +89,7 @@ class CollectedModel(eqx.Module):
         angle = jnp.asarray(phi)
         by_angle = jax.jvp(lambda p: self.torque(p, rate, speed, a), (angle,), (jnp.ones_like(angle),))[1]
         by_rate = jax.jvp(lambda r: self.torque(angle, r, speed, a), (rate,), (jnp.ones_like(rate),))[1]
-        if not any(effect.has_friction for effect in self.effects):
+        if not has_term(self.effects, ContactFriction):
             return by_angle, by_rate, None
         axes = (jnp.zeros_like(a).at[k].set(1.0) for k in range(a.shape[0]))
         by_a = [jax.jvp(lambda x: self.torque(angle, rate, speed, x), (a,), (axis,))[1] for axis in axes]
@@ -112,13 +117,13 @@ def require_collected(scene: Scene) -> CircularLoads:
 
 
 def _require_balance(effects: tuple[Effect, ...]) -> None:
-    shaking = [effect.kind for effect in effects if effect.has_imbalance]
-    require_effects(shaking, "shakes|shake the machine at the rotor's own speed, so that no motion repeats", "or simulate")
+    problem = "shakes|shake the machine at the rotor's own speed, so that no motion repeats"
+    require_terms(effects, COLLECTED_TERMS, problem, "or simulate")
 
 
 def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
     """Torque of dry friction on light loads that turn at `omega`, N m, all together: a carrier that hardly moves adds nothing
     to their radial load, and their weight, on the average of a turn, neither."""
     phi, rate = (jnp.zeros((loads.count,)),), (jnp.full((loads.count,), omega),)
-    found = (effect.friction(loads, phi, rate, speed, {}) for effect in effects)
-    return sum((jnp.sum(friction.torque({})) for friction in found if friction is not None), jnp.zeros_like(omega))
+    found = (term.friction(loads, phi, rate, speed, {}) for term in terms_of(effects, ContactFriction))
+    return sum((jnp.sum(friction.torque({})) for friction in found), jnp.zeros_like(omega))

@@ -15,7 +15,18 @@ from jaxvib.boundary import validated
 from jaxvib.equations.sliding import Kinematics, dot, kinematics, missing_force, slid, slip_rates, total
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects.base import Effect, Friction, SlipLimit, total_gravity
+from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
+from jaxvib.machine.effects.terms import (
+    ContactFriction,
+    DrillingSpinRelease,
+    Friction,
+    LoadInteraction,
+    LoadPotential,
+    LoadResistance,
+    RotorImbalance,
+    SlipRelease,
+    SupportForce,
+)
 from jaxvib.machine.loads import Loads, Twisting
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, times
@@ -63,9 +74,8 @@ class State(eqx.Module):
 
 
 class _Support(eqx.Module):
-    """An effect that supports the carrier, the displacements it is at (k, nd), and what a force there accelerates (nd, k)."""
+    """Place of a `SupportForce`: `rows` (k, nd) of its displacements; `push` (nd, k), acceleration per force there."""
 
-    effect: Effect
     rows: Array
     push: Array
 
@@ -96,7 +106,7 @@ class Dynamics(eqx.Module):
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `push` M^-1 P^T (nd, nP): acceleration per force at the port; `mobility` P M^-1 P^T (nP, nP); `port` P (nP, nd)
-    - `stations` of the loads and `cg_offset` of the rotor, see `Carrier`; `supports` that are not linear
+    - `stations` of the loads and `cg_offset` of the rotor, see `Carrier`; `supports`, a place for each `SupportForce`
     """
 
     stiffness: Array
@@ -145,14 +155,15 @@ class Dynamics(eqx.Module):
         a, carrier, part, rotor = accelerations(friction, force, kappa)
         at_loads = self._at_loads(a)
         change = part.change(at_loads)
-        slip, limit = self._slip(state), self._slip_limit
-        if slip is not None and limit is not None:
+        slip = self._slip(state)
+        if slip is not None:
             # Whether a load sticks or slides: by what the motion in which all of them roll asks of its contact.
             u, rate = state.angle, state.rate
             pressing = self.loads.pressing(u, rate, total_gravity(self.effects))
             assert pressing is not None
             centre = self.centre_forces(state, speed)
             needed = missing_force(self.loads, loads, change, at_loads, centre, 1.0)
+            (limit,) = terms_of(self.effects, SlipRelease)
             moved = slid(self.loads, loads, slip, limit, pressing, at_loads, needed, force, centre, friction)
             a, carrier, part, rotor = accelerations(moved.friction, moved.force, moved.kappa)
             at_loads = self._at_loads(a)
@@ -170,20 +181,15 @@ class Dynamics(eqx.Module):
         spin = None if twisting is None and slip is None else Spin(None if twisting is None else twisting.rate, slip_change)
         return State(state.velocity, carrier, state.rate, change, None if rotor is None else (speed, rotor), spin)
 
-    @property
-    def _slip_limit(self) -> SlipLimit | None:
-        found = [limit for limit in (effect.slip_limit for effect in self.effects) if limit is not None]
-        return found[0] if found else None
-
     def _slip(self, state: State) -> tuple[Array, ...] | None:
-        if self._slip_limit is None:
+        if not has_term(self.effects, SlipRelease):
             return None
         if state.spin is None or state.spin.slip is None:
             raise InputError("state.spin", "has no slip, which an effect of the scene makes free; see with_spin(scene, state)")
         return state.spin.slip
 
     def _twisting(self, state: State, speed: Array) -> Twisting | None:
-        if not any(effect.frees_twist for effect in self.effects):
+        if not has_term(self.effects, DrillingSpinRelease):
             return None
         if state.spin is None or state.spin.twist is None:
             raise InputError("state.spin", "has no twist, which an effect of the scene makes free; see with_spin(scene, state)")
@@ -194,15 +200,16 @@ class Dynamics(eqx.Module):
         flow = -times(self.stiffness, state.displacement) - times(self.damping, state.velocity)
         if self.gyroscopic is not None:
             flow = flow - speed * times(self.gyroscopic, state.velocity)
-        for support in self.supports:
+        for term, support in zip(terms_of(self.effects, SupportForce), self.supports, strict=True):
             x, v = times(support.rows, state.displacement), times(support.rows, state.velocity)
-            flow = flow - times(support.push, support.effect.support_force(x, v))
+            flow = flow - times(support.push, term.force(x, v))
         return flow
 
     def _friction(self, state: State, speed: Array) -> list[Friction]:
         g = total_gravity(self.effects)
-        found = (effect.friction(self.loads, state.angle, state.rate, speed, g) for effect in self.effects)
-        return [each.signed({}) if each.normal is None else each for each in found if each is not None]
+        terms = terms_of(self.effects, ContactFriction)
+        found = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
+        return [each.signed({}) if each.normal is None else each for each in found]
 
     def _forces(self, state: State, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
         """The torque of the drag, and the generalised forces on the loads but for friction; without a `rotation` of their own
@@ -217,10 +224,9 @@ class Dynamics(eqx.Module):
         if twisting is not None:
             assert state.spin is not None and state.spin.twist is not None
             force = [f + state.spin.twist * s for f, s in zip(force, twisting.force, strict=True)]
-        for effect in self.effects:
-            for extra in (effect.load_force(loads, state.angle), effect.load_resistance(loads, state.angle, state.rate)):
-                if extra is not None:
-                    force = [f + e for f, e in zip(force, extra, strict=True)]
+        for term in terms_of(self.effects, LoadPotential, LoadResistance, LoadInteraction):
+            for extra in term.forces(loads, state.angle, state.rate):
+                force = [f + e for f, e in zip(force, extra, strict=True)]
         return torque[0], force
 
     def centre_forces(self, state: State, speed: Array) -> list[Array]:
@@ -285,12 +291,13 @@ class Dynamics(eqx.Module):
 
     def _throw(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
         """With d(theta) (nP,) what is out of balance: d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2."""
-        if not any(effect.has_imbalance for effect in self.effects):
+        terms = terms_of(self.effects, RotorImbalance)
+        if not terms:
             return None
         turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
 
         def thrown(angle: Array) -> tuple[Array, ...]:
-            found = [imbalance for imbalance in (effect.imbalance(angle) for effect in self.effects) if imbalance is not None]
+            found = [term.at(angle) for term in terms]
             static = tuple(total(imbalance.static[axis] for imbalance in found) for axis in self.axes)
             if self.stations is None:
                 return static
@@ -363,12 +370,11 @@ def vector_field(scene: Scene) -> Dynamics:
     """
     carrier, effects = scene.machine.carrier(), scene.effects
     stations, port = carrier.stations, carrier.port
-    if carrier.tilt is not None and (stations is not None or any(effect.has_imbalance for effect in effects)):
+    if carrier.tilt is not None and (stations is not None or has_term(effects, RotorImbalance)):
         port = jnp.concatenate([port, carrier.tilt])
         stations = jnp.zeros_like(carrier.mass[0, 0]) if stations is None else stations
-    places = [(effect, effect.place(carrier)) for effect in effects]
-    places = [(effect, rows) for effect, rows in places if rows is not None]
-    parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for _, rows in places)]
+    places = [term.rows(carrier) for term in terms_of(effects, SupportForce)]
+    parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for rows in places)]
     if carrier.gyroscopic is not None:
         parts.append(carrier.gyroscopic)
     solved = small_solve(carrier.mass, jnp.concatenate(parts, axis=1))
@@ -382,9 +388,9 @@ def vector_field(scene: Scene) -> Dynamics:
         port=port,
         stations=stations,
         cg_offset=carrier.cg_offset,
-        supports=tuple(_Support(effect, rows, rest[k]) for k, (effect, rows) in enumerate(places)),
+        supports=tuple(map(_Support, places, rest)),
         loads=scene.loads,
         drive=scene.drive,
-        effects=tuple(effect.prepared(scene.loads) for effect in effects),
+        effects=tuple(effect.prepare(scene.loads) for effect in effects),
         axes=carrier.axes,
     )

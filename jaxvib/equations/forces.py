@@ -14,7 +14,15 @@ from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import Dynamics, State, vector_field
 from jaxvib.equations.sliding import dot, kinematics, missing_force
 from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.effects.base import terms_of, total_gravity
+from jaxvib.machine.effects.terms import (
+    ContactFriction,
+    LoadInteraction,
+    LoadPotential,
+    LoadResistance,
+    RotorImbalance,
+    SupportForce,
+)
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 
@@ -36,10 +44,9 @@ def foundation_force(scene: Scene, state: State) -> Array:
     """
     carrier = scene.machine.carrier()
     force = carrier.bed_force(state.displacement, state.velocity)
-    for effect in scene.effects:
-        rows = effect.place(carrier)
-        if rows is not None:
-            force = force + effect.support_force(rows @ state.displacement, rows @ state.velocity)
+    for term in terms_of(scene.effects, SupportForce):
+        rows = term.rows(carrier)
+        force = force + term.force(rows @ state.displacement, rows @ state.velocity)
     return force
 
 
@@ -76,13 +83,9 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         0.5 * (v @ carrier.mass @ v + q @ carrier.stiffness @ q),
         jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate))),
     ]
-    for effect in scene.effects:
-        potential = effect.load_potential(loads, state.angle)
-        if potential is not None:
-            parts.append(jnp.sum(jnp.broadcast_to(potential, (loads.count,))))
-        rows = effect.place(carrier)
-        if rows is not None:
-            parts.append(effect.support_potential(rows @ q))
+    for term in terms_of(scene.effects, LoadPotential, LoadInteraction):
+        parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
+    parts += [term.energy(term.rows(carrier) @ q) for term in terms_of(scene.effects, SupportForce)]
     t = jnp.asarray(t, q.dtype)
     turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     if state.spin is not None and state.spin.slip is not None:
@@ -123,21 +126,19 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
     sliding, spun = _spin_power(field, state, change, at_load, speed)
-    for effect in scene.effects:
-        friction = effect.friction(loads, state.angle, state.rate, speed, g)
-        if friction is not None:
-            rubbing = friction.forces(at_load)
-            taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
-            lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
-        resistance = effect.load_resistance(loads, state.angle, state.rate)
-        if resistance is not None:
+    for term in terms_of(scene.effects, ContactFriction):
+        rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
+        taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
+        lost += [jnp.sum(f * w) for f, w in zip(rubbing, sliding, strict=False)]
+    for term in terms_of(scene.effects, LoadResistance, LoadInteraction):
+        if term.resistance is not None:
+            resistance = term.resistance(loads, state.angle, state.rate)
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
-        rows = effect.place(carrier)
-        if rows is not None:
-            x, v = rows @ state.displacement, rows @ state.velocity
-            resisting = effect.support_resistance(x, v)
-            if resisting is not None:
-                lost.append(resisting @ v)
+    for term in terms_of(scene.effects, SupportForce):
+        rows = term.rows(carrier)
+        x, v = rows @ state.displacement, rows @ state.velocity
+        if term.resistance is not None:
+            lost.append(term.resistance(x, v) @ v)
     braking = jnp.sum(taken[0])
     lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
     motor = scene.drive.torque_and_inertia(speed)
@@ -208,10 +209,8 @@ def _throw_rate(scene: Scene, turn: Array) -> Array:
     carrier = scene.machine.carrier()
     static, moment = carrier.port_at(0.0 if carrier.cg_offset is None else carrier.cg_offset), carrier.tilt
     row = jnp.zeros_like(carrier.mass[0])
-    for effect in scene.effects:
-        rate = jax.jvp(effect.imbalance, (turn,), (jnp.ones_like(turn),))[1]
-        if rate is None:
-            continue
+    for term in terms_of(scene.effects, RotorImbalance):
+        rate = jax.jvp(term.at, (turn,), (jnp.ones_like(turn),))[1]
         row = row + jnp.stack([rate.static[axis] for axis in carrier.axes]) @ static
         if moment is not None:
             row = row + jnp.stack([rate.moment[axis] for axis in carrier.axes]) @ moment

@@ -15,6 +15,15 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.effects.terms import (
+    ContactFriction,
+    GravityField,
+    LoadInteraction,
+    LoadPotential,
+    RotorImbalance,
+    Term,
+)
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
@@ -23,6 +32,8 @@ from jaxvib.runtime.programs import cached
 from jaxvib.units.known import when_known
 
 __all__ = [
+    "JAM_TERMS",
+    "TURNING_TERMS",
     "AbstractLinearModel",
     "FrequencyStatus",
     "JammedModel",
@@ -35,12 +46,20 @@ __all__ = [
     "natural_frequencies",
     "peak_force",
     "require_drag",
-    "require_effects",
     "require_one_point",
+    "require_terms",
     "steady_displacement",
     "turning",
     "turning_loads",
 ]
+
+
+TURNING_TERMS = (GravityField, LoadPotential, LoadInteraction, RotorImbalance)
+"""Terms that theories of turning loads include: the carrier stays linear, and the mean torque on loads that turn together is 0
+over a turn, to leading order of their mass."""
+
+JAM_TERMS = (*TURNING_TERMS, ContactFriction)
+"""Terms that theories of jams include."""
 
 
 class FrequencyStatus(eqx.Enumeration):
@@ -232,7 +251,7 @@ def circular_loads(scene: Scene) -> CircularLoads:
 
 def jammed_loads(scene: Scene) -> CircularLoads:
     """The same where a formula is that of jams: loads that slip on the rotor, with or without dry friction."""
-    loads = turning_loads(scene, friction=True)
+    loads = turning_loads(scene, JAM_TERMS)
     require_one_point(scene)
     return loads
 
@@ -256,11 +275,11 @@ def require_one_point(scene: Scene) -> None:
         raise InputError("machine.stations", problem)
 
 
-def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
-    """The scene's loads, where a formula holds for loads on circles that a drive of given speed turns.
+def turning_loads(scene: Scene, included: tuple[type[Term], ...] = TURNING_TERMS) -> CircularLoads:
+    """Return the loads of a scene, for a theory of loads on circles that a drive of given speed turns.
 
-    The scene's parts are asked for their properties: loads that are `circular`, an `ideal` drive, effects that `averages_out`
-    and, where the formula has it, `friction`. **Raises** `InputError` that names the property a part lacks.
+    **Raises** `InputError` for loads that are not `circular` and a drive that is not `ideal`, naming the property, and for
+    effects with terms that are not among the `included` ones, naming these.
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
@@ -273,21 +292,34 @@ def turning_loads(scene: Scene, *, friction: bool = False) -> CircularLoads:
             "drive.kind",
             f"is {quoted(drive.kind)}; this holds at a given rotor speed (property ideal): use ConstantSpeed, or simulate",
         )
-    named = "averages_out or has_friction" if friction else "averages_out"
-    require_effects(
-        [effect.kind for effect in scene.effects if not (effect.averages_out or (friction and effect.has_friction))],
-        f"is|are not part of this theory (property {named})",
-    )
+    require_terms(scene.effects, included)
     return cast(CircularLoads, loads)
 
 
-def require_effects(kinds: Sequence[str], problem: str, advice: str = "here, or simulate") -> None:
-    """**Raises** `InputError` that names all effects of these `kinds` at once, if there are any, with their `problem`: a verb
-    for one and, after |, for several, and the rest of the sentence."""
-    named = list(dict.fromkeys(kinds))
+def require_terms(
+    effects: Sequence[Effect],
+    included: tuple[type[Term], ...],
+    problem: str = "is|are not part of this theory",
+    advice: str = "here, or simulate",
+) -> None:
+    """Check that a theory includes every term of the `effects`.
+
+    **Arguments**: `problem`, the sentence about other effects: a verb for one effect and, after |, for several, and the rest.
+
+    **Raises** `InputError` that names all effects with other terms, and the types of these terms.
+    """
+    others = [(effect.kind, type(term).__name__) for effect in effects for term in effect.terms() if type(term) not in included]
+    if not others:
+        return
+    kinds, terms = (list(dict.fromkeys(names)) for names in zip(*others, strict=True))
     verbs, rest = problem.split(" ", 1)
     one, several = verbs.split("|")
-    if len(named) == 1:
-        raise InputError(f"effects.{named[0]}", f"{one} {rest}; leave it out {advice}")
-    if named:
-        raise InputError("effects", f"{', '.join(named[:-1])} and {named[-1]} {several} {rest}; leave them out {advice}")
+    rest = f"{rest} (term{'s' * (len(terms) > 1)} {_list_words(terms)})"
+    if len(kinds) == 1:
+        raise InputError(f"effects.{kinds[0]}", f"{one} {rest}; leave it out {advice}")
+    raise InputError("effects", f"{_list_words(kinds)} {several} {rest}; leave them out {advice}")
+
+
+def _list_words(words: Sequence[str]) -> str:
+    """Return words as "a", "a and b" or "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))

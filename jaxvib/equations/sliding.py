@@ -5,19 +5,16 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.effects.base import Friction, SlipLimit
+from jaxvib.machine.effects.terms import Coordinates, Friction, SlipRelease
 from jaxvib.machine.loads import Loads, Pressing
 
 __all__ = ["Kinematics", "Slid", "dot", "kinematics", "missing_force", "slid", "slip_rates", "total"]
-
-Coordinates: TypeAlias = tuple[Array, ...]
-"""An array (count,) for each coordinate of a load."""
 
 
 class Kinematics(NamedTuple):
@@ -90,7 +87,7 @@ def slid(
     loads: Loads,
     found: Kinematics,
     slip: Coordinates,
-    limit: SlipLimit,
+    limit: SlipRelease,
     pressing: Pressing,
     a: Mapping[int, Array],
     needed: Sequence[Array],

@@ -10,7 +10,8 @@ import numpy as np
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.drive import Drive
-from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.effects.base import Effect, has_term
+from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease
 from jaxvib.machine.loads import Loads
 from jaxvib.units.known import when_known
 
@@ -68,8 +69,8 @@ class Scene(eqx.Module):
                 "machine.stations", f"has {stations.shape[0]} values; one for all loads or {loads.count} are needed"
             )
         for effect in effects:
-            effect.check(machine, loads)
-            if effect.needs_ideal_drive and not drive.ideal:
+            effect.validate(machine, loads)
+            if not drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
                 problem = f"goes with a drive of given speed (property ideal), not with {drive.kind!r}; use ConstantSpeed"
                 raise InputError(f"effects.{effect.kind}", problem)
         require_comparable(machine, loads, drive)

@@ -16,6 +16,8 @@ from jax import Array
 from jaxvib.equations.dynamics import Spin, State, vector_field
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import measure, trajectory, unmeasured
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -82,8 +84,8 @@ def on_jumps(scene: Scene, controller: Any) -> diffrax.AbstractStepSizeControlle
 
 
 def effects_rate(scene: Scene) -> Array:
-    """The fastest that effects add to the loads' motion, see `Effect.own_rate`; 0 where there is none."""
-    rates = (effect.own_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
+    """The fastest that effects add to the loads' motion, see `Effect.fastest_rate`; 0 where there is none."""
+    rates = (effect.fastest_rate(scene.loads, scene.drive.speed) for effect in scene.effects)
     found = [jnp.max(rate) for rate in rates if rate is not None]
     return functools.reduce(jnp.maximum, found, jnp.zeros_like(scene.drive.speed))
 
@@ -105,7 +107,7 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     """Whether angles are kept within a turn, and all loads' by the same turns: single precision, loads that touch."""
-    return jnp.dtype(dtype).itemsize < 8, any(effect.couples_loads for effect in scene.effects)
+    return jnp.dtype(dtype).itemsize < 8, has_term(scene.effects, LoadInteraction)
 
 
 @cached

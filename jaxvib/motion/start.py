@@ -17,6 +17,8 @@ from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
+from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, SlipRelease
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
@@ -115,7 +117,7 @@ def initial_state(
 def _places(scene: Scene, start: Start, apart: Number | None, *, one_each: bool) -> Array | np.ndarray:
     """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
     n = scene.loads.count
-    touching = any(effect.couples_loads for effect in scene.effects)
+    touching = has_term(scene.effects, LoadInteraction)
     wide = getattr(scene.loads, "own_radius", None) is not None
     usual = apart is None and start != "jam"
     side_by_side = not one_each and (touching or (usual and wide))
@@ -155,8 +157,8 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     """
     if turning not in get_args(Turning):
         raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    twists = any(effect.frees_twist for effect in scene.effects)
-    slips = any(effect.slip_limit is not None for effect in scene.effects)
+    twists = has_term(scene.effects, DrillingSpinRelease)
+    slips = has_term(scene.effects, SlipRelease)
     if not (twists or slips):
         if state.spin is not None:
             raise InputError("start.spin", "is given, but no effect of the scene makes it free; leave it out, or add FreeSpin")
@@ -232,7 +234,8 @@ def validate_state(scene: Scene, state: State, mode: int | None, apart: Number |
 
 
 def require_start(scene: Scene, u: tuple[Array, ...]) -> None:
-    """**Raises** `InputError` where an effect says that the loads cannot start from coordinates `u` (..., count), if known."""
+    """**Raises** `InputError` if loads that touch cannot start from the coordinates `u` (..., count), if these are known."""
     if not any(map(traced, u)):
-        for effect in scene.effects:
-            effect.check_start(scene.loads, u)
+        for term in terms_of(scene.effects, LoadInteraction):
+            if term.validate_start is not None:
+                term.validate_start(scene.loads, u)

@@ -12,6 +12,8 @@ from jaxvib.boundary import validated
 from jaxvib.equations.collected import light_friction
 from jaxvib.equations.linear import jammed_loads, peak_force
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
@@ -310,7 +312,7 @@ def _power(answers: Answers, tier: Tier, mode: int) -> Array:
     scene, loads, jam = answers.scene, jammed_loads(answers.scene), answers.jam(mode)
     n, omega = scene.drive.speed, jam.omega
     torque = loads.drag_sum() * (n - omega)
-    if any(effect.has_friction for effect in scene.effects):
+    if has_term(scene.effects, ContactFriction):
         torque = torque + light_friction(loads, scene.effects, omega, n)
     # Strong drag leaves n - Omega few digits; what the carrier dissipates, which that torque equals, has all of them.
     close = n - omega < _SLIP * n

@@ -27,6 +27,8 @@ from random_scenes import (
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, scaled_error
 
 SCENES = {"two platforms": two_platforms(), "motor": motor_driven()}
@@ -56,7 +58,7 @@ def holds(scene, state, units):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(field))
     assert abs(float(left)) < 1e-12 * float(size)
     n = scene.loads.count
-    if not any(effect.couples_loads for effect in scene.effects):
+    if not has_term(scene.effects, LoadInteraction):
         close(look(renumbered(scene, n), renumbered(state, n), t)[0], renumbered(field, n), 1e-10)
     close(look(mirrored(scene), half_turn(state), t)[0], half_turn(field, 0.0), 1e-9)
     length, mass, time = (10.0 ** float(x) for x in units)

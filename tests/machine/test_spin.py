@@ -220,7 +220,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
         (lambda: jv.vector_field(scene(BOTH))(0.0, some_state()), r"state.spin has no .*; see with_spin\(scene, state\)"),
         (
             lambda: jv.jam_modes(jv.Scene(HEAVY, PLANE, jv.ConstantSpeed(1.0), (jv.Sliding(0.1),))),
-            r"effects.sliding is not part of this theory \(property averages_out or has_friction\)",
+            r"effects.sliding is not part of this theory \(term SlipRelease\)",
         ),
     ],
 )

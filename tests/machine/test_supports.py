@@ -10,11 +10,11 @@ import jaxvib as jv
 @pytest.mark.parametrize(("side", "sign"), [("above", 1.0), ("below", -1.0), ("both", 1.0), ("both", -1.0)])
 def test_a_stop_never_pulls(side, sign):
     """Moving away faster than k x / c it lets go: its force is 0, neither a pull nor the spring's."""
-    stop = jv.Stop(1e4, gap=1e-3, damping=100.0, side=side)
+    (support,) = jv.Stop(1e4, gap=1e-3, damping=100.0, side=side).terms()
 
     def force(beyond, rate):
         """Away from the bed's side, N: what presses is positive."""
-        return sign * float(stop.support_force(jnp.full(1, sign * (1e-3 + beyond)), jnp.full(1, sign * rate))[0])
+        return sign * float(support.force(jnp.full(1, sign * (1e-3 + beyond)), jnp.full(1, sign * rate))[0])
 
     np.testing.assert_allclose(force(2e-3, 0.3), 1e4 * 2e-3 + 100.0 * 0.3)
     np.testing.assert_allclose(force(2e-3, -0.1), 1e4 * 2e-3 - 100.0 * 0.1)
@@ -23,7 +23,7 @@ def test_a_stop_never_pulls(side, sign):
 
 
 def test_a_ring_never_pulls():
-    stop = jv.Stop(1e4, gap=1e-3, damping=100.0)
+    (support,) = jv.Stop(1e4, gap=1e-3, damping=100.0).terms()
     place, away = jnp.asarray([1.8e-3, 2.4e-3]), jnp.asarray([-3.0, -4.0])
-    np.testing.assert_allclose(stop.support_force(place, 0.0 * away), 1e4 * 2e-3 * np.array([0.6, 0.8]))
-    np.testing.assert_allclose(stop.support_force(place, away), 0.0, atol=1e-12)
+    np.testing.assert_allclose(support.force(place, 0.0 * away), 1e4 * 2e-3 * np.array([0.6, 0.8]))
+    np.testing.assert_allclose(support.force(place, away), 0.0, atol=1e-12)

@@ -58,7 +58,7 @@ def test_wrong_arguments_are_one_sentence(arguments, sentence):
 
 def test_steps_resolve_what_effects_add_to_the_fastest_load():
     quick, none = (
-        SimpleNamespace(own_rate=lambda loads, speed, rate=rate: rate) for rate in (jnp.array([9.0, 30.0, 20.0]), None)
+        SimpleNamespace(fastest_rate=lambda loads, speed, rate=rate: rate) for rate in (jnp.array([9.0, 30.0, 20.0]), None)
     )
     motion = SimpleNamespace(effects=(none, quick), loads=None, drive=jv.ConstantSpeed(5.0))
     assert effects_rate(motion) == 30.0

@@ -67,8 +67,8 @@ def test_starts_that_cannot_be_say_what_else_to_start_from():
         with pytest.raises(jv.InputError) as error:
             ask(scene(effects=effects))
         assert str(error.value) == (
-            "start is 'jam', but effects cubic_support and stop are not part of this theory (property averages_out or "
-            "has_friction); start at 'rest', or from a State"
+            "start is 'jam', but effects cubic_support and stop are not part of this theory (term SupportForce); "
+            "start at 'rest', or from a State"
         )
     with pytest.raises(jv.InputError, match=r"apart is 0\.1, which goes with named starts"):
         jv.simulate(scene(), 1.0, start=jv.initial_state(scene()), apart=0.1)

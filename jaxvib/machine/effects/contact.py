@@ -11,6 +11,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.effects.terms import Coordinates, LoadInteraction, Term
 from jaxvib.machine.loads import CircularLoads, Loads, own_radius
 from jaxvib.units import Number, number
 from jaxvib.units.known import when_known
@@ -49,9 +50,6 @@ class LoadContact(Effect):
     (Schwager and Poeschel 2007).
     """
 
-    averages_out = True
-    couples_loads = True
-
     stiffness: Array
     damping: Array
     restitution: Array | None
@@ -69,16 +67,20 @@ class LoadContact(Effect):
                 raise InputError(field, "goes without damping, which it stands for; leave one of them out")
         self.kind = "load_contact"
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads on one track that have a size."""
+    def terms(self) -> tuple[Term, ...]:
+        """Return the forces between the loads."""
+        return (LoadInteraction(self.energy, self.resistance, self.validate_start),)
+
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for loads without a size, or at several stations."""
         own_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
         if machine.structure().stations is not None:
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
-    def check_start(self, loads: Loads, u: tuple[Array, ...]) -> None:
-        """On a circle, in the order of the track, less than a turn from the first to the last; else not inside each other."""
+    def validate_start(self, loads: Loads, u: Coordinates) -> None:
+        """**Raises** `InputError` if loads on a circle are not in order within a turn, or if others overlap."""
         if not loads.circular:
             self._require_apart(loads, u)
             return
@@ -101,27 +103,27 @@ class LoadContact(Effect):
             problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
-    def own_rate(self, loads: Loads, speed: Array) -> Array:
-        """sqrt(k / mu): what a contact swings with."""
+    def fastest_rate(self, loads: Loads, speed: Array) -> Array:
+        """Return sqrt(k / mu), the natural frequency of a contact."""
         return jnp.sqrt(self.stiffness / self._reduced(loads))
 
-    def prepared(self, loads: Loads) -> LoadContact:
-        """The same with the damping that the restitution stands for."""
+    def prepare(self, loads: Loads) -> LoadContact:
+        """Return the contact with the damping that gives its restitution."""
         if self.restitution is None:
             return self
         return eqx.tree_at(
             lambda c: (c.damping, c.restitution), self, (self._damping(loads), None), is_leaf=lambda leaf: leaf is None
         )
 
-    def load_potential(self, loads: Loads, u: tuple[Array, ...]) -> Array:
-        """k (2 r - s)^2 / 2 of the pairs that overlap, an entry a load."""
+    def energy(self, loads: Loads, u: Coordinates) -> Array:
+        """Return k (2 r - s)^2 / 2 of the pairs that overlap, (count,) J."""
         parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
         if parts[-1].shape != (loads.count,):  # opposite loads make half as many pairs
             parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
 
-    def load_resistance(self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...]) -> tuple[Array, ...]:
-        """-c s' of each pair that overlaps; a contact that would pull lets go."""
+    def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
+        """Return the forces -c s' of the pairs that overlap; a contact never pulls."""
         damping = self._damping(loads)
 
         def gaps(*v: Array) -> tuple[Array, ...]:

@@ -11,7 +11,8 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import Effect, Friction, Typical
+from jaxvib.machine.effects.base import Effect, Typical
+from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
 from jaxvib.machine.loads import CircularLoads, Loads
 from jaxvib.units import Number, number
 
@@ -68,9 +69,6 @@ class DryFriction(Effect):
     Source: Artyunin and Sumenkov 2019, equations (1)-(5).
     """
 
-    # By itself: the radial load takes the acceleration along the load's direction, and both turn over.
-    half_turn_symmetric = True
-
     coefficient: Array
     diameter: Array
     width: Array
@@ -95,8 +93,12 @@ class DryFriction(Effect):
         diameter = 0.2 * jnp.max(loads.radius)
         return Typical(cls(0.0015, diameter), f"a ball bearing, mu2 = 0.0015, of {1e3 * float(diameter):.3g} mm")
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads on a circle that hang on bearings."""
+    def terms(self) -> tuple[Term, ...]:
+        """Return the friction, whose radial load keeps its size if loads and carrier turn over."""
+        return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
+
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for loads that do not hang on bearings on a circle."""
         if not loads.circular:
             raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {quoted(loads.kind)}")
         if not loads.has_bearing:
@@ -105,10 +107,8 @@ class DryFriction(Effect):
                 f"is that of a bearing, and a {loads.kind} rolls without one (property has_bearing); give pendulums, or drag",
             )
 
-    def friction(
-        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
-    ) -> Friction:
-        """mu2 d/2 and N."""
+    def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
+        """Return mu2 d/2 and N."""
         assert isinstance(loads, CircularLoads)
         turn = rate[0]
         lever = dry_lever(self.coefficient, self.diameter, speed - turn, self.width)

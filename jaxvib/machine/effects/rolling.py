@@ -12,8 +12,9 @@ from jax import Array
 
 from jaxvib.errors import require_one_of
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import Effect, Friction, Typical
+from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.friction import sliding_sign
+from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
 from jaxvib.machine.loads import Loads, own_radius
 from jaxvib.units import Number, number
 
@@ -47,9 +48,6 @@ class RollingFriction(Effect):
     Source: Strautmanis et al. 2018, equations (6)-(10), with the normal force and the levers derived again.
     """
 
-    # By itself: it goes with the normal force, which takes the acceleration along the load's direction, and both turn over.
-    half_turn_symmetric = True
-
     coefficient: Array
     direction: str = eqx.field(static=True)
     width: Array
@@ -68,14 +66,16 @@ class RollingFriction(Effect):
         """Steel on steel."""
         return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads that roll and press on a track."""
+    def terms(self) -> tuple[Term, ...]:
+        """Return the friction, whose normal force keeps its size if loads and carrier turn over."""
+        return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
+
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for loads that do not roll on a track."""
         own_radius(loads, "effects.rolling_friction")
 
-    def friction(
-        self, loads: Loads, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, g: Mapping[int, Array]
-    ) -> Friction:
-        """-(k/r) J^T d and N."""
+    def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
+        """Return -(k/r) J^T d and N."""
         pressing = loads.pressing(u, rate, g)
         assert pressing is not None
         slip = (rate[0] - speed, *rate[1:])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,8 @@ from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
-from jaxvib.machine.effects.base import Effect, SlipLimit, Typical
+from jaxvib.machine.effects.base import Effect, Typical
+from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease, Term
 from jaxvib.machine.loads import Loads, own_radius
 from jaxvib.units import Number, number
 
@@ -35,16 +34,11 @@ class FreeSpin(Effect):
     **Raises** `InputError`, by the scene, for loads that nothing couples to such a spin, as on a plane track, and for a motor.
 
     >>> import jaxvib as jv
-    >>> jv.FreeSpin().frees_twist
-    True
+    >>> jv.FreeSpin().terms()
+    (DrillingSpinRelease(),)
 
     Source: derived here from Newton's and Euler's equations of the ball; asked for by no paper.
     """
-
-    smooth = True
-    half_turn_symmetric = True
-    frees_twist = True
-    needs_ideal_drive = True
 
     kind: str = eqx.field(static=True)
 
@@ -56,8 +50,12 @@ class FreeSpin(Effect):
         """It has no number."""
         return Typical(cls(), "no moment about the normal of a contact at a point")
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads that are coupled to their spin."""
+    def terms(self) -> tuple[Term, ...]:
+        """Return the freedom to spin."""
+        return (DrillingSpinRelease(),)
+
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for loads that are not coupled to their spin."""
         rest = loads.rest()
         if jax.eval_shape(loads.twisting, rest, rest, jnp.zeros(())) is None:
             problem = f"goes with balls in a torus; nothing couples {loads.kind!r} to a spin about the normal (twisting)"
@@ -91,9 +89,6 @@ class Sliding(Effect):
     Source: derived here; Coulomb's law. Asked for by no paper.
     """
 
-    half_turn_symmetric = True
-    needs_ideal_drive: ClassVar[bool] = True
-
     coefficient: Array
     width: Array
     kind: str = eqx.field(static=True)
@@ -103,21 +98,20 @@ class Sliding(Effect):
         self.width = number(width, "m/s", "effects.sliding.width", low=0.0, open_low=True)
         self.kind = "sliding"
 
-    def own_rate(self, loads: Loads, speed: Array) -> Array:
-        """kappa/(kappa - 1) mu R w^2 / width: at which a slip dies out."""
+    def fastest_rate(self, loads: Loads, speed: Array) -> Array:
+        """Return kappa/(kappa - 1) mu R w^2 / width, at which a slip dies out."""
         kappa = loads.inertia_factor()
         return kappa / (kappa - 1.0) * self.coefficient * loads.arm()[0] * speed**2 / self.width
 
-    @property
-    def slip_limit(self) -> SlipLimit:
-        """mu and the width."""
-        return SlipLimit(self.coefficient, self.width)
+    def terms(self) -> tuple[Term, ...]:
+        """Return the freedom to slide, with mu and the width."""
+        return (SlipRelease(self.coefficient, self.width),)
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
         """Oiled steel on steel."""
         return Typical(cls(0.1), "mu = 0.1, oiled steel on steel")
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Loads that roll."""
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for loads that do not roll."""
         own_radius(loads, "effects.sliding")

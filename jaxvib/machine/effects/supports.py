@@ -9,6 +9,7 @@ from jax import Array
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.effects.base import Effect, Typical
+from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.loads import Loads
 from jaxvib.units import Number, number
 
@@ -22,12 +23,12 @@ class _Support(Effect):
     platform: eqx.AbstractVar[int | None]
     position: eqx.AbstractVar[Array | None]
 
-    def check(self, machine: Machine, loads: Loads) -> None:
-        """Whether the machine has the place."""
-        self.place(machine.carrier())
+    def validate(self, machine: Machine, loads: Loads) -> None:
+        """**Raises** `InputError` for a place that the machine does not have."""
+        self.rows(machine.carrier())
 
-    def place(self, carrier: Carrier) -> Array:
-        """The row of the platform's coordinate, or the rows of the axis' two directions."""
+    def rows(self, carrier: Carrier) -> Array:
+        """Return the row of the platform's coordinate, or the rows of the two directions of the axis."""
         n = len(carrier.coordinates)
         if self.position is not None:
             if carrier.tilt is None:
@@ -64,8 +65,6 @@ class CubicSupport(_Support):
     2000000000.0
     """
 
-    smooth = True
-
     stiffness: Array
     platform: int | None = eqx.field(static=True)
     position: Array | None
@@ -92,8 +91,12 @@ class CubicSupport(_Support):
         stiffness = jnp.max(jnp.abs(carrier.bed_stiffness[:, which])) * 0.04 / (3.0 * a**2)
         return Typical(cls(stiffness, platform, position), f"1 % stiffer in the mean at a swing of {1e3 * float(a):.3g} mm")
 
-    def support_potential(self, displacement: Array) -> Array:
-        """k3 r^4 / 4."""
+    def terms(self) -> tuple[Term, ...]:
+        """Return the force of the spring."""
+        return (SupportForce(self.rows, self.energy, is_smooth=True),)
+
+    def energy(self, displacement: Array) -> Array:
+        """Return k3 r^4 / 4, J."""
         return 0.25 * self.stiffness * jnp.sum(displacement**2) ** 2
 
 
@@ -147,20 +150,24 @@ class Stop(_Support):
         distance = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
         return distance - self.gap, displacement / jnp.where(distance > 0.0, distance, 1.0)
 
-    def place(self, carrier: Carrier) -> Array:
-        """As every support's; a ring has no sides."""
-        rows = super().place(carrier)
+    def terms(self) -> tuple[Term, ...]:
+        """Return the force of spring and damper."""
+        return (SupportForce(self.rows, self.energy, self.resistance),)
+
+    def rows(self, carrier: Carrier) -> Array:
+        """Return the rows of the place. **Raises** `InputError` for a side of a ring."""
+        rows = super().rows(carrier)
         if rows.shape[0] > 1 and self.side != "both":
             raise InputError("effects.stop.side", f"is {quoted(self.side)}; around a rotor's axis it must be 'both'")
         return rows
 
-    def support_potential(self, displacement: Array) -> Array:
-        """k (x - gap)^2 / 2 beyond the gap."""
+    def energy(self, displacement: Array) -> Array:
+        """Return k (x - gap)^2 / 2 beyond the gap, J."""
         beyond, _ = self._beyond(displacement)
         return 0.5 * self.stiffness * jnp.maximum(beyond, 0.0) ** 2
 
-    def support_resistance(self, displacement: Array, velocity: Array) -> Array:
-        """c x' while it presses; a stop that would pull lets go."""
+    def resistance(self, displacement: Array, velocity: Array) -> Array:
+        """Return c x' while the stop presses, (k,) N; a stop never pulls."""
         beyond, direction = self._beyond(displacement)
         closing = self.damping * jnp.sum(direction * velocity)
         return jnp.where(beyond > 0.0, jnp.maximum(closing, -self.stiffness * beyond), 0.0) * direction

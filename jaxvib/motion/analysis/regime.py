@@ -12,6 +12,8 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
@@ -245,7 +247,7 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     carrier, loads = scene.machine.carrier(), scene.loads
     each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
-    thrown = [imbalance for imbalance in (effect.imbalance(origin) for effect in scene.effects) if imbalance is not None]
+    thrown = [term.at(origin) for term in terms_of(scene.effects, RotorImbalance)]
     own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))
     size = jnp.sum(jnp.abs(each))
     left = jnp.abs(jnp.sum(each) + own) / size

@@ -12,6 +12,8 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import Spin, State
+from jaxvib.machine.effects.base import has_term, terms_of
+from jaxvib.machine.effects.terms import DrillingSpinRelease, RotorImbalance, SlipRelease
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.programs import cached
 from jaxvib.units import traced
@@ -31,16 +33,14 @@ def natural_units(scene: Scene) -> State:
     arm = jnp.sqrt(jnp.mean(jnp.square(across)) + jnp.mean(jnp.square(up)))
     unbalance = jnp.mean(loads.mass) * arm
     unbalances = [loads.count * unbalance]
-    for effect in scene.effects:
-        own = effect.imbalance(jnp.zeros_like(unbalance))
-        if own is not None:
-            unbalances.append(jnp.sqrt(sum(x**2 for x in own.static)))
+    for term in terms_of(scene.effects, RotorImbalance):
+        unbalances.append(jnp.sqrt(sum(x**2 for x in term.at(jnp.zeros_like(unbalance)).static)))
     length = functools.reduce(jnp.maximum, unbalances) / jnp.mean(jnp.diagonal(carrier.mass))
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
     rotor = None if scene.drive.ideal else (one, speed)
-    twist = speed if any(effect.frees_twist for effect in scene.effects) else None
-    slip = (speed * arm,) if any(effect.slip_limit is not None for effect in scene.effects) else None
+    twist = speed if has_term(scene.effects, DrillingSpinRelease) else None
+    slip = (speed * arm,) if has_term(scene.effects, SlipRelease) else None
     spin = None if twist is None and slip is None else Spin(twist, slip)
     return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
 
@@ -115,7 +115,7 @@ def estimated_error(
 
     **Returns** a number, or an array of them.
     """
-    kept = share if all(effect.smooth for effect in scene.effects) else 2.0
+    kept = share if all(term.is_smooth for effect in scene.effects for term in effect.terms()) else 2.0
     return difference * kept + 2.0 * float(np.finfo(scene.drive.speed.dtype).eps) * (steps + radians)
 
 

@@ -22,6 +22,8 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import expm
 
 from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.runtime.programs import cached
@@ -95,7 +97,7 @@ def _transition(scene: Scene, stretch: Trajectory, first: Array) -> tuple[Array,
 
 def _basis(scene: Scene, state: State) -> tuple[Callable[[Array], State], Callable[[State], Array], int]:
     """Tangents of the state from numbers x, the numbers of such a tangent, and how many there are."""
-    touching = any(effect.couples_loads for effect in scene.effects)
+    touching = has_term(scene.effects, LoadInteraction)
     shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(scene.loads))
     if touching or not shared or scene.machine.structure().stations is not None:
         flat, restored = ravel_pytree(state)

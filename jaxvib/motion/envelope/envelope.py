@@ -20,6 +20,8 @@ from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import LoadPotential
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
 from jaxvib.motion.analysis.scaled_error import natural_units
@@ -354,12 +356,12 @@ def _measure(scene: Scene, window: Envelopes) -> Measured:
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
     """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
     and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
-    loads, pulling = scene.loads, [effect for effect in scene.effects if effect.has_load_potential]
-    if not pulling:
+    loads, potentials = scene.loads, terms_of(scene.effects, LoadPotential)
+    if not potentials:
         return jnp.asarray(True)
 
     def potential(u: Array) -> Array:
-        found = [each for each in (effect.load_potential(loads, (u,)) for effect in pulling) if each is not None]
+        found = [term.energy(loads, (u,)) for term in potentials]
         return sum(found[1:], found[0])
 
     angles = jnp.linspace(0.0, 2.0 * jnp.pi, 64, endpoint=False)

@@ -10,9 +10,18 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.linear import circular_loads, require_one_point, turning
+from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, turning
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.terms import (
+    ContactFriction,
+    DrillingSpinRelease,
+    GravityField,
+    LoadInteraction,
+    RotorImbalance,
+    SlipRelease,
+    SupportForce,
+)
 from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -111,6 +120,18 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     return size**2 * omega**2 / 2.0 * receptance
 
 
+CRITERION_TERMS = (
+    GravityField,
+    LoadInteraction,
+    RotorImbalance,
+    ContactFriction,
+    DrillingSpinRelease,
+    SlipRelease,
+    SupportForce,
+)
+"""Terms that the criterion allows: those without a force on each load by itself, as a potential has."""
+
+
 @validated
 def criterion(scene: Scene) -> Criterion:
     """Judges every rotor speed of a scene's machine: where its loads balance it, where they gather.
@@ -135,10 +156,7 @@ def criterion(scene: Scene) -> Criterion:
         raise InputError(
             "loads.count", "is 1; the criterion tells loads that gather from loads that spread: it needs 2 or more"
         )
-    for effect in scene.effects:
-        if effect.has_load_potential and not effect.couples_loads:
-            problem = "pulls at each load by its angle (property has_load_potential), which the criterion knows nothing of"
-            raise InputError(f"effects.{effect.kind}", f"{problem}; leave it out, or simulate")
+    require_terms(scene.effects, CRITERION_TERMS, "acts|act on each load by itself, which the criterion leaves out")
     return _judged(characteristic_speeds(scene))
 
 

@@ -16,6 +16,8 @@ from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
 from jaxvib.errors import InputError
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
@@ -169,9 +171,9 @@ def _sides(loads: CircularLoads) -> np.ndarray:
 
 def _imbalance(scene: Scene) -> complex:
     """The rotor's own, kg m, in its frame; refused where loads at one point cannot cancel it."""
-    thrown = [effect.imbalance(jnp.zeros_like(scene.drive.speed)) for effect in scene.effects]
-    static = [complex(*map(float, each.static)) for each in thrown if each is not None]
-    moment = [complex(*map(float, each.moment)) for each in thrown if each is not None]
+    thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.effects, RotorImbalance)]
+    static = [complex(*map(float, each.static)) for each in thrown]
+    moment = [complex(*map(float, each.moment)) for each in thrown]
     machine = scene.machine  # its form is known without computing its numbers
     cg_offset = None if machine.structure().cg_offset is None else machine.carrier().cg_offset
     moment += [] if cg_offset is None else [float(cg_offset) * each for each in static]

@@ -15,6 +15,8 @@ from jax import Array
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
 from jaxvib.equations.linear import AbstractLinearModel, JammedModel, jammed_model
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.numerics.roots import bracketed_root
@@ -92,7 +94,7 @@ def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tu
     torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.push) * displacement))
     free = omega + torque / model.drag
     effects = model.scene.effects
-    if not any(effect.has_friction for effect in effects):
+    if not has_term(effects, ContactFriction):
         return free, displacement
 
     def residual(n: Array) -> Array:

@@ -13,9 +13,11 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Averaged, averaged_growth, averaged_model, mean_torque
-from jaxvib.equations.linear import LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
+from jaxvib.equations.linear import JAM_TERMS, LinearModel, linear_model, peak_force, require_drag, turning, turning_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import eliminate, magnitude, small_solve, times
@@ -302,9 +304,9 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
     >>> [round(float(x), 1) for x in growth_apart(scene, jv.jam_modes(scene).omega[jnp.array([0, 1, 4])])]
     [-0.4, 19.4, 23.3]
     """
-    loads, speeds = turning_loads(scene, friction=True), np.asarray(omega)
+    loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
     known = np.isfinite(speeds)
-    if loads.own_radius is not None or any(effect.has_friction for effect in scene.effects):
+    if loads.own_radius is not None or has_term(scene.effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     starts = np.where(known, speeds, float(scene.drive.speed))
     found = _growths(scene, jnp.asarray(starts))

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.equations.linear import linear_model
-from jaxvib.machine.effects.base import total_gravity
+from jaxvib.machine.effects.base import has_term, total_gravity
+from jaxvib.machine.effects.terms import ContactFriction, LoadInteraction, SupportForce
 from jaxvib.machine.scene import Scene
 from jaxvib.study.audit.questions import Values, mean_torque
 
@@ -109,7 +110,7 @@ def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
 
 
 def _distance(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
-    if not np.isfinite(values.closest) or any(effect.couples_loads for effect in scene.effects):
+    if not np.isfinite(values.closest) or has_term(scene.effects, LoadInteraction):
         return None
     says = "diameter over the least distance of two loads: above 1 they pass through each other, and load_contact is called for"
     return _row("contact: 2 r / distance", 1.0 / max(values.closest, 1e-9), 1.0, says)
@@ -117,7 +118,7 @@ def _distance(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
 
 def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
     drag = mean_torque(scene, values.omega)
-    if any(effect.has_friction for effect in scene.effects) or not drag > 0.0:
+    if has_term(scene.effects, ContactFriction) or not drag > 0.0:
         return None
     arm, n = _arm(scene), scene.loads.count
     pressed = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (n,)))) * arm * values.omega**2
@@ -146,7 +147,7 @@ def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | No
 
 def _lift(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
     carrier = scene.machine.carrier()
-    if carrier.axes != (1,) or any(effect.place(carrier) is not None for effect in scene.effects):
+    if carrier.axes != (1,) or has_term(scene.effects, SupportForce):
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
     weight = _G * (float(jnp.trace(carrier.mass)) + loads)

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.collected import require_collected
+from jaxvib.equations.collected import COLLECTED_TERMS, require_collected
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -162,7 +162,7 @@ class RunQuestion(NamedTuple):
 
 def admitted(scene: Scene) -> Scene:
     """The scene without the effects that theories of jams leave out, an imbalance among them: it shakes at another speed."""
-    kept = tuple(e for e in scene.effects if (e.averages_out or e.has_friction) and not e.has_imbalance)
+    kept = tuple(e for e in scene.effects if all(isinstance(term, COLLECTED_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.effects) else Scene(scene.machine, scene.loads, scene.drive, kept)
 
 

@@ -16,6 +16,8 @@ from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import SlipRelease
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
@@ -208,8 +210,8 @@ def capture(
         raise InputError("resolution", f"is {quoted(resolution)}; it must be between 0 and 1, such as 1e-3")
     if turning not in get_args(Turning):
         raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    if turning == "still" and not any(effect.slip_limit is not None for effect in scene.effects):
-        problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (property slip_limit)"
+    if turning == "still" and not has_term(scene.effects, SlipRelease):
+        problem = "is 'still', but the scene's balls roll from the start; add the effect Sliding (term SlipRelease)"
         raise InputError("turning", problem)
     tried = np.linspace(-1.0, 0.0, _SCAN + 1)[:-1] if speeds is None else np.asarray(speeds, dtype=float)
     allowed = tried.ndim == 1 and tried.size > 0 and np.all(np.isfinite(tried)) and np.all(np.diff(tried) > 0.0)

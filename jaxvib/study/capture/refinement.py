@@ -32,7 +32,7 @@ _STEPS_PER_RADIAN = 1.0
 """Steps per radian of the fastest oscillation, balls up and down their tube: errors far below those of chance."""
 
 _STEPS_PER_ADDED_RADIAN = 2.0
-"""Steps per radian of contacts between balls and of slips (`Effect.own_rate`): six for a collision."""
+"""Steps per radian of contacts between balls and of slips (`Effect.fastest_rate`): six for a collision."""
 
 _DECAY_PER_STEP = 3.0
 """Decay rate times the step. The method of order 8 is stable up to 5.2; normal forces rise above the one on the equator."""

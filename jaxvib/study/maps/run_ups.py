@@ -14,6 +14,8 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.checked import checked
+from jaxvib.machine.effects.base import has_term
+from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
@@ -168,7 +170,7 @@ def run_ups(
             raise InputError("angles", f"has shape {sets.shape}; (starts, {n}) finite numbers are needed")
     elif starts is not None:
         sets = random_numbers(seed).uniform(-np.pi, np.pi, (count(starts, "starts"), n))
-        if any(effect.couples_loads for effect in scene.effects):
+        if has_term(scene.effects, LoadInteraction):
             sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:
         sets = np.asarray(initial_state(scene, apart=apart).azimuth)[None]

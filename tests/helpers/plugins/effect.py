@@ -4,13 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.effects.base import Effect, Friction
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.effects.terms import ContactFriction, Friction
 
 
 class SealFriction(Effect):
     """A torque `torque` tanh(slip / `width`), N m, of the rotor on each load, slip = the rotor's speed less the load's."""
-
-    half_turn_symmetric = True
 
     torque: Array
     width: Array
@@ -18,6 +17,9 @@ class SealFriction(Effect):
 
     def __init__(self, torque, width):
         self.torque, self.width, self.kind = jnp.asarray(torque), jnp.asarray(width), "seal_friction"
+
+    def terms(self):
+        return (ContactFriction(self.friction, is_half_turn_symmetric=True),)
 
     def friction(self, loads, u, rate, speed, g):
         slip = speed - rate[0]

@@ -14,6 +14,7 @@ from scenes import published
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.machine.effects.terms import LoadResistance
 from jaxvib.motion.envelope.envelope import _measure, _Tolerance
 from jaxvib.steady.jams.folds import jam_rotor_speed
 
@@ -239,8 +240,8 @@ MOTOR = jv.DCMotor(60.0, stall_torque=1.0, inertia=0.01)
 class Wind(jv.Effect):
     kind: ClassVar[str] = "wind"
 
-    def load_potential(self, loads, u):
-        return u[0]
+    def terms(self):
+        return (LoadResistance(lambda loads, u, rate: (-jnp.ones_like(u[0]),)),)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +260,10 @@ class Wind(jv.Effect):
         (dict(max_steps=0), "max_steps is 0"),
         (dict(scene=eqx.tree_at(lambda s: s.drive, small(), MOTOR)), "drive.kind is .* this holds at a given rotor speed"),
         (dict(scene=small(effects=(Wind(),))), "effects.wind is not part of this theory"),
-        (dict(scene=small(effects=(jv.StaticImbalance(1e-3),))), "effects.static_imbalance is not averaged"),
+        (
+            dict(scene=small(effects=(jv.StaticImbalance(1e-3),))),
+            r"effects.static_imbalance is not part of this theory \(term RotorImbalance\)",
+        ),
     ],
 )
 def test_what_cannot_be_averaged_is_refused(change, says):

@@ -64,7 +64,7 @@ def test_captures_of_balls_that_are_thrown_without_turning():
     assert np.all(rolled.finite) and np.all(slid.finite) and not np.any(rolled.captured[0])
     start = jv.with_spin(scene, thrown_state(scene, -0.7), "still")
     np.testing.assert_allclose(start.spin.slip[0], -0.7 * 140.0 * 0.2)
-    for scene_, how, says in ((base, "still", "property slip_limit"), (scene, "asleep", "it must be 'rolling' or 'still'")):
+    for scene_, how, says in ((base, "still", "term SlipRelease"), (scene, "asleep", "it must be 'rolling' or 'still'")):
         with pytest.raises(jv.InputError, match=says):
             jv.capture(scene_, [-0.5], turns=5, turning=how)
 

@@ -1,0 +1,249 @@
+"""Terms that effects add to the equations of a scene. Each theory states the types of terms that it includes.
+
+A term is made while a question is asked and holds functions (methods of its effect) or numbers. Energies are in J, forces in
+N; the generalised force of a load's angle is a torque in N m. A load's coordinates `u` and their rates are tuples of (count,)
+arrays. Terms are final: a new effect combines them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, TypeAlias, final
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.loads import Loads, Pressing
+
+__all__ = [
+    "ContactFriction",
+    "Coordinates",
+    "DrillingSpinRelease",
+    "Friction",
+    "GravityField",
+    "Imbalance",
+    "LoadInteraction",
+    "LoadPotential",
+    "LoadResistance",
+    "RotorImbalance",
+    "SlipRelease",
+    "SupportForce",
+    "Term",
+]
+
+Coordinates: TypeAlias = tuple[Array, ...]
+"""An array (count,) for each coordinate of a load."""
+
+Energy: TypeAlias = Callable[[Loads, Coordinates], Array]
+Resistance: TypeAlias = Callable[[Loads, Coordinates, Coordinates], Coordinates]
+
+
+@final
+@dataclass(frozen=True)
+class GravityField:
+    """Uniform gravity, which changes the normal forces of loads. Its force on the loads themselves is a `LoadPotential`.
+
+    **Attributes**: `axis` of a load's position that it pulls against (0 across, 1 up, 2 along the rotor's axis); `g` m/s^2.
+    """
+
+    axis: int
+    g: Array
+    is_smooth: ClassVar[bool] = True
+
+
+@final
+@dataclass(frozen=True)
+class LoadPotential:
+    """Potential energy of each load in its own position.
+
+    The energy is a single-valued function of the position. Its mean torque over a turn is therefore 0.
+
+    **Attributes**: `energy` of loads at `u`, (count,) J; `is_smooth`: True if the force has all derivatives.
+    """
+
+    energy: Energy
+    is_smooth: bool = False
+
+    def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
+        """Return the generalised forces on each load."""
+        return [_potential_force(self.energy, loads, u)]
+
+
+@final
+@dataclass(frozen=True)
+class LoadResistance:
+    """Force on each load that takes energy out of its motion, such as the drag of the air.
+
+    **Attributes**: `resistance` of loads at `u` with rates, the generalised force on each coordinate; `is_smooth`.
+    """
+
+    resistance: Resistance
+    is_smooth: bool = False
+
+    def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
+        """Return the generalised forces on each load."""
+        return [self.resistance(loads, u, rate)]
+
+
+@final
+@dataclass(frozen=True)
+class LoadInteraction:
+    """Forces between loads. They cancel in the torque on loads that lie together, and make the order of the loads count.
+
+    **Attributes**: `energy` of the pairs, J, (count,); `resistance`, the generalised forces that take energy out of the
+    relative motion, or None; `validate_start`, which raises `InputError` if loads cannot start at `u` (..., count), or None.
+    """
+
+    energy: Energy
+    resistance: Resistance | None = None
+    validate_start: Callable[[Loads, Coordinates], None] | None = None
+    is_smooth: ClassVar[bool] = False
+
+    def forces(self, loads: Loads, u: Coordinates, rate: Coordinates) -> list[Coordinates]:
+        """Return the generalised forces on each load, those of the potential and those of the resistance."""
+        force = _potential_force(self.energy, loads, u)
+        return [force] if self.resistance is None else [force, self.resistance(loads, u, rate)]
+
+
+def _potential_force(energy: Energy, loads: Loads, u: Coordinates) -> Coordinates:
+    value, back = jax.vjp(lambda *v: energy(loads, v), *u)
+    return tuple(-slope for slope in back(jnp.ones_like(value)))
+
+
+class Imbalance(NamedTuple):
+    """Imbalance of a rotor at one angle: `static` (across, up) kg m, `moment` about the tilts kg m^2."""
+
+    static: tuple[Array, Array]
+    moment: tuple[Array, Array]
+
+
+@final
+@dataclass(frozen=True)
+class RotorImbalance:
+    """Imbalance of the rotor: a vector of length `amount` that turns with the rotor, `phase` ahead of its angle.
+
+    **Attributes**: `amount`, kg m of a static imbalance, kg m^2 of a moment imbalance (`about_tilts`); `phase` rad.
+    """
+
+    amount: Array
+    phase: Array
+    about_tilts: bool = False
+    is_smooth: ClassVar[bool] = True
+
+    def at(self, angle: Array) -> Imbalance:
+        """Return the imbalance at the rotor's `angle`, rad."""
+        zero = jnp.zeros_like(self.amount)
+        turned = angle + self.phase
+        vector = (self.amount * jnp.cos(turned), self.amount * jnp.sin(turned))
+        return Imbalance((zero, zero), vector) if self.about_tilts else Imbalance(vector, (zero, zero))
+
+
+class Friction(NamedTuple):
+    """Friction torque `lever` |N| on each load, N = reaction + normal . a, a the acceleration of the point that carries it.
+
+    `lever` (count,) m, signed as the torque on the load; `reaction` (count,) N; `normal` two (count,) arrays (across, up) in
+    kg, or None if the reaction does not depend on accelerations; `others` the levers of a load's further coordinates, if
+    friction acts on them; `one_sided`: True if there is no friction while N is negative.
+    """
+
+    lever: Array
+    reaction: Array
+    normal: tuple[Array, Array] | None
+    others: tuple[Array, ...] = ()
+    one_sided: bool = False
+
+    def torque(self, a: Mapping[int, Array]) -> Array:
+        """Return the torque on each load if the points that carry them have the acceleration `a`, by axis, m/s^2."""
+        return self.forces(a)[0]
+
+    def forces(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
+        """Return the torque and the generalised forces on a load's further coordinates that friction acts on."""
+        reaction = self._reaction(a)
+        size = jnp.maximum(reaction, 0.0) if self.one_sided else jnp.abs(reaction)
+        return tuple(lever * size for lever in (self.lever, *self.others))
+
+    def signed(self, a: Mapping[int, Array]) -> Friction:
+        """Return the friction linear in the accelerations, its reaction assumed to have the sign that it has at `a`."""
+        sign = jnp.where(self._reaction(a) < 0.0, 0.0 if self.one_sided else -1.0, 1.0)
+        return self._replace(lever=self.lever * sign, others=tuple(lever * sign for lever in self.others))
+
+    def linear(self, a: Mapping[int, Array]) -> tuple[Array, ...]:
+        """Return the `forces` of a friction that is `signed` already."""
+        reaction = self._reaction(a)
+        return tuple(lever * reaction for lever in (self.lever, *self.others))
+
+    def _reaction(self, a: Mapping[int, Array]) -> Array:
+        if self.normal is None:
+            return self.reaction
+        return Pressing(self.reaction, self.normal).at(a)
+
+
+@final
+@dataclass(frozen=True)
+class ContactFriction:
+    """Friction of each load against the rotor.
+
+    **Attributes**: `friction` of loads at `u` with rates, the rotor at a speed, under gravity by axis; see `Friction`.
+    `is_half_turn_symmetric`: True if the equations with it stay the same under phi + pi, -q.
+    """
+
+    friction: Callable[[Loads, Coordinates, Coordinates, Array, Mapping[int, Array]], Friction]
+    is_half_turn_symmetric: bool = False
+    is_smooth: ClassVar[bool] = False
+
+
+@final
+@dataclass(frozen=True)
+class DrillingSpinRelease:
+    """Freedom of rolling loads to spin about the normal of their contact (`Loads.twisting`, `Spin.twist`)."""
+
+    is_smooth: ClassVar[bool] = True
+
+
+@final
+@dataclass(frozen=True)
+class SlipRelease:
+    """Freedom of rolling loads to slide (`Spin.slip`).
+
+    The contact holds a force along the track up to `coefficient` times N. A slip below `width`, m/s, dies out.
+    """
+
+    coefficient: Array
+    width: Array
+    is_smooth: ClassVar[bool] = False
+
+
+@final
+@dataclass(frozen=True)
+class SupportForce:
+    """Nonlinear support of the carrier.
+
+    **Attributes**: `rows` of a carrier, (k, nd), which give the displacements x of the supported point; `energy` of x, J;
+    `resistance` of x and its rate, the dissipative force on the foundation, (k,) N, or None; `is_smooth`.
+    """
+
+    rows: Callable[[Carrier], Array]
+    energy: Callable[[Array], Array]
+    resistance: Callable[[Array, Array], Array] | None = None
+    is_smooth: bool = False
+
+    def force(self, displacement: Array, velocity: Array) -> Array:
+        """Return the force on the foundation, (k,) N. The force on the carrier is opposite."""
+        force = jax.grad(self.energy)(displacement)
+        return force if self.resistance is None else force + self.resistance(displacement, velocity)
+
+
+Term: TypeAlias = (
+    GravityField
+    | LoadPotential
+    | LoadResistance
+    | LoadInteraction
+    | RotorImbalance
+    | ContactFriction
+    | DrillingSpinRelease
+    | SlipRelease
+    | SupportForce
+)
