@@ -1,0 +1,57 @@
+"""Documents as tables of a page, cell by cell."""
+
+import re
+
+import jaxvib as jv
+from jaxvib.report.tables import results, worth
+
+UNITS = {"force": "N", "rows": "m"}
+
+
+def cells(text, tag="td"):
+    return [re.sub("<.*?>", "", cell) for cell in re.findall(rf"<{tag}[^>]*>(.*?)</{tag}>", text)]
+
+
+def test_only_columns_of_numbers_stand_at_the_right():
+    rows = [{"force": 1.0, "kind": "x", "fits": True}, {"force": None, "kind": 2.0, "fits": False}]
+    text = results({"rows": rows}, UNITS)
+    assert cells(text, "th") == ["force, N", "kind", "fits"] and cells(text) == ["1", "x", "yes", "none", "2", "no"]
+    assert re.findall(r"<t[hd]( class='n')?>", text) == [" class='n'", "", ""] * 3
+
+
+def test_long_texts_stand_below_their_row():
+    long = "a sentence of more than forty characters, which no column has room for"
+    text = results({"rows": [{"name": "first", "message": long}, {"name": "second", "message": ""}]}, {})
+    assert cells(text, "th") == ["name"] and cells(text) == ["first", f"message: {long}", "second"]
+
+
+def test_worth_is_said_apart_from_results():
+    document = {"status": "done", "force": 2.5, "scene": "hidden", "toml": "hidden", "inner": {"status": "inside"}}
+    assert cells(worth(document, UNITS)) == ["done", ""]
+    text = results(document, UNITS)
+    assert cells(text) == ["2.5", "N", "inside", ""] and cells(text, "h3") == ["inner"] and "hidden" not in text
+
+
+def test_long_lists_are_told_by_their_range():
+    document = {"times": [0.5 * k for k in range(40)], "names": ["x"] * 40, "grid": [[1.0, 2.0], [3.0, None]]}
+    text = results(document, {})
+    assert cells(text, "p") == [
+        "40 numbers from 0 to 19.5; --json and --out have them",
+        "40 values; --json and --out have them",
+    ]
+    assert cells(text) == ["1", "2", "3", "none"]
+    short = results({"times": [1.0, 2.0], "none": []}, {})
+    assert cells(short) == ["1, 2", "", "none", ""]
+
+
+def test_a_report_shows_what_the_terminal_would(tmp_path):
+    scene = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+        jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25),
+        jv.ConstantSpeed("60 rad/s"),
+    )
+    modes = jv.jam_modes(scene)
+    text = jv.html_report(modes, tmp_path / "r.html", title="Größe µ", figures=[]).read_text(encoding="utf-8")
+    assert cells(text, "h1") == ["Größe µ"] and 'class="command"' not in text
+    shown = re.search(r"<pre>(.*?)</pre>", text, re.DOTALL)
+    assert shown and shown[1].strip().splitlines()[0].split() == modes.summary().strip().splitlines()[0].split()
