@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import closest
 from jaxvib.motion.analysis.regime import REGIMES
-from jaxvib.motion.lanes import BatchRun
+from jaxvib.motion.batch import BatchRun
 from optimize.wishes.quantity import Quantity
 
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
