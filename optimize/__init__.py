@@ -9,11 +9,9 @@ watch(sys.modules[__name__])  # before all other imports, which it then watches 
 
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto
-from optimize.space import DesignSpace, Held, hold
-from optimize.synthesize import Outcome, Synthesis, synthesize
-from optimize.wishes.aims import maximize, minimize, negative
-from optimize.wishes.cases import expected, quantile, under, worst
-from optimize.wishes.jams import (
+from optimize.quantities.aims import maximize, minimize, negative
+from optimize.quantities.cases import expected, quantile, under, worst
+from optimize.quantities.jams import (
     amplitude,
     fold_margin,
     force_per_amplitude,
@@ -23,9 +21,11 @@ from optimize.wishes.jams import (
     phase,
     power,
 )
-from optimize.wishes.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
-from optimize.wishes.motion import peak_force, settling_time
-from optimize.wishes.quantity import Demand, Quantity, largest, least
+from optimize.quantities.machine import product, spring_cost, static_deflection, support_frequency_squared, total, total_mass
+from optimize.quantities.motion import peak_force, settling_time
+from optimize.quantities.quantity import Demand, Quantity, largest, least
+from optimize.space import DesignSpace, Held, hold
+from optimize.synthesize import Outcome, Synthesis, synthesize
 
 __all__ = [
     "Demand",

@@ -11,13 +11,13 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import Tables, called, closest, load_scene, out_of_place, read_toml
 from jaxvib.units import count, number
+from optimize.quantities import jams, machine, motion
+from optimize.quantities.cases import expected, worst
+from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.search.find import require_searcher
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
-from optimize.wishes import jams, machine, motion
-from optimize.wishes.cases import expected, worst
-from optimize.wishes.quantity import Demand, Quantity
 
 __all__ = ["TEMPLATE", "Design", "load_design", "quantity_from_table"]
 

@@ -17,11 +17,11 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.units import count
+from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
 from optimize.space.numbers import shown_unit
 from optimize.synthesize import synthesize
-from optimize.wishes.quantity import Demand, Quantity
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,12 +9,12 @@ from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count
 from optimize.files import Design
+from optimize.quantities.jams import amplitude, fold_margin, force_per_amplitude, jam_frequency
+from optimize.quantities.machine import support_frequency_squared, total_mass
+from optimize.quantities.quantity import Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace, hold
 from optimize.synthesize import synthesize
-from optimize.wishes.jams import amplitude, fold_margin, force_per_amplitude, jam_frequency
-from optimize.wishes.machine import support_frequency_squared, total_mass
-from optimize.wishes.quantity import Quantity
 
 __all__ = ["anti_resonance", "antiphase", "lightest_exciter", "retune", "widest_range"]
 

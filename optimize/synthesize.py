@@ -24,15 +24,15 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import count
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
+from optimize.quantities.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 from optimize.result import Outcome, Row, Synthesis, SynthesisStatus, amplitude_names
 from optimize.search.find import Found, Options, Searcher, choose, require_searcher
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem, made, problem_of, reported
-from optimize.search.sense import influences_of, limits_of, machines_of, neighbours
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 from optimize.space import DesignSpace
-from optimize.wishes.answers import Answers
-from optimize.wishes.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency
-from optimize.wishes.quantity import Demand, Pair, Quantity, Tier, require_quantity, walk
 
 __all__ = ["Outcome", "Synthesis", "synthesize"]
 
@@ -347,22 +347,22 @@ def _other_tiers(
 ) -> tuple[list[float], list[float]]:
     """The same quantities of the exact motion, and of the run that checks the design; NaN where they have no such tier."""
 
-    def value(quantity: Quantity, answers: Answers, tier: Tier) -> float:
+    def value(quantity: Quantity, evaluation: Evaluation, tier: Tier) -> float:
         other = quantity.at_tier(tier)
         if other == quantity and tier not in {getattr(q, "tier", None) for q in walk(quantity)}:
             return math.nan
         if tier == "time" and any(getattr(q, "tier", tier) != tier or hasattr(q, "case") for q in walk(other)):
             return math.nan
         try:
-            return float(other.read(answers))
+            return float(other.read(evaluation))
         except (InputError, ComputationError):  # a theory that does not hold this scene
             return math.nan
 
-    answers = Answers(scene)
-    exact = [value(q, answers, "exact") if verify else math.nan for q in quantities]
+    evaluation = Evaluation(scene)
+    exact = [value(q, evaluation, "exact") if verify else math.nan for q in quantities]
     if run is None or mode is None:
         return exact, [math.nan] * len(exact)
-    measured = Answers(scene)
+    measured = Evaluation(scene)
     measured.keep_run(mode, run)
     return exact, [value(q, measured, "time") for q in quantities]
 
@@ -374,13 +374,13 @@ def _outcome(space: DesignSpace, scene: Scene, values: np.ndarray) -> Outcome:
 
 
 def _by_run(space: DesignSpace, run: Run, mode: int, of: Pair) -> Outcome:
-    answers = Answers(run.scene)
-    answers.keep_run(mode, run)
+    evaluation = Evaluation(run.scene)
+    evaluation.keep_run(mode, run)
     return Outcome(
         parameters=space.parameters(run.scene),
         exists=True,
         omega=float(run.omega),
         amplitude=tuple(float(a) for a in run.amplitude),
         foundation_force=float(run.foundation_force),
-        force_per_amplitude=float(force_per_amplitude(mode=mode, of=of, tier="time").read(answers)),
+        force_per_amplitude=float(force_per_amplitude(mode=mode, of=of, tier="time").read(evaluation)),
     )

@@ -25,7 +25,7 @@ FLOORS = (
 )
 """Floors from the top down; a module may import from its own package and from floors below its own."""
 
-MOST_FILES, MOST_LINES = 12, 400
+MOST_FILES, MOST_LINES = 12, 600
 
 
 def sources():

@@ -19,7 +19,7 @@ from jaxvib.runtime.compat import enumeration_names
 from jaxvib.sweeps.axes import Grid, Spot
 from jaxvib.sweeps.identity import UnknownIdentity, digest, identity
 from jaxvib.sweeps.measures import Measure
-from optimize.wishes.quantity import Tier
+from optimize.quantities.quantity import Tier
 
 __all__ = ["CASE_STATUSES", "UNKNOWN", "CaseStatus", "Study", "SweepStatus", "identify"]
 

@@ -14,7 +14,7 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import closest
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
-from optimize.wishes.quantity import Quantity
+from optimize.quantities.quantity import Quantity
 
 __all__ = ["RUN_MEASURES", "Measure", "RunMeasure", "measure_of"]
 

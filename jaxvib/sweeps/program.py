@@ -19,7 +19,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
 from jaxvib.sweeps.definition import CASE_STATUSES, Study
 from jaxvib.sweeps.measures import Measure, RunMeasure
-from optimize.wishes.answers import Answers
+from optimize.quantities.evaluation import Evaluation
 
 __all__ = ["Chunk", "compute", "planned", "shapes"]
 
@@ -62,7 +62,7 @@ def _each(
 
     def one(value: Array) -> tuple[tuple[Array, ...], Array]:
         this = put(scene, spots, value)
-        answers, run = Answers(this), None
+        evaluation, run = Evaluation(this), None
         if plan is not None:
             apart = APART if start == "jam" else None  # at one angle, no run would show that a jam is unstable
             state = put_start(initial_state(this, start, mode=mode, apart=apart, throw=False), spots, value)
@@ -70,7 +70,7 @@ def _each(
 
         def read(measure: Measure) -> Array:
             if not isinstance(measure, RunMeasure):
-                return measure.read(answers)
+                return measure.read(evaluation)
             assert run is not None
             return measure.function(run)
 

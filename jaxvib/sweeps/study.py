@@ -21,7 +21,7 @@ from jaxvib.sweeps.measures import Measure, RunMeasure, measure_of
 from jaxvib.sweeps.program import planned, shapes
 from jaxvib.units import Number, count, number
 from optimize.files import quantity_from_table
-from optimize.wishes.quantity import TIERS, Quantity, Tier
+from optimize.quantities.quantity import TIERS, Quantity, Tier
 
 __all__ = ["TEMPLATE", "Measures", "load_study", "study"]
 

@@ -26,7 +26,7 @@ from jaxvib.sweeps.execute import Report, in_this_process, timed
 from jaxvib.sweeps.store import ChunkState, Store
 from jaxvib.sweeps.study import Measures, study
 from jaxvib.units import Number, count
-from optimize.wishes.quantity import Tier
+from optimize.quantities.quantity import Tier
 
 if TYPE_CHECKING:
     import xarray

@@ -11,13 +11,13 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from jaxvib.errors import InputError, quoted
+from optimize.quantities.cases import Robust
+from optimize.quantities.quantity import walk
 from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
 from optimize.search.problem import Point, Problem, evaluate, looked_up
 from optimize.space.space import DesignSpace
-from optimize.wishes.cases import Robust
-from optimize.wishes.quantity import walk
 
 __all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
 

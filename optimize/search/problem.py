@@ -22,9 +22,9 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
+from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, guesses
+from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
 from optimize.space.space import DesignSpace, Held
-from optimize.wishes.answers import Answers, Key, Recorder, guesses
-from optimize.wishes.quantity import Asking, Demand, Quantity, walk
 
 __all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
 
@@ -64,17 +64,17 @@ class Problem(eqx.Module):
     def values(self, z: Array, near: Sequence[Array], pieces: bool = False) -> tuple[Array, tuple[Array, ...]]:
         """The objective, by how much what is held is off, and the demands' excess, (1 + me + mi,), and the `pieces` of the
         objective behind them; and the speeds followed."""
-        answers = Answers(self.space.at(z), dict(zip(self.keys, near, strict=True)))
-        values = self.read(answers)
+        evaluation = Evaluation(self.space.at(z), dict(zip(self.keys, near, strict=True)))
+        values = self.read(evaluation)
         if pieces:
-            values = jnp.concatenate([values, self.objective.pieces(answers)])
-        return values, tuple(answers.found[key] for key in self.keys)
+            values = jnp.concatenate([values, self.objective.pieces(evaluation)])
+        return values, tuple(evaluation.found[key] for key in self.keys)
 
-    def read(self, answers: Answers) -> Array:
+    def read(self, evaluation: Evaluation) -> Array:
         """The same numbers from what is known of a scene."""
-        objective = jnp.reshape(self.objective.read(answers), (1,))
-        held = self.space.residuals(answers)
-        excess = [demand.excess(answers, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
+        objective = jnp.reshape(self.objective.read(evaluation), (1,))
+        held = self.space.residuals(evaluation)
+        excess = [demand.excess(evaluation, limit) for demand, limit in zip(self.demands, self.constants, strict=True)]
         return jnp.concatenate([objective, held, jnp.stack(excess) / self.scales if excess else jnp.zeros((0,))])
 
     def easy(self) -> Problem | None:
@@ -109,7 +109,7 @@ def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]
 
 def _hard(quantity: Quantity) -> bool:
     """True if part of the quantity is not computed to leading order."""
-    return any(isinstance(q, Asking) and q.tier != "leading" for q in walk(quantity))
+    return any(isinstance(q, BuiltinQuantity) and q.tier != "leading" for q in walk(quantity))
 
 
 class Point(NamedTuple):
@@ -273,11 +273,11 @@ class _Shapes(NamedTuple):
 def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
     """Load speeds that these quantities of a scene follow, and the number of smooth pieces of which the first one is the
     largest."""
-    recorder = Recorder()
+    recorder = TargetRecorder()
 
     def ask(scene: Scene) -> tuple[Array, list[Array]]:
-        answers = Answers(scene, recorder)
-        return quantities[0].pieces(answers), [q.read(answers) for q in quantities]
+        evaluation = Evaluation(scene, recorder)
+        return quantities[0].pieces(evaluation), [q.read(evaluation) for q in quantities]
 
     scene = jax.tree.unflatten(shapes.tree, [jax.ShapeDtypeStruct(*leaf) for leaf in shapes.leaves])
     pieces, _ = jax.eval_shape(ask, scene)
@@ -292,8 +292,8 @@ def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]
 @cached
 def _reported(quantities: tuple[Quantity, ...], keys: tuple[Key, ...], scenes: Scene, near: tuple[Array, ...]) -> Array:
     def one(scene: Scene, known: tuple[Array, ...]) -> Array:
-        answers = Answers(scene, dict(zip(keys, known, strict=True)))
-        return jnp.stack([q.read(answers) for q in quantities])
+        evaluation = Evaluation(scene, dict(zip(keys, known, strict=True)))
+        return jnp.stack([q.read(evaluation) for q in quantities])
 
     return jax.vmap(one)(scenes, near)
 

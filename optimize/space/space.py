@@ -15,9 +15,9 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import Quantity, require_quantity
 from optimize.space.numbers import Place, changed, names_of, places_of, present_places
-from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Quantity, require_quantity
 
 __all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
 
@@ -217,9 +217,9 @@ class DesignSpace(eqx.Module):
         """The same space between other bounds (d,), SI; equal ones fix a number."""
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
 
-    def residuals(self, answers: Answers) -> Array:
+    def residuals(self, evaluation: Evaluation) -> Array:
         """Deviation of each held quantity, relative to the value at which it is held (m,)."""
-        off = [held.quantity.read(answers) / held.value - 1.0 for held in self.held if held.value is not None]
+        off = [held.quantity.read(evaluation) / held.value - 1.0 for held in self.held if held.value is not None]
         return jnp.stack(off) if off else jnp.zeros((0,))
 
 

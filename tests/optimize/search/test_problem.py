@@ -10,8 +10,8 @@ from two_springs import FREE, NEAREST, SCENE, plain, point_of
 import jaxvib as jv
 from jaxvib.steady.jams.jam import jam_modes
 from optimize import DesignSpace, Quantity, amplitude, expected, foundation_force, hold, jam_frequency, largest, total
+from optimize.quantities.quantity import BuiltinQuantity
 from optimize.search.problem import Point, derive, evaluate, looked_up, made, problem_of, report_keys, reported
-from optimize.wishes.quantity import Asking
 
 SUM, FIRST = plain("sum", lambda x, y: x + y), plain("first", lambda x, y: x)
 
@@ -126,7 +126,9 @@ def test_points_are_put_together_by_design():
 
 
 def asking(name, tier, tiers):
-    return Asking(name, "", lambda answers, tier: jnp.sum(answers.scene.machine.stiffness) / 1e4, tier=tier, tiers=tiers)
+    return BuiltinQuantity(
+        name, "", lambda evaluation, tier: jnp.sum(evaluation.scene.machine.stiffness) / 1e4, tier=tier, tiers=tiers
+    )
 
 
 EXACT = asking("exact", "exact", ("leading", "exact"))

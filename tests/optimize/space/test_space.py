@@ -62,9 +62,9 @@ def test_ties_follow_in_order():
 
 def test_what_is_held_is_off_by_its_share():
     space = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"), "100 N/mm")])
-    from optimize.wishes.answers import Answers
+    from optimize.quantities.evaluation import Evaluation
 
-    np.testing.assert_allclose(space.residuals(Answers(space.at(jnp.array([0.5, 1.0])))), [0.4], rtol=1e-12)
+    np.testing.assert_allclose(space.residuals(Evaluation(space.at(jnp.array([0.5, 1.0])))), [0.4], rtol=1e-12)
     kept = DesignSpace(SCENE, {"machine.stiffness": (1e4, 9e4)}, [hold(total("machine.stiffness"))])
     assert float(kept.held[0].value) == 8e4
 

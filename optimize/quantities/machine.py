@@ -17,9 +17,9 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 from jaxvib.units import FIELD_UNITS, Number, count
-from optimize.wishes.answers import Answers
-from optimize.wishes.given import number_in
-from optimize.wishes.quantity import Asking, Quantity, Tier
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.user_inputs import number_in
 
 __all__ = ["product", "spring_cost", "static_deflection", "support_frequency_squared", "total", "total_mass"]
 
@@ -27,7 +27,7 @@ _GRAVITY = 9.80665
 
 
 def _asking(name: str, unit: str, function: Callable[..., Array], text: str, *settings: object) -> Quantity:
-    return Asking(name, unit, function, tiers=("leading",), text=text, settings=settings)
+    return BuiltinQuantity(name, unit, function, tiers=("leading",), text=text, settings=settings)
 
 
 def _platforms(scene: Scene, what: str) -> Platforms:
@@ -53,9 +53,9 @@ def support_frequency_squared() -> Quantity:
     return _asking("support_frequency_squared", "rad^2/s^2", _budget, "stiffness budget of the supports, sum of k/M")
 
 
-def _budget(answers: Answers, tier: Tier) -> Array:
-    machine = _platforms(answers.scene, "the budget")
-    return jnp.sum(machine.stiffness / jnp.diagonal(answers.model.mass))
+def _budget(evaluation: Evaluation, tier: Tier) -> Array:
+    machine = _platforms(evaluation.scene, "the budget")
+    return jnp.sum(machine.stiffness / jnp.diagonal(evaluation.model.mass))
 
 
 def _entries(field: str, what: str) -> tuple[str, str, str, str]:
@@ -88,8 +88,8 @@ def total(field: str) -> Quantity:
     return _asking(called, FIELD_UNITS[name], _total, f"sum of {words}", part, name)
 
 
-def _total(answers: Answers, tier: Tier, part: str, name: str) -> Array:
-    return jnp.sum(_leaf(answers.scene, part, name))
+def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
+    return jnp.sum(_leaf(evaluation.scene, part, name))
 
 
 @validated
@@ -107,8 +107,8 @@ def product(field: str) -> Quantity:
     return _asking(called, "", _product, f"product of {words}", part, name)
 
 
-def _product(answers: Answers, tier: Tier, part: str, name: str) -> Array:
-    return jnp.prod(_leaf(answers.scene, part, name))
+def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
+    return jnp.prod(_leaf(evaluation.scene, part, name))
 
 
 _WORDS = {
@@ -136,8 +136,8 @@ def total_mass() -> Quantity:
     return _asking("total_mass", "kg", _mass, "mass of platforms and loads")
 
 
-def _mass(answers: Answers, tier: Tier) -> Array:
-    scene = answers.scene
+def _mass(evaluation: Evaluation, tier: Tier) -> Array:
+    scene = evaluation.scene
     machine = _platforms(scene, "the mass")
     return jnp.sum(machine.mass) + jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,)))
 
@@ -164,9 +164,9 @@ def static_deflection(of: int | None = None) -> Quantity:
     return _asking("static_deflection", "m", _sag, text, of)
 
 
-def _sag(answers: Answers, tier: Tier, of: int | None) -> Array:
-    machine = _platforms(answers.scene, "the deflection")
-    model, carried = linear_model(answers.scene), _carried(machine)
+def _sag(evaluation: Evaluation, tier: Tier, of: int | None) -> Array:
+    machine = _platforms(evaluation.scene, "the deflection")
+    model, carried = linear_model(evaluation.scene), _carried(machine)
     # The stiffness matrix of platforms that nothing carries is singular up to rounding: they are held here, and told as NaN.
     held = jnp.where(carried, 0.0, 1.0)[:, None] * np.eye(len(carried))
     sag = jnp.linalg.solve(model.carrier.stiffness + held, _GRAVITY * jnp.diagonal(model.mass))
@@ -215,8 +215,8 @@ def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quant
     return _asking("spring_cost", unit, _cost, "cost of the springs", stiffness, price)
 
 
-def _cost(answers: Answers, tier: Tier, stiffness: tuple[float, ...], price: tuple[float, ...]) -> Array:
-    machine = _platforms(answers.scene, "the cost of springs")
+def _cost(evaluation: Evaluation, tier: Tier, stiffness: tuple[float, ...], price: tuple[float, ...]) -> Array:
+    machine = _platforms(evaluation.scene, "the cost of springs")
     springs = jnp.concatenate([jnp.ravel(machine.stiffness), jnp.ravel(machine.link_stiffness)])
     each = jnp.interp(springs, jnp.asarray(stiffness), jnp.asarray(price), left="extrapolate", right="extrapolate")
     least = jnp.where(springs < stiffness[0], price[0], jnp.where(springs > stiffness[-1], price[-1], 0.0))

@@ -16,10 +16,22 @@ from jaxvib.numerics.extrema import greatest
 from jaxvib.steady.jams.jam import JamModes
 from jaxvib.units import Number, count, in_own_unit
 from jaxvib.units import Quantity as UnitQuantity
-from optimize.wishes.answers import Answers
-from optimize.wishes.given import arguments, number_in, same_unit
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.user_inputs import arguments, number_in, same_unit
 
-__all__ = ["TIERS", "Asking", "Combined", "Demand", "Pair", "Quantity", "Tier", "largest", "least", "require_quantity", "walk"]
+__all__ = [
+    "TIERS",
+    "BuiltinQuantity",
+    "Combined",
+    "Demand",
+    "Pair",
+    "Quantity",
+    "Tier",
+    "largest",
+    "least",
+    "require_quantity",
+    "walk",
+]
 
 Pair = int | tuple[int, int] | None
 """Platform whose amplitude is meant, or pair of platforms for a relative amplitude; None: see `between`."""
@@ -69,19 +81,19 @@ class Quantity:
 
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
         """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
-        return self.read(Answers(scene, modes=modes))
+        return self.read(Evaluation(scene, modes=modes))
 
-    def read(self, answers: Answers) -> Array:
+    def read(self, evaluation: Evaluation) -> Array:
         """The quantity's value, a scalar in `unit`, from what is known of a scene."""
         assert self.function is not None
         if arguments(self.function) == 1:
-            return jnp.reshape(self.function(answers.scene), ())
-        return jnp.reshape(self.function(answers.scene, answers.modes), ())
+            return jnp.reshape(self.function(evaluation.scene), ())
+        return jnp.reshape(self.function(evaluation.scene, evaluation.modes), ())
 
-    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+    def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         """Smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity where `sign` is -1: a
         search may go along the kinks where two of them are alike."""
-        return jnp.reshape(sign * self.read(answers), (1,))
+        return jnp.reshape(sign * self.read(evaluation), (1,))
 
     @property
     def words(self) -> str:
@@ -153,29 +165,29 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Asking(Quantity):
-    """A quantity that knows what to ask: its function gets the `Answers`, the tier and the `settings`."""
+class BuiltinQuantity(Quantity):
+    """A quantity that knows what to ask: its function gets the `Evaluation`, the tier and the `settings`."""
 
     tier: Tier = "leading"
     settings: tuple[object, ...] = ()
     tiers: tuple[Tier, ...] = TIERS
     text: str = ""
     parted: Callable[..., Array] | None = None
-    """Function of the answers, the sign, the tier and the settings that returns its `pieces`."""
+    """Function of the evaluation, the sign, the tier and the settings that returns its `pieces`."""
 
     def __post_init__(self) -> None:
         require_one_of(self.tier, TIERS, "tier")
         if self.tier not in self.tiers:
             raise InputError("tier", f"is {quoted(self.tier)}; {self.words} is computed as: {', '.join(self.tiers)}")
 
-    def read(self, answers: Answers) -> Array:
+    def read(self, evaluation: Evaluation) -> Array:
         assert self.function is not None
-        return jnp.reshape(self.function(answers, self.tier, *self.settings), ())
+        return jnp.reshape(self.function(evaluation, self.tier, *self.settings), ())
 
-    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+    def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         if self.parted is None:
-            return super().pieces(answers, sign)
-        return self.parted(answers, sign, self.tier, *self.settings)
+            return super().pieces(evaluation, sign)
+        return self.parted(evaluation, sign, self.tier, *self.settings)
 
     @property
     def words(self) -> str:
@@ -205,11 +217,11 @@ class Combined(Quantity):
     operation: str = "+"
     constant: float = 0.0
 
-    def read(self, answers: Answers) -> Array:
-        values = [part.read(answers) for part in self.parts]
+    def read(self, evaluation: Evaluation) -> Array:
+        values = [part.read(evaluation) for part in self.parts]
         match self.operation:
             case "constant":
-                return jnp.asarray(self.constant, answers.scene.drive.speed.dtype)
+                return jnp.asarray(self.constant, evaluation.scene.drive.speed.dtype)
             case "neg":
                 return -values[0]
             case "+":
@@ -227,23 +239,23 @@ class Combined(Quantity):
             case _:
                 return -greatest(-jnp.stack(values))
 
-    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+    def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         if self.operation == "neg":
-            return self.parts[0].pieces(answers, -sign)
+            return self.parts[0].pieces(evaluation, -sign)
         if self.operation == ("largest" if sign > 0.0 else "least"):
-            return jnp.concatenate([part.pieces(answers, sign) for part in self.parts])
+            return jnp.concatenate([part.pieces(evaluation, sign) for part in self.parts])
         if self.operation in ("+", "-"):
-            one = self.parts[0].pieces(answers, sign)
-            other = self.parts[1].pieces(answers, sign if self.operation == "+" else -sign)
+            one = self.parts[0].pieces(evaluation, sign)
+            other = self.parts[1].pieces(evaluation, sign if self.operation == "+" else -sign)
             return (one[:, None] + other[None, :]).reshape(-1)
         if self.operation in ("*", "/"):
             for part, other in (self.parts, self.parts[::-1])[: 1 if self.operation == "/" else 2]:
-                numbers = part.pieces(answers, sign)
+                numbers = part.pieces(evaluation, sign)
                 if len(numbers) > 1:  # they are those of the product where the other one is positive
-                    by = other.read(answers)
+                    by = other.read(evaluation)
                     many = numbers * by if self.operation == "*" else numbers / by
-                    return jnp.where(by > 0.0, many, sign * self.read(answers))
-        return super().pieces(answers, sign)
+                    return jnp.where(by > 0.0, many, sign * self.read(evaluation))
+        return super().pieces(evaluation, sign)
 
 
 @dataclass(frozen=True)
@@ -287,10 +299,10 @@ class Demand:
         limit = self.limit if self.constant is None else Combined("", "", operation="constant")
         return replace(self, limit=limit, shown="")
 
-    def excess(self, answers: Answers, constant: Array) -> Array:
+    def excess(self, evaluation: Evaluation, constant: Array) -> Array:
         """Violation of the demand in its unit, negative if it is met; `constant` is its limit if that is a number."""
-        value = self.quantity.read(answers)
-        limit = constant if self.constant is not None else self.limit.read(answers)
+        value = self.quantity.read(evaluation)
+        limit = constant if self.constant is not None else self.limit.read(evaluation)
         return value - limit if self.sense == "at most" else limit - value
 
     def __bool__(self) -> bool:

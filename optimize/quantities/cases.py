@@ -17,9 +17,9 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
+from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder
+from optimize.quantities.quantity import Quantity, require_quantity
 from optimize.space.numbers import Place, changed, places_of, set_present, value_of
-from optimize.wishes.answers import Answers, Key, Recorder
-from optimize.wishes.quantity import Quantity, require_quantity
 
 __all__ = ["expected", "quantile", "under", "worst"]
 
@@ -92,17 +92,17 @@ class Under(_OfPart):
 
     case: Changed = Changed("", ())
 
-    def read(self, answers: Answers) -> Array:
-        return self._asked(answers, self.parts[0].read)
+    def read(self, evaluation: Evaluation) -> Array:
+        return self._asked(evaluation, self.parts[0].read)
 
-    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
-        return self._asked(answers, lambda inner: self.parts[0].pieces(inner, sign))
+    def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
+        return self._asked(evaluation, lambda inner: self.parts[0].pieces(inner, sign))
 
-    def _asked(self, answers: Answers, question: Callable[[Answers], Array]) -> Array:
-        scene, path = answers.under(self.case)
-        inner = Answers(scene, answers.known, path)
+    def _asked(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
+        scene, path = evaluation.under(self.case)
+        inner = Evaluation(scene, evaluation.known, path)
         value = question(inner)
-        answers.found.update(inner.found)
+        evaluation.found.update(inner.found)
         return value
 
 
@@ -114,8 +114,8 @@ class Robust(_OfPart):
     statistic: str = "expected"
     level: float = 0.0
 
-    def read(self, answers: Answers) -> Array:
-        values = self._sampled(answers, self.parts[0].read)
+    def read(self, evaluation: Evaluation) -> Array:
+        values = self._sampled(evaluation, self.parts[0].read)
         if self.statistic == "expected":
             return jnp.mean(values)
         if self.statistic == "worst":
@@ -123,30 +123,30 @@ class Robust(_OfPart):
         # The mean beyond the quantile would bend less; the quantile itself is what is asked, between two samples.
         return jnp.quantile(values, self.level)
 
-    def pieces(self, answers: Answers, sign: float = 1.0) -> Array:
+    def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
         if self.statistic != "worst" or sign < 0.0:
-            return super().pieces(answers, sign)
-        return self._sampled(answers, self.parts[0].pieces).reshape(-1)
+            return super().pieces(evaluation, sign)
+        return self._sampled(evaluation, self.parts[0].pieces).reshape(-1)
 
-    def _sampled(self, answers: Answers, question: Callable[[Answers], Array]) -> Array:
-        """Answers of all samples, (samples, ...)."""
-        scenes, path = answers.under(self.case)
-        known, keys = answers.known, []
+    def _sampled(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
+        """Values of all samples, (samples, ...)."""
+        scenes, path = evaluation.under(self.case)
+        known, keys = evaluation.known, []
         near: tuple[Array, ...] | None = None
-        if not isinstance(known, Recorder) and known is not None:
+        if not isinstance(known, TargetRecorder) and known is not None:
             keys = [key for key in known if key[0][: len(path)] == path]
             near = tuple(known[key] for key in keys)
         found: list[Key] = []
 
         def one(scene: Scene, near: tuple[Array, ...] | None) -> tuple[Array, tuple[Array, ...]]:
-            recorder = known if isinstance(known, Recorder) else None
-            inner = Answers(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
+            recorder = known if isinstance(known, TargetRecorder) else None
+            inner = Evaluation(scene, recorder if near is None else dict(zip(keys, near, strict=True)), path)
             value = question(inner)
             found[:] = inner.found
             return value, tuple(inner.found.values())
 
         values, speeds = jax.vmap(one)(scenes, near)
-        answers.found.update(zip(found, speeds, strict=True))
+        evaluation.found.update(zip(found, speeds, strict=True))
         return values
 
     @property

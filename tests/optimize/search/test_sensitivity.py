@@ -9,7 +9,7 @@ from optimize.result import Machine
 from optimize.search.find import Found
 from optimize.search.polish import Optimality
 from optimize.search.problem import problem_of
-from optimize.search.sense import influences_of, limits_of, machines_of, neighbours
+from optimize.search.sensitivity import influences_of, limits_of, machines_of, neighbours
 
 SUM, FIRST = plain("sum", lambda x, y: x + y), plain("first", lambda x, y: x)
 WISH = plain("wish", lambda x, y: x * y)

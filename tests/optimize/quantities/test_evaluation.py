@@ -9,10 +9,10 @@ from scenes import scene
 
 import jaxvib as jv
 from optimize import amplitude, fold_margin, foundation_force, phase, total
-from optimize.wishes import answers as answers_module
-from optimize.wishes.answers import Answers, Recorder, guesses
-from optimize.wishes.given import arguments, same_unit
-from optimize.wishes.jams import between
+from optimize.quantities import evaluation as answers_module
+from optimize.quantities.evaluation import Evaluation, TargetRecorder, guesses
+from optimize.quantities.jams import between
+from optimize.quantities.user_inputs import arguments, same_unit
 
 SCENE = scene("two_mass")
 
@@ -25,17 +25,17 @@ def modes():
 def test_runs_from_a_jam_last_sixty_lowest_periods(monkeypatch):
     asked = []
     monkeypatch.setattr(answers_module, "simulate", lambda scene, until, **more: asked.append((until, more)))
-    answers = Answers(SCENE)
-    answers.jam_run(3)
-    answers.jam_run(3)
+    evaluation = Evaluation(SCENE)
+    evaluation.jam_run(3)
+    evaluation.jam_run(3)
     k, m = np.array([[2.5e5, -2e5], [-2e5, 2.3e5]]), np.diag([120.0, 95.0 + 2.4])
     lowest = np.sqrt(np.linalg.eigvals(np.linalg.solve(m, k)).min())
     ((until, more),) = asked
     np.testing.assert_allclose(until, 60.0 * 2.0 * np.pi / lowest, rtol=1e-10)
     assert (more["start"], more["mode"], more["adjoint"]) == ("jam", 3, None)
-    answers.start_up(5.0, 2.0)
+    evaluation.start_up(5.0, 2.0)
     assert asked[1][0] == 5.0 and asked[1][1]["spin_up"] == 2.0
-    kept = Answers(SCENE)
+    kept = Evaluation(SCENE)
     kept.keep_run(3, "the run")
     assert kept.jam_run(3) == "the run" and len(asked) == 2
 
@@ -52,25 +52,25 @@ def test_guesses_are_the_jam_and_the_folds_beside_it(modes):
 
 def test_margins_are_to_the_nearer_fold(modes):
     """Odd modes end at a lower rotor speed on the side of lower load speeds, even ones on the other; none is 0, or 10 n."""
-    answers = Answers(SCENE, modes=modes)
-    assert answers.modes is modes
-    below, above = answers.folds(5)
+    evaluation = Evaluation(SCENE, modes=modes)
+    assert evaluation.modes is modes
+    below, above = evaluation.folds(5)
     assert 0.0 < below < 120.0 and float(above) == 1200.0
     for mode in (3, 4):
-        ends = np.array([float(each) for each in answers.folds(mode)])
+        ends = np.array([float(each) for each in evaluation.folds(mode)])
         slow, fast = ends if mode == 3 else ends[::-1]
         assert slow < 120.0 < fast
-        np.testing.assert_allclose(fold_margin(mode=mode).read(answers), min(120.0 - slow, fast - 120.0), rtol=1e-12)
-        pieces = fold_margin(mode=mode).pieces(answers, -1.0)
+        np.testing.assert_allclose(fold_margin(mode=mode).read(evaluation), min(120.0 - slow, fast - 120.0), rtol=1e-12)
+        pieces = fold_margin(mode=mode).pieces(evaluation, -1.0)
         np.testing.assert_allclose(pieces, [slow - 120.0, 120.0 - fast], rtol=1e-12)
-        assert fold_margin(mode=mode).pieces(answers).shape == (1,)
+        assert fold_margin(mode=mode).pieces(evaluation).shape == (1,)
 
 
 def test_modes_are_numbered():
     for wrong in (0, 6, True, 2.0):
         with pytest.raises(jv.InputError, match="numbered 1 to 5"):
-            Answers(SCENE).jam(wrong)
-    recorder = Recorder()
+            Evaluation(SCENE).jam(wrong)
+    recorder = TargetRecorder()
     recorder["a"], recorder["b"], recorder["a"]
     assert recorder.keys == ["a", "b"]
 
@@ -128,6 +128,6 @@ def test_what_users_give_is_read():
 def test_a_mode_is_not_followed_to_another_one(modes):
     """The start is the speed of mode 4, where the branch falls; mode 3 lies where it rises."""
     key = ((), ("jam", 3))
-    near = {mode: Answers(SCENE, {key: modes.select(mode).omega}) for mode in (3, 4)}
+    near = {mode: Evaluation(SCENE, {key: modes.select(mode).omega}) for mode in (3, 4)}
     np.testing.assert_allclose(near[3].orbit(3).omega, jv.jam_orbit(SCENE, mode=3).omega, rtol=1e-9)
     assert np.isnan(near[4].jam(3).omega)

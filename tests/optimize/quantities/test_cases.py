@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, expected, jam_frequency, largest, quantile, under, worst
+from optimize.quantities.evaluation import Evaluation
 from optimize.search.problem import evaluate, looked_up, problem_of
-from optimize.wishes.answers import Answers
 
 SCENE = scene("two_mass")
 FIRST = Quantity("first", "N/m", lambda s: s.machine.stiffness[0])
@@ -45,17 +45,17 @@ def test_statistics_are_those_of_the_samples():
         (quantile(BOTH, 0.3, OFF, samples=9), np.quantile(values, 0.3)),
     ):
         np.testing.assert_allclose(quantity(SCENE), awaited, rtol=1e-12)
-        np.testing.assert_allclose(quantity.pieces(Answers(SCENE), -1.0), [-awaited], rtol=1e-12)
-        one = quantity.pieces(Answers(SCENE))
+        np.testing.assert_allclose(quantity.pieces(Evaluation(SCENE), -1.0), [-awaited], rtol=1e-12)
+        one = quantity.pieces(Evaluation(SCENE))
         np.testing.assert_allclose(one, values if quantity.statistic == "worst" else [awaited], rtol=1e-12)
     of_two = worst(largest(FIRST, 1.01 * FIRST), {"machine.stiffness": 0.1}, samples=3)
-    assert of_two.pieces(Answers(SCENE)).shape == (6,) and of_two.easy == largest(FIRST, 1.01 * FIRST)
+    assert of_two.pieces(Evaluation(SCENE)).shape == (6,) and of_two.easy == largest(FIRST, 1.01 * FIRST)
 
 
 def test_a_case_is_a_quantity_of_another_scene():
     heavy = under(FIRST, "stiff", {"machine.stiffness": "70 N/mm"})
     assert heavy.words == "first (stiff)" and float(heavy(SCENE)) == 7e4
-    pieces = under(largest(FIRST, BOTH / "1 N/m"), "stiff", {"machine.stiffness[0]": 7e4}).pieces(Answers(SCENE))
+    pieces = under(largest(FIRST, BOTH / "1 N/m"), "stiff", {"machine.stiffness[0]": 7e4}).pieces(Evaluation(SCENE))
     np.testing.assert_allclose(pieces, [7e4, 7e4 * 2e5])
     timed = under(jam_frequency(mode=3, tier="exact"), "x", {"drive.speed": 130.0})
     assert timed.easy.parts == (jam_frequency(mode=3),) and timed.easy.case == timed.case

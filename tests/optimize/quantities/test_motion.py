@@ -14,8 +14,8 @@ TIME = jnp.linspace(0.0, 10.0, 2001)
 SPEED = 7.0
 
 
-def answers(size, force=None):
-    """Answers of a run-up with this amplitude of platform 2; platform 1 rests."""
+def evaluation(size, force=None):
+    """Evaluation of a run-up with this amplitude of platform 2; platform 1 rests."""
     y, v = size * jnp.sin(SPEED * TIME), size * SPEED * jnp.cos(SPEED * TIME)
     state = SimpleNamespace(displacement=jnp.stack([0.0 * y, y], axis=1), velocity=jnp.stack([0.0 * v, v], axis=1))
     run = SimpleNamespace(trajectory=SimpleNamespace(state=state, time=TIME, foundation_force=force), omega=jnp.asarray(SPEED))
@@ -28,17 +28,17 @@ def test_the_amplitude_settles_within_a_share(within, size):
     """size (1 - exp(-t)): off by more than the share of its end until t = -ln(within). Samples are 5 ms apart."""
     asked = settling_time(until=10.0, spin_up="2 s", within=within, of=2)
     last = float(jnp.mean(1.0 - jnp.exp(-TIME[-100:])))
-    found = float(asked.read(answers(size * (1.0 - jnp.exp(-TIME)))))
+    found = float(asked.read(evaluation(size * (1.0 - jnp.exp(-TIME)))))
     np.testing.assert_allclose(found, -np.log(1.0 - last * (1.0 - within)), atol=1e-5)  # h^2/8 of the line between samples
-    later = float(asked.read(answers(size * (1.0 + jnp.where(TIME > 4.0, 0.0, 1.0)))))  # too large at first
+    later = float(asked.read(evaluation(size * (1.0 + jnp.where(TIME > 4.0, 0.0, 1.0)))))  # too large at first
     np.testing.assert_allclose(later, 4.0, atol=0.006)
 
 
 def test_what_still_changes_settles_at_the_end():
-    falling = answers(2.0 - 0.1 * TIME)
+    falling = evaluation(2.0 - 0.1 * TIME)
     np.testing.assert_allclose(settling_time(until=10.0, spin_up=2.0, within=0.001, of=2).read(falling), 10.0, atol=0.006)
     # Where not even the last sample is near enough, the end of the run is the answer, and nothing moves it.
-    still = lambda slope: settling_time(until=10.0, spin_up=2.0, within=1e-6, of=2).read(answers(2.0 - slope * TIME))  # noqa: E731
+    still = lambda slope: settling_time(until=10.0, spin_up=2.0, within=1e-6, of=2).read(evaluation(2.0 - slope * TIME))  # noqa: E731
     time, by_slope = jax.value_and_grad(still)(0.1)
     np.testing.assert_allclose(time, 10.0, atol=0.006)
     assert by_slope == 0.0
@@ -55,7 +55,7 @@ def test_what_still_changes_settles_at_the_end():
 def test_the_peak_of_a_force_is_its_largest_modulus():
     force = jnp.stack([3.0 * jnp.sin(TIME), 4.0 * jnp.sin(TIME)], axis=1) * jnp.exp(-TIME)[:, None]
     top = float(jnp.sin(jnp.pi / 4.0) * jnp.exp(-jnp.pi / 4.0))
-    np.testing.assert_allclose(peak_force(until=10.0, spin_up=2.0).read(answers(TIME, force)), 5.0 * top, rtol=1e-5)
+    np.testing.assert_allclose(peak_force(until=10.0, spin_up=2.0).read(evaluation(TIME, force)), 5.0 * top, rtol=1e-5)
 
 
 def test_platforms_are_counted_from_one():

@@ -18,8 +18,8 @@ from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import relative_amplitude
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.units import count
-from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import TIERS, Asking, Pair, Quantity, Tier
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import TIERS, BuiltinQuantity, Pair, Quantity, Tier
 
 __all__ = [
     "amplitude",
@@ -69,7 +69,7 @@ def _asking(
     parted: Callable[..., Array] | None = None,
 ) -> Quantity:
     text = f"{text}, mode {mode}"
-    return Asking(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, parted)
+    return BuiltinQuantity(name, unit, function, mode, of, tier, (mode, *settings), tiers, text, parted)
 
 
 def _whose(of: Pair) -> str:
@@ -105,17 +105,17 @@ def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity
     return _asking("amplitude", "m", _amplitude, mode, tier, f"amplitude{_whose(of)}", of=of, settings=(of,))
 
 
-def _amplitude(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
-    chosen = between(answers.scene, of)
+def _amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
+    chosen = between(evaluation.scene, of)
     if tier == "leading":
-        jam = answers.jam(mode)
+        jam = evaluation.jam(mode)
         if isinstance(chosen, int):
             return jam.amplitude[chosen - 1]
         return magnitude(jam.displacement[chosen[0] - 1] - jam.displacement[chosen[1] - 1])
     if tier == "exact":
-        orbit = answers.orbit(mode)
+        orbit = evaluation.orbit(mode)
         return orbit.amplitude[chosen - 1] if isinstance(chosen, int) else orbit.relative_amplitude(*chosen)
-    run = answers.jam_run(mode)
+    run = evaluation.jam_run(mode)
     return run.amplitude[chosen - 1] if isinstance(chosen, int) else relative_amplitude(run.window, *chosen)
 
 
@@ -139,13 +139,13 @@ def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") ->
     return _asking("phase", "rad", _phase, mode, tier, text, of=pair, settings=(pair,), tiers=("leading", "exact"))
 
 
-def _phase(answers: Answers, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
-    between(answers.scene, of)  # raises for platforms that are not there
+def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -> Array:
+    between(evaluation.scene, of)  # raises for platforms that are not there
     i, j = of
     if tier == "leading":
-        first = answers.jam(mode).displacement
+        first = evaluation.jam(mode).displacement
     else:
-        orbit = answers.orbit(mode)
+        orbit = evaluation.orbit(mode)
         first = orbit.displacement_harmonics[:, orbit.orders.index(1)]
     turned = first[i - 1] * jnp.conj(first[j - 1])
     return jnp.arctan2(jnp.abs(turned.imag), turned.real)
@@ -173,12 +173,12 @@ def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "le
     return _asking("force_harmonic", "N", _force, mode, tier, text, settings=(harmonic,), tiers=("exact",))
 
 
-def _force(answers: Answers, tier: Tier, mode: int, harmonic: int | None) -> Array:
+def _force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) -> Array:
     if tier == "leading":
-        return answers.jam(mode).foundation_force
+        return evaluation.jam(mode).foundation_force
     if tier == "time":
-        return answers.jam_run(mode).foundation_force
-    orbit = answers.orbit(mode)
+        return evaluation.jam_run(mode).foundation_force
+    orbit = evaluation.orbit(mode)
     if harmonic is None:
         return orbit.foundation_force
     if harmonic not in orbit.orders:  # the half-turn symmetry leaves odd harmonics only
@@ -204,19 +204,19 @@ def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -
     return _asking("force_per_amplitude", "N/m", _ratio, mode, tier, text, of=of, settings=(of,), parted=_peaks_per_amplitude)
 
 
-def _ratio(answers: Answers, tier: Tier, mode: int, of: Pair) -> Array:
-    return _force(answers, tier, mode, None) / _amplitude(answers, tier, mode, of)
+def _ratio(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array:
+    return _force(evaluation, tier, mode, None) / _amplitude(evaluation, tier, mode, of)
 
 
-def _peaks(answers: Answers, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
+def _peaks(evaluation: Evaluation, sign: float, tier: Tier, mode: int, harmonic: int | None) -> Array:
     """The exact force's peaks in parts of the period: where its first harmonic is small, several are about as high."""
     if tier != "exact" or sign < 0.0:
-        return sign * _force(answers, tier, mode, harmonic)[None]
-    return answers.orbit(mode).force_peaks()
+        return sign * _force(evaluation, tier, mode, harmonic)[None]
+    return evaluation.orbit(mode).force_peaks()
 
 
-def _peaks_per_amplitude(answers: Answers, sign: float, tier: Tier, mode: int, of: Pair) -> Array:
-    return _peaks(answers, sign, tier, mode, None) / _amplitude(answers, tier, mode, of)
+def _peaks_per_amplitude(evaluation: Evaluation, sign: float, tier: Tier, mode: int, of: Pair) -> Array:
+    return _peaks(evaluation, sign, tier, mode, None) / _amplitude(evaluation, tier, mode, of)
 
 
 @validated
@@ -235,10 +235,10 @@ def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
     return _asking("jam_frequency", "rad/s", _frequency, mode, tier, "jam frequency")
 
 
-def _frequency(answers: Answers, tier: Tier, mode: int) -> Array:
+def _frequency(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     if tier == "leading":
-        return answers.jam(mode).omega
-    return answers.orbit(mode).omega if tier == "exact" else answers.jam_run(mode).omega
+        return evaluation.jam(mode).omega
+    return evaluation.orbit(mode).omega if tier == "exact" else evaluation.jam_run(mode).omega
 
 
 @validated
@@ -262,15 +262,15 @@ def fold_margin(*, mode: int) -> Quantity:
     )
 
 
-def _margin(answers: Answers, tier: Tier, mode: int) -> Array:
-    return _margins(answers, 1.0, tier, mode)[0]
+def _margin(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
+    return _margins(evaluation, 1.0, tier, mode)[0]
 
 
-def _margins(answers: Answers, sign: float, tier: Tier, mode: int) -> Array:
-    below, above = answers.folds(mode)
-    n = answers.scene.drive.speed
+def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Array:
+    below, above = evaluation.folds(mode)
+    n = evaluation.scene.drive.speed
     slow, fast = (below, above) if mode % 2 == 1 else (above, below)
-    both = jnp.stack([n - slow, fast - n]) + 0.0 * answers.jam(mode).omega
+    both = jnp.stack([n - slow, fast - n]) + 0.0 * evaluation.jam(mode).omega
     return -both if sign < 0.0 else jnp.minimum(both[0], both[1])[None]
 
 
@@ -287,8 +287,8 @@ def largest_multiplier(*, mode: int) -> Quantity:
     return _asking("largest_multiplier", "", _multiplier, mode, "exact", "largest multiplier", tiers=("exact",))
 
 
-def _multiplier(answers: Answers, tier: Tier, mode: int) -> Array:
-    return answers.orbit(mode).multiplier
+def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
+    return evaluation.orbit(mode).multiplier
 
 
 @validated
@@ -306,16 +306,16 @@ def power(*, mode: int, tier: Tier = "leading") -> Quantity:
     return _asking("power", "W", _power, mode, tier, "power drawn", tiers=("leading", "exact"))
 
 
-def _power(answers: Answers, tier: Tier, mode: int) -> Array:
+def _power(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
     if tier == "exact":
-        return answers.orbit(mode).power
-    scene, loads, jam = answers.scene, jammed_loads(answers.scene), answers.jam(mode)
+        return evaluation.orbit(mode).power
+    scene, loads, jam = evaluation.scene, jammed_loads(evaluation.scene), evaluation.jam(mode)
     n, omega = scene.drive.speed, jam.omega
     torque = loads.drag_sum() * (n - omega)
     if has_term(scene.effects, ContactFriction):
         torque = torque + light_friction(loads, scene.effects, omega, n)
     # Strong drag leaves n - Omega few digits; what the carrier dissipates, which that torque equals, has all of them.
     close = n - omega < _SLIP * n
-    taken = answers.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
+    taken = evaluation.jammed.dissipated(omega * jnp.where(close, jam.displacement, 0.0))
     torque = jnp.where(close, taken / omega, torque)
     return n * torque

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jaxvib.boundary import validated
-from optimize.wishes.quantity import Quantity, require_quantity
+from optimize.quantities.quantity import Quantity, require_quantity
 
 __all__ = ["maximize", "minimize", "negative"]
 

@@ -7,8 +7,8 @@ from scenes import scene
 
 from jaxvib import InputError
 from optimize import Quantity, amplitude, foundation_force, largest, least
-from optimize.wishes.answers import Answers
-from optimize.wishes.quantity import Asking, Demand
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import BuiltinQuantity, Demand
 
 SCENE = scene("two_mass")
 
@@ -49,7 +49,7 @@ TOP, LOW = largest(A, B), least(A, C)
     ],
 )
 def test_the_largest_piece_is_the_quantity(quantity, sign, pieces):
-    found = quantity.pieces(Answers(SCENE), sign)
+    found = quantity.pieces(Evaluation(SCENE), sign)
     np.testing.assert_allclose(found, pieces, rtol=1e-14)
     np.testing.assert_allclose(jnp.max(found), sign * quantity(SCENE), rtol=1e-14)
 
@@ -96,11 +96,11 @@ def test_what_is_no_number_is_refused(wrong):
 
 
 def test_demands_say_by_how_much_they_are_not_met():
-    answers = Answers(SCENE)
+    evaluation = Evaluation(SCENE)
     most, more, other = A < 3.0, A > 5.0, B < A
     assert (most.constant, more.constant, other.constant) == (3.0, 5.0, None)
     for demand, limit, excess in ((most, 3.0, -1.0), (more, 5.0, 3.0), (other, 0.0, 3.0), (B > A, 0.0, -3.0), (most, 1.5, 0.5)):
-        np.testing.assert_allclose(demand.excess(answers, jnp.asarray(limit)), excess, rtol=1e-14)
+        np.testing.assert_allclose(demand.excess(evaluation, jnp.asarray(limit)), excess, rtol=1e-14)
     assert most.form() == (A < 8.0).form() != (A > 8.0).form() and most.form().constant == 0.0
     assert other.form() == Demand(B, A, "at most", "") and other.words == "b at most a"
     assert (foundation_force(mode=3) < "2 kN").words == "foundation force, mode 3 at most 2 kN"
@@ -109,23 +109,25 @@ def test_demands_say_by_how_much_they_are_not_met():
 def test_what_asks_knows_its_tiers():
     asked = []
 
-    def function(answers, tier, *settings):
+    def function(evaluation, tier, *settings):
         asked.append((tier, settings))
-        return answers.scene.drive.speed
+        return evaluation.scene.drive.speed
 
-    both = Asking("a_b", "", function, settings=(1, 2), tiers=("leading", "exact"))
+    both = BuiltinQuantity("a_b", "", function, settings=(1, 2), tiers=("leading", "exact"))
     assert both.words == "a b" and both.at_tier("exact").words == "a b, exact" and both.at_tier("time") is both
-    assert Asking("a_b", "", function, tiers=("leading",)).words == "a b"
-    assert Asking("a_b", "", function, text="said so").words == "said so"
+    assert BuiltinQuantity("a_b", "", function, tiers=("leading",)).words == "a b"
+    assert BuiltinQuantity("a_b", "", function, text="said so").words == "said so"
     exact = both.at_tier("exact")
-    np.testing.assert_array_equal(exact.pieces(Answers(SCENE), -1.0), [-120.0])
+    np.testing.assert_array_equal(exact.pieces(Evaluation(SCENE), -1.0), [-120.0])
     assert asked == [("exact", (1, 2))] and exact.easy == both and not exact.forward_only
-    timed = Asking("t", "", function, tier="time")
+    timed = BuiltinQuantity("t", "", function, tier="time")
     assert timed.forward_only and (A + timed).forward_only and (timed * A).forward_only and not (A + both).forward_only
     assert (A + exact).easy.parts == (A, both) and (A + both).at_tier("exact").parts == (A, exact)
     assert len(asked) == 1
-    parted = Asking("p", "", function, settings=(7,), parted=lambda answers, sign, tier, seven: sign * jnp.array([1.0, seven]))
-    np.testing.assert_array_equal(parted.pieces(Answers(SCENE), -1.0), [-1.0, -7.0])
+    parted = BuiltinQuantity(
+        "p", "", function, settings=(7,), parted=lambda evaluation, sign, tier, seven: sign * jnp.array([1.0, seven])
+    )
+    np.testing.assert_array_equal(parted.pieces(Evaluation(SCENE), -1.0), [-1.0, -7.0])
 
 
 @pytest.mark.parametrize("text", ["10 Hz", "600 rpm", "600 1/min", "10 rps", "62.83185307179586 rad/s"])

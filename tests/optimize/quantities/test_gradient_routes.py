@@ -34,9 +34,9 @@ from optimize import (
     under,
     worst,
 )
+from optimize.quantities import evaluation
+from optimize.quantities.evaluation import Evaluation, guesses
 from optimize.search.problem import report_keys
-from optimize.wishes import answers
-from optimize.wishes.answers import Answers, guesses
 
 OFF = {"machine.stiffness": 0.05}
 FORCE = foundation_force(mode=3)
@@ -90,8 +90,8 @@ class Routes:
         self.value = stored_jit(lambda s, near, e: self.read(s, None if whole else near, e))
 
     def read(self, scene, near, shares):
-        answers = Answers(moved(scene, shares), near)
-        return jnp.stack([q.read(answers) for q in self.quantities])
+        evaluation = Evaluation(moved(scene, shares), near)
+        return jnp.stack([q.read(evaluation) for q in self.quantities])
 
     def speeds(self, scene):
         """Load speeds that a search follows."""
@@ -142,7 +142,7 @@ def test_every_route_agrees_on_ten_random_machines(quantities, least, monkeypatc
     """Agreement to 1e-5 wherever finite differences are accurate enough; runs are noisy and have forward derivatives only. Runs
     are to a tolerance at which what they compute has the derivatives of what they integrate: to 1e-8 the two differ by up to
     6e-5 after 60 periods."""
-    monkeypatch.setattr(answers, "simulate", functools.partial(jv.simulate, stepsize_controller=jv.Tolerance(1e-12)))
+    monkeypatch.setattr(evaluation, "simulate", functools.partial(jv.simulate, stepsize_controller=jv.Tolerance(1e-12)))
     routes = Routes(quantities, ("forward",) if quantities is TIME else ("forward", "reverse"))
     machines = seed = judged = 0
     while machines < 10:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import Found
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem
 from optimize.space.numbers import shown_unit
-from optimize.wishes.quantity import Demand
 
 __all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
 

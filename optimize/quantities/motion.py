@@ -9,9 +9,9 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.units import Number, count
-from optimize.wishes.answers import Answers
-from optimize.wishes.given import number_in
-from optimize.wishes.quantity import Asking, Quantity, Tier
+from optimize.quantities.evaluation import Evaluation
+from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
+from optimize.quantities.user_inputs import number_in
 
 __all__ = ["peak_force", "settling_time"]
 
@@ -36,11 +36,11 @@ def peak_force(*, until: Number, spin_up: Number) -> Quantity:
     'largest foundation force during spin-up at most 2 kN'
     """
     text = "largest foundation force during spin-up"
-    return Asking("peak_force", "N", _peak, tier="time", tiers=("time",), text=text, settings=_times(until, spin_up))
+    return BuiltinQuantity("peak_force", "N", _peak, tier="time", tiers=("time",), text=text, settings=_times(until, spin_up))
 
 
-def _peak(answers: Answers, tier: Tier, until: float, spin_up: float) -> Array:
-    trajectory = answers.start_up(until, spin_up).trajectory
+def _peak(evaluation: Evaluation, tier: Tier, until: float, spin_up: float) -> Array:
+    trajectory = evaluation.start_up(until, spin_up).trajectory
     assert trajectory is not None
     return jnp.sqrt(jnp.max(jnp.sum(trajectory.foundation_force**2, axis=1)))
 
@@ -64,11 +64,11 @@ def settling_time(*, until: Number, spin_up: Number, within: float = 0.05, of: i
         raise InputError("within", f"is {quoted(within)}; it must be greater than 0 and less than 1")
     text = f"time until platform {of} settles"
     settings = (*_times(until, spin_up), share, of)
-    return Asking("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)
+    return BuiltinQuantity("settling_time", "s", _settling, tier="time", tiers=("time",), text=text, settings=settings)
 
 
-def _settling(answers: Answers, tier: Tier, until: float, spin_up: float, within: float, of: int) -> Array:
-    run = answers.start_up(until, spin_up)
+def _settling(evaluation: Evaluation, tier: Tier, until: float, spin_up: float, within: float, of: int) -> Array:
+    run = evaluation.start_up(until, spin_up)
     assert run.trajectory is not None
     state, time = run.trajectory.state, run.trajectory.time
     if of > state.displacement.shape[1]:

@@ -23,7 +23,7 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import traced
 
-__all__ = ["Answers", "Asked", "Case", "Key", "Recorder", "guesses"]
+__all__ = ["Case", "Evaluation", "Key", "Target", "TargetRecorder", "guesses"]
 
 _NO_FOLD = 10.0
 """Factor of the rotor speed that stands for the fold of a mode that no fold ends on the side of higher rotor speeds."""
@@ -45,14 +45,14 @@ class Case(Protocol):
         ...
 
 
-Asked = tuple[str, int]
+Target = tuple[str, int]
 """Followed jam or fold: ("jam", mode), or a fold beside it, ("below", mode) and ("above", mode)."""
 
-Key = tuple[tuple[Case, ...], Asked]
+Key = tuple[tuple[Case, ...], Target]
 """Scene (the cases that lead there from the design's own), and the followed jam or fold."""
 
 
-class Recorder:
+class TargetRecorder:
     """Stands for what is known and notes what is asked for."""
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class Recorder:
         return jnp.asarray(1.0)
 
 
-class Answers:
+class Evaluation:
     """Results of one scene. Questions are answered when they are first asked.
 
     **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the
@@ -74,7 +74,7 @@ class Answers:
     def __init__(
         self,
         scene: Scene,
-        known: Mapping[Key, Array] | Recorder | None = None,
+        known: Mapping[Key, Array] | TargetRecorder | None = None,
         path: tuple[Case, ...] = (),
         modes: JamModes | None = None,
     ):
@@ -174,7 +174,7 @@ class Answers:
         return case.scenes(self.scene), (*self.path, case)
 
 
-def guesses(modes: JamModes, asked: Asked) -> Array:
+def guesses(modes: JamModes, asked: Target) -> Array:
     """The load speed, rad/s, of what is asked of the jam modes of a scene; NaN where there is none."""
     what, mode = asked
     omega = modes.select(mode, throw=False).omega
