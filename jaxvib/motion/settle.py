@@ -24,7 +24,6 @@ from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former, re
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, count, number
 
@@ -55,7 +54,6 @@ _FALLS = -3.0
 
 @validated
 @refuse_former(tolerance=FORMER["tolerance"])
-@compiled_together
 def settle(
     scene: Scene,
     *,
@@ -125,8 +123,7 @@ def settle(
         state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
     _, slowest = frequency_bounds(scene)
     # An imbalance goes on from where it was: the rotor is there after whole turns.
-    slow = float(slowest) or float(scene.drive.speed)  # 0 where programs are compiled only, see `compiled_together`
-    stretch = whole_turns(scene, 2.0 * math.pi * periods / slow)
+    stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
     remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
     decay = _slowest_decay(scene)
     seen: list[list[float]] = []

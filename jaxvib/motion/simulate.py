@@ -33,7 +33,6 @@ from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.many import in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
 from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, known_number, traced
 
@@ -55,7 +54,6 @@ _STRETCH = 2.0e4
 
 @validated
 @refuse_former(**FORMER)
-@compiled_together
 def simulate(
     scene: Scene,
     until: Number,
@@ -177,7 +175,7 @@ def simulate(
     found = _with(found, seconds=time.perf_counter() - begun, **estimated)
     if throw:
         _raise_if_failed(found, max_steps, stepsize_controller)
-    return judged_by_separation(found) if concrete and not is_rehearsing() and bool(found.settled) else found
+    return judged_by_separation(found) if concrete and bool(found.settled) else found
 
 
 def _limited(chosen: _Control, most: int) -> tuple[_Control, int]:

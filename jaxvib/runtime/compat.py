@@ -50,7 +50,6 @@ __all__ = [
     "no_host_checks",
     "no_places",
     "operation_like",
-    "resuming",
     "rewritten",
     "short_end",
     "traced",
@@ -148,14 +147,6 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
     """In here known numbers are computed with at once, whatever JAX is transforming; without it they are part of that."""
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
-
-
-def resuming() -> Callable[[], contextlib.AbstractContextManager[None]]:
-    """Contexts in which JAX transforms what it transforms here: the rules of its transformations run outside of them. Without
-    JAX's own two names they change nothing."""
-    core = sys.modules.get("jax._src.core")
-    here, change = getattr(core, "trace_ctx", None), getattr(core, "set_current_trace", None)
-    return contextlib.nullcontext if here is None or change is None else functools.partial(change, here.trace)
 
 
 @contextlib.contextmanager

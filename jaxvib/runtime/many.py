@@ -22,7 +22,6 @@ from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 from jaxvib.runtime.devices import shared_devices
-from jaxvib.runtime.rehearsal import begin_others, beginning, is_rehearsing
 from jaxvib.runtime.stored import is_debugging
 
 __all__ = ["cores", "in_chunks", "in_parallel", "in_threads"]
@@ -48,8 +47,8 @@ def cores() -> int:
 def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
     """A function of many items: threads compute them on all cores and accelerators; gives each with its item as it is finished.
 
-    The first item is computed alone as long as its programs are new, so that each is compiled once. Items are taken as there is
-    room for them: one more than threads is held at most, so that memory does not grow with their number. JAX's options are
+    Threads that need the same new program wait for the one that compiles it. Items are taken as there is room for them: one
+    more than threads is held at most, so that memory does not grow with their number. JAX's options are
     those of the caller, with those that a context manager set for the caller's thread alone. When an error is raised, here or
     by who takes the results, items that have not begun are not computed.
 
@@ -61,28 +60,17 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
     pool = ThreadPoolExecutor(threads)
     running: dict[Future[Found], Item] = {}
 
-    def begin(most: int) -> None:
-        for item in itertools.islice(left, max(most - len(running), 0)):
-            running[pool.submit(alike, item, next(devices))] = item
-
     try:
-        for first in left:
-            with beginning(functools.partial(begin, threads - 1)):
-                found = alike(first, next(devices))
-            yield first, found
-            break
-        begin(threads + 1)
-        while running:
-            yield from _finished(running)
-            begin(threads + 1)
+        while True:
+            for item in itertools.islice(left, threads + 1 - len(running)):
+                running[pool.submit(alike, item, next(devices))] = item
+            if not running:
+                return
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in ended:
+                yield running.pop(future), future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _finished(running: dict[Future[Found], Item]) -> Generator[tuple[Item, Found], None, None]:
-    ended, _ = wait(running, return_when=FIRST_COMPLETED)
-    for future in ended:
-        yield running.pop(future), future.result()
 
 
 def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:
@@ -135,7 +123,7 @@ def in_chunks(
         out = function(*jax.tree.map(lambda leaf: leaf[index[chunk]], plain), *shared)
         return jax.tree.map(np.asarray, out)
 
-    parts = [computed(0)] * chunks if is_rehearsing() else in_threads(computed, chunks, shared_devices())
+    parts = in_threads(computed, chunks, shared_devices())
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
 
@@ -149,7 +137,7 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
     >>> in_threads(lambda k: k * k, 3)
     [0, 1, 4]
     """
-    if is_rehearsing() or is_debugging():
+    if is_debugging():
         return [function(k) for k in range(number)]
     alike = _same_options(function)
     workers = min(max(cores(), len(devices)), number)
@@ -161,15 +149,13 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
                 if failed:
                     break
                 found.append((k, alike(k, devices[worker % len(devices)])))
-                begin_others()
         except BaseException:
             failed.append(True)
             raise
 
-    others: list[Future[None]] = []
+    others = [_threads().submit(work, k) for k in range(1, workers)]
     try:
-        with beginning(lambda: others.extend(_threads().submit(work, k) for k in range(1, workers))):
-            work(0)
+        work(0)
     finally:
         begun = [other for other in others if not other.cancel()]
         wait(begun)

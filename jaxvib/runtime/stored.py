@@ -33,8 +33,7 @@ from jaxvib.imported import CodeState, clear_derived, code_state, digest_of_sour
 from jaxvib.runtime.cache import program_folder
 from jaxvib.runtime.compat import evaluating, no_host_checks, no_places
 from jaxvib.runtime.cpu import processor
-from jaxvib.runtime.devices import arrays_on_device, on_device
-from jaxvib.runtime.rehearsal import Unstored, begin_others, is_rehearsing, rehearsal
+from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
 
 __all__ = ["StoredFunction", "is_debugging"]
@@ -109,16 +108,10 @@ class StoredFunction(Generic[T]):
                     program = self.ready[asked] = self._program(folder, arrays_on_device(leaves), treedef, home)
             _evict_least_recently_used()
         if program is None:
-            if is_rehearsing():
-                raise Unstored
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
-        if program.is_new and (beside := rehearsal()) is not None:
-            program.compile_beside(beside)
-        if program.has_run:
-            begin_others()
         with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
-            return program.unknown() if is_rehearsing() else program(x for x in leaves if isinstance(x, _ARRAYS))
+            return program(x for x in leaves if isinstance(x, _ARRAYS))
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
         args, kwargs = jax.tree.unflatten(treedef, arrays_on_device(leaves))
@@ -166,7 +159,7 @@ class StoredFunction(Generic[T]):
                 raise
             return _Program.of(jitted, structure[0])
         exported = export.deserialize(bytearray(stored))  # the first one holds its trace, 1 to 3 MB
-        program = _Program.of(_compiled(path, exported, home), structure[0], exported, size=len(stored), is_new=True)
+        program = _Program.of(_compiled(path, exported, home), structure[0], size=len(stored))
         if code_state(look=True) != state:  # it changed while it was traced
             return program
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
@@ -179,71 +172,24 @@ class StoredFunction(Generic[T]):
 class _Program:
     """A function of all arrays of the arguments, compiled by `jax.jit`.
 
-    `result` is the structure of its result, `memory` its estimated memory in bytes, `arguments` and `results` the types of the
-    arrays of a stored program; `is_new` is True if it was traced in this process and has not been run; `used` is the time of
-    the last use, `compiling` the thread that compiles it.
+    `result` is the structure of its result, `memory` its estimated memory in bytes, `used` the time of the last use.
     """
 
     run: Callable[..., list[Array]]
     result: Skeleton
     memory: int = 0
-    arguments: Sequence[jax.ShapeDtypeStruct] = ()
-    results: Sequence[jax.ShapeDtypeStruct] | None = None
-    is_new: bool = False
-    has_run: bool = False
     used: int = dataclasses.field(default_factory=lambda: next(_clock))
-    compiling: threading.Thread | None = None
 
     @classmethod
-    def of(
-        cls,
-        run: Callable[..., list[Array]],
-        structure: Description,
-        exported: export.Exported | None = None,
-        *,
-        size: int = UNKNOWN_STORED_SIZE,
-        is_new: bool = False,
-    ) -> _Program:
+    def of(cls, run: Callable[..., list[Array]], structure: Description, size: int = UNKNOWN_STORED_SIZE) -> _Program:
         places = itertools.count()
         result = Skeleton(rebuild(structure, map(Slot, places)))
         if result.size != next(places):
             raise Undescribable("an array of the result is in a static field")
-        memory = MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * size
-        if exported is None:
-            return cls(run, result, memory)
-        arguments, results = (list(map(_type_of, avals)) for avals in (exported.in_avals, exported.out_avals))
-        return cls(run, result, memory, arguments, results, is_new)
+        return cls(run, result, MEMORY_PER_PROGRAM + MEMORY_PER_STORED_BYTE * size)
 
     def __call__(self, arrays: Iterable[Array | np.ndarray]) -> Any:
-        compiling, self.compiling, self.is_new = self.compiling, None, False
-        if compiling is not None:
-            compiling.join()
-        found = self.run(*arrays)
-        self.has_run = True
-        return self.result.filled(found)
-
-    def compile_beside(self, what: Callable[[], None]) -> None:
-        """Begins to compile a new program in a thread, and does what is to be done beside."""
-        if self.compiling is None:
-            lowered = self.run.lower(*self.arguments)  # pyright: ignore[reportFunctionMemberAccess]
-            self.compiling = threading.Thread(target=_compile, args=(lowered,))
-            self.compiling.start()
-            what()
-
-    def unknown(self) -> Any:
-        """Zeros in place of results that have not been computed."""
-        if self.results is None:
-            raise Unstored
-        return self.result.filled(on_device([np.zeros(x.shape, x.dtype) for x in self.results]))
-
-
-def _type_of(aval: Any) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type)
-
-
-def _compile(lowered: jax.stages.Lowered) -> None:
-    with contextlib.suppress(Exception):  # the compiler fails once more where the program is run
-        lowered.compile()
+        return self.result.filled(self.run(*arrays))
 
 
 _pausing = threading.Lock()
@@ -309,7 +255,7 @@ def _read(path: Path, home: Sharding) -> _Program | None:
         exported = export.deserialize(bytearray(stored))
     except (OSError, ImportError):
         return None
-    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], exported, size=len(stored))
+    return _Program.of(_compiled(path, exported, home), json.loads(head)["structure"], size=len(stored))
 
 
 def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable[..., list[Array]]:

@@ -104,28 +104,6 @@ def test_known_numbers_are_computed_with_while_jax_transforms():
     assert not compat.traced(seen[0]) and float(seen[0]) == 3.0
 
 
-def test_a_transformation_is_resumed_in_its_rules():
-    """A derivative that is taken within the rule of an operation is that of what is around the rule."""
-    resumed, found = [], []
-
-    @jax.custom_jvp
-    def function(x):
-        return x
-
-    @function.defjvp
-    def _(primals, tangents):
-        with resumed[0]():
-            found.append(jnp.sin(resumed[1]))
-        return primals[0], tangents[0]
-
-    def outer(x):
-        resumed[:] = compat.resuming(), x
-        return function(x) + found[0] if found else function(x) + jnp.sin(x)
-
-    assert jax.jvp(outer, (0.0,), (1.0,))[1] == 2.0
-    assert len(found) == 1 and compat.traced(found[0])
-
-
 def test_places_are_left_out_and_come_back():
     frames = importlib.import_module("jax._src.traceback_util")
     asked = frames.include_filename

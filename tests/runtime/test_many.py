@@ -4,23 +4,22 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import scene
 
-from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.runtime import many
 from jaxvib.runtime.cache import keep_programs
-from jaxvib.runtime.rehearsal import begin_others
+from jaxvib.runtime.programs import cached
 
 
-def test_items_are_taken_in_order_with_the_first_one_alone(monkeypatch):
+def test_items_are_taken_as_there_is_room(monkeypatch):
     monkeypatch.setattr(many, "cores", lambda: 3)
-    taken, threads = [], {}
+    taken = []
 
     def items():
         for k in range(20):
@@ -28,16 +27,13 @@ def test_items_are_taken_in_order_with_the_first_one_alone(monkeypatch):
             yield k
 
     def computed(k):
-        threads[k] = threading.current_thread()
         return k * k
 
     finished = 0
     for k, found in many.in_parallel(computed, items()):
         finished += 1
-        assert found == k * k and len(taken) - finished <= 4 and (finished > 1 or len(taken) == 1)
-    assert (
-        finished == 20 and threads[0] is threading.main_thread() and threading.main_thread() not in list(threads.values())[1:]
-    )
+        assert found == k * k and len(taken) - finished <= 4
+    assert finished == 20
     assert list(many.in_parallel(computed, [])) == []
 
 
@@ -59,35 +55,36 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
     assert len(begun) < 30
 
 
-def test_other_threads_begin_when_a_known_program_runs_again(monkeypatch, tmp_path, unwatched):
-    """Nothing else runs beside the first item of a new program; other items run beside a known one."""
+@pytest.mark.parametrize("stored", [True, False])
+def test_threads_compile_a_new_program_once(monkeypatch, tmp_path, unwatched, stored):
+    monkeypatch.setattr(many, "cores", lambda: 4)
+    keep_programs(tmp_path if stored else None)
+    traces, compiled = [], []
+
+    def listen(event, seconds, **_):
+        compiled.extend([event] * (event == "/jax/core/compile/backend_compile_duration"))
+
+    def tripled(x):
+        traces.append(threading.get_ident())
+        time.sleep(0.1)  # until the other threads ask for the same program
+        return 3.0 * x
+
+    function = cached(tripled)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        found = many.in_threads(lambda k: function(np.full(2, float(k))).tolist(), 4)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert found == [[3.0 * k] * 2 for k in range(4)]
+    assert len(traces) == 1 and len(compiled) == 1
+    assert len(list(tmp_path.iterdir())) == stored
+
+
+def test_items_are_computed_side_by_side(monkeypatch):
     monkeypatch.setattr(many, "cores", lambda: 2)
-    keep_programs(tmp_path)
-    threads, both = [], threading.Event()
-
-    def computed(x):
-        frequency_bounds(asked)
-        threads.append(threading.current_thread())
-        if len(set(threads)) == 2:
-            both.set()
-        if wait:
-            assert both.wait(20.0)  # until another thread has come as far
-        return x + 1.0
-
-    asked, wait = scene("one_mass", "balls"), False
-    np.testing.assert_array_equal(many.in_chunks(2, computed, np.arange(3.0)), np.arange(3.0) + 1.0)
-    assert threads[0] is threading.main_thread()
-    threads.clear(), both.clear()
-    wait = True
-    np.testing.assert_array_equal(many.in_chunks(2, computed, np.arange(8.0)), np.arange(8.0) + 1.0)
-    threads.clear(), both.clear()
-    assert sorted(k for k, _ in many.in_parallel(lambda k: computed(np.ones(2)), range(4))) == [0, 1, 2, 3]
-
-
-def test_a_rehearsal_starts_no_threads(monkeypatch):
-    """They would run what is only to be traced."""
-    monkeypatch.setattr(many, "is_rehearsing", lambda: True)
-    assert set(many.in_threads(lambda _: threading.current_thread(), 5)) == {threading.main_thread()}
+    both = threading.Barrier(2, timeout=20.0)
+    assert sorted(many.in_threads(lambda _: both.wait(), 2)) == [0, 1]
+    assert sorted(found for _, found in many.in_parallel(lambda _: both.wait(), range(2))) == [0, 1]
 
 
 def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
@@ -112,7 +109,6 @@ def test_nobody_waits_for_a_thread_that_has_not_begun(monkeypatch):
     busy = pool.submit(free.wait)
 
     def squared(k):
-        begin_others()
         return k * k, threading.current_thread()
 
     try:

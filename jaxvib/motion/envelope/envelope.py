@@ -39,7 +39,6 @@ from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
 from jaxvib.results.status import failure, member, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together, is_rehearsing
 from jaxvib.steady.balance.monodromy import at_constant_speed
 from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, number, traced
@@ -122,7 +121,6 @@ class _Units(eqx.Module):
 
 @validated
 @refuse_former(tolerance=FORMER["tolerance"], controller=FORMER["controller"])
-@compiled_together
 def envelope(
     scene: Scene,
     until: Number,
@@ -201,7 +199,7 @@ def envelope(
         return refuse_unknowns(asked, run, EnvelopeStatus.refused)
     if throw:
         _raise_if_failed(run, max_steps)
-    if not is_rehearsing() and bool(run.settled) and status_name(run.status) == "done":
+    if bool(run.settled) and status_name(run.status) == "done":
         return _judged_by_separation(run)
     return run
 

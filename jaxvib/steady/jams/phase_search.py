@@ -21,7 +21,6 @@ from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
@@ -162,7 +161,6 @@ def phase_jams(
     return _jams_near(scene, parts, *starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count))))
 
 
-@compiled_together
 def _jams_near(scene: Scene, parts: Parts, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
     """The jams that are found from these load speeds (n,) and phases (n, count)."""
     omega, phase = in_chunks(_STARTS, lambda w, a: _balanced_many(parts, w, a), omega, phase)

@@ -24,7 +24,6 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.many import in_chunks
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.floquet import Floquet, is_stiff, steps_for
@@ -97,7 +96,6 @@ class ExactBranches(Result):
         return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
 
 
-@compiled_together
 def exact_branches(
     scene: Scene,
     *,

@@ -22,7 +22,6 @@ from jaxvib.numerics.fourier import grid_of
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.runtime.rehearsal import compiled_together
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
@@ -50,7 +49,6 @@ _FAR = 0.02
 
 
 @validated
-@compiled_together
 def jam_orbit(
     scene: Scene,
     *,
