@@ -70,7 +70,7 @@ def main() -> None:
     speeds = np.linspace(-1.0, -0.1, options.starts // 64 * 64)
     omega = float(SCENE.drive.speed)
     end = 2.0 * np.pi * options.turns / omega / options.share
-    own = SCENE.loads.own_frequency(SCENE.drive.speed)
+    own = SCENE.loads.natural_frequency(SCENE.drive.speed)
     assert own is not None
     steps = jv.EqualSteps(4 * math.ceil(end * float(own) / 4))
     values = jnp.asarray(speeds)

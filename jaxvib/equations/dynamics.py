@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.sliding import Kinematics, dot, kinematics, missing_force, slid, slip_rates, total
+from jaxvib.equations.sliding import Kinematics, contact_force, dot, kinematics, resolve_contact, slip_rates, total
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
@@ -27,7 +27,7 @@ from jaxvib.machine.effects.terms import (
     SlipRelease,
     SupportForce,
 )
-from jaxvib.machine.loads import Loads, Twisting
+from jaxvib.machine.loads import DrillingSpin, Loads
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, times
 
@@ -35,14 +35,14 @@ __all__ = ["Dynamics", "Spin", "State", "vector_field"]
 
 
 class Spin(eqx.Module):
-    """What of the loads' own rotation is free, where effects make it so (`FreeSpin`, `Sliding`); also how it changes.
+    """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`); also the time derivative of one.
 
-    **Attributes**: `twist` (count,) rad/s, a load's spin about the normal of its contact, relative to its track; `slip`, a
+    **Attributes**: `drilling` (count,) rad/s, a load's spin about the normal of its contact, relative to its track; `slip`, a
     (count,) array m/s for each coordinate of a load, the velocity of its point of contact relative to the track along that
-    coordinate. Each is None where no effect frees it.
+    coordinate. Each is None if no effect releases it.
     """
 
-    twist: Array | None = None
+    drilling: Array | None = None
     slip: tuple[Array, ...] | None = None
 
 
@@ -159,12 +159,12 @@ class Dynamics(eqx.Module):
         if slip is not None:
             # Whether a load sticks or slides: by what the motion in which all of them roll asks of its contact.
             u, rate = state.angle, state.rate
-            pressing = self.loads.pressing(u, rate, total_gravity(self.effects))
-            assert pressing is not None
+            normal_force = self.loads.normal_force(u, rate, total_gravity(self.effects))
+            assert normal_force is not None
             centre = self.centre_forces(state, speed)
-            needed = missing_force(self.loads, loads, change, at_loads, centre, 1.0)
+            needed = contact_force(self.loads, loads, change, at_loads, centre, 1.0)
             (limit,) = terms_of(self.effects, SlipRelease)
-            moved = slid(self.loads, loads, slip, limit, pressing, at_loads, needed, force, centre, friction)
+            moved = resolve_contact(self.loads, loads, slip, limit, normal_force, at_loads, needed, force, centre, friction)
             a, carrier, part, rotor = accelerations(moved.friction, moved.force, moved.kappa)
             at_loads = self._at_loads(a)
             change = part.change(at_loads)
@@ -172,28 +172,30 @@ class Dynamics(eqx.Module):
             for each in friction:
                 for i, f in enumerate(each.linear(at_loads)):
                     rolled[i] = rolled[i] + f
-            lacking = missing_force(self.loads, loads, change, at_loads, rolled, kappa)
+            lacking = contact_force(self.loads, loads, change, at_loads, rolled, kappa)
             inertia = (kappa - 1.0) * self.loads.mass
             slip_change = slip_rates(self.loads, u, rate, slip, [f / inertia for f in lacking])
         else:
             slip_change = None
-        twisting = self._twisting(state, speed)
-        spin = None if twisting is None and slip is None else Spin(None if twisting is None else twisting.rate, slip_change)
+        drilling = self._drilling_spin(state, speed)
+        spin = None if drilling is None and slip is None else Spin(None if drilling is None else drilling.rate, slip_change)
         return State(state.velocity, carrier, state.rate, change, None if rotor is None else (speed, rotor), spin)
 
     def _slip(self, state: State) -> tuple[Array, ...] | None:
         if not has_term(self.effects, SlipRelease):
             return None
         if state.spin is None or state.spin.slip is None:
-            raise InputError("state.spin", "has no slip, which an effect of the scene makes free; see with_spin(scene, state)")
+            raise InputError("state.spin", "has no slip, which an effect of the scene releases; see with_spin(scene, state)")
         return state.spin.slip
 
-    def _twisting(self, state: State, speed: Array) -> Twisting | None:
+    def _drilling_spin(self, state: State, speed: Array) -> DrillingSpin | None:
         if not has_term(self.effects, DrillingSpinRelease):
             return None
-        if state.spin is None or state.spin.twist is None:
-            raise InputError("state.spin", "has no twist, which an effect of the scene makes free; see with_spin(scene, state)")
-        return self.loads.twisting(state.angle, state.rate, speed, state.spin.slip)
+        if state.spin is None or state.spin.drilling is None:
+            raise InputError(
+                "state.spin", "has no drilling spin, which an effect of the scene releases; see with_spin(scene, state)"
+            )
+        return self.loads.drilling_spin(state.angle, state.rate, speed, state.spin.slip)
 
     def _unforced(self, state: State, speed: Array) -> Array:
         """Accelerations of the carrier without loads and imbalance."""
@@ -220,10 +222,10 @@ class Dynamics(eqx.Module):
         turning = loads.spin_force(state.angle, state.rate, speed) if rotation else None
         if turning is not None:
             force = [f + s for f, s in zip(force, turning, strict=True)]
-        twisting = self._twisting(state, speed) if rotation else None
-        if twisting is not None:
-            assert state.spin is not None and state.spin.twist is not None
-            force = [f + state.spin.twist * s for f, s in zip(force, twisting.force, strict=True)]
+        drilling = self._drilling_spin(state, speed) if rotation else None
+        if drilling is not None:
+            assert state.spin is not None and state.spin.drilling is not None
+            force = [f + state.spin.drilling * s for f, s in zip(force, drilling.force, strict=True)]
         for term in terms_of(self.effects, LoadPotential, LoadResistance, LoadInteraction):
             for extra in term.forces(loads, state.angle, state.rate):
                 force = [f + e for f, e in zip(force, extra, strict=True)]

@@ -12,7 +12,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import Dynamics, State, vector_field
-from jaxvib.equations.sliding import dot, kinematics, missing_force
+from jaxvib.equations.sliding import contact_force, dot, kinematics
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
@@ -92,10 +92,10 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         found = kinematics(loads, state.angle, state.rate)
         pairs = zip(state.spin.slip, found.columns, found.sizes, strict=True)
         parts += [jnp.sum(own * loads.mass * c * (0.5 * c - dot(column, p_rate) / size)) for c, column, size in pairs]
-    if state.spin is not None and state.spin.twist is not None:
-        twisting = loads.twisting(state.angle, state.rate, rate)
-        assert twisting is not None
-        parts.append(jnp.sum(0.5 * twisting.inertia * state.spin.twist**2))
+    if state.spin is not None and state.spin.drilling is not None:
+        drilling = loads.drilling_spin(state.angle, state.rate, rate)
+        assert drilling is not None
+        parts.append(jnp.sum(0.5 * drilling.inertia * state.spin.drilling**2))
     parts.append(rate * _throw_rate(scene, turn) @ v)
     motor = scene.drive.torque_and_inertia(rate)
     if motor is not None:
@@ -156,14 +156,14 @@ def _spin_power(
         return (), (zero, zero)
     u, rate = state.angle, state.rate
     supplied, lost, rates = zero, zero, ()
-    if spin.twist is not None:
-        twisting = loads.twisting(u, rate, speed)
-        assert twisting is not None
-        supplied = speed * jnp.sum(twisting.force[0] * spin.twist)
+    if spin.drilling is not None:
+        drilling = loads.drilling_spin(u, rate, speed)
+        assert drilling is not None
+        supplied = speed * jnp.sum(drilling.force[0] * spin.drilling)
     if spin.slip is not None:
         found = kinematics(loads, u, rate)
         rates = tuple(c / size for c, size in zip(spin.slip, found.sizes, strict=True))
-        contact = missing_force(loads, found, change.rate, at_load, field.centre_forces(state, speed), 1.0)
+        contact = contact_force(loads, found, change.rate, at_load, field.centre_forces(state, speed), 1.0)
         lost = -jnp.sum(dot(contact, spin.slip))
         turning = loads.spin_force(u, rate, speed)
         if turning is not None:
@@ -175,7 +175,7 @@ def _spin_power(
 def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
     """The force N with which each load presses on its track, (count,) N; negative where the track would have to pull.
 
-        N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.pressing`
+        N = m (centrifugal force of u' - n . (acceleration of the load's carrier + gravity upward)),    see `Loads.normal_force`
 
     The equations keep a load on its track all the same; friction with the normal force is then none. `t` s, where the rotor
     is; n the direction in which the load presses.
@@ -196,12 +196,12 @@ def normal_force(scene: Scene, t: Array | float, state: State) -> Array:
 
 @cached
 def _normal_force(scene: Scene, t: Array, state: State) -> Array:
-    pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
-    if pressing is None:
-        problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.pressing)"
+    normal_force = scene.loads.normal_force(state.angle, state.rate, total_gravity(scene.effects))
+    if normal_force is None:
+        problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
         raise InputError("loads.kind", problem)
     acceleration = vector_field(scene)(jnp.asarray(t, state.displacement.dtype), state).velocity
-    return pressing.at(scene.machine.carrier().point_rates(acceleration))
+    return normal_force.at(scene.machine.carrier().point_rates(acceleration))
 
 
 def _throw_rate(scene: Scene, turn: Array) -> Array:

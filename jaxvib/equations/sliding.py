@@ -1,4 +1,4 @@
-"""What the contact of a rolling load asks of its track, what the track can give, and how a load slides."""
+"""Contact of rolling loads with their track: the force that rolling needs, Coulomb's limit, and sliding."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.machine.effects.terms import Coordinates, Friction, SlipRelease
-from jaxvib.machine.loads import Loads, Pressing
+from jaxvib.machine.loads import Loads, NormalForce
 
-__all__ = ["Kinematics", "Slid", "dot", "kinematics", "missing_force", "slid", "slip_rates", "total"]
+__all__ = ["ContactSolution", "Kinematics", "contact_force", "dot", "kinematics", "resolve_contact", "slip_rates", "total"]
 
 
 class Kinematics(NamedTuple):
-    """Of the loads: the columns of J = dp/du, and c = (dJ/dt) u'; each an x, a y and, where loads move so, a z.
+    """Columns of J = dp/du of the loads, and c = (dJ/dt) u'; each an x, a y and, if loads move along the axis, a z.
 
-    `lengths` are those of the columns, where they are the same all along the track: see `Loads.tangent_lengths`.
+    `lengths` of the columns are known if they are constant along the track, see `Loads.tangent_lengths`.
     """
 
     columns: list[tuple[Array, ...]]
@@ -43,12 +43,12 @@ class Kinematics(NamedTuple):
 
     @property
     def turning(self) -> list[Array] | None:
-        """J^T c, m^2/s^2; None where it is 0 for any motion."""
+        """J^T c, m^2/s^2; None if it is 0 for every motion."""
         return None if self.lengths is not None else [dot(column, self.curvature) for column in self.columns]
 
 
 def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
-    """J and (dJ/dt) u' of all loads at once (the position acts elementwise)."""
+    """Return J and (dJ/dt) u' of all loads at once (the position acts elementwise)."""
 
     def along(direction: Coordinates) -> Callable[..., tuple[Array, ...]]:
         return lambda *v: jax.jvp(loads.position, v, direction)[1]
@@ -57,14 +57,16 @@ def kinematics(loads: Loads, u: Coordinates, rate: Coordinates) -> Kinematics:
     return Kinematics(columns, jax.jvp(along(rate), u, rate)[1], loads.tangent_lengths())
 
 
-def missing_force(
+def contact_force(
     loads: Loads, found: Kinematics, change: Coordinates, a: Mapping[int, Array], force: Sequence[Array], kappa: Array | float
 ) -> list[Array]:
-    """What a motion needs along each coordinate's unit tangent besides the generalised `force`, (count,) N each.
+    """Return the force of the contact along each coordinate's unit tangent, (count,) N each.
 
         [kappa m J^T (J u'' + (dJ/dt) u') + m J^T a - Q]_i / |dp/du_i|
 
-    `change` u''; `a` the acceleration of what carries the loads, by axis; `kappa` 1 for the loads' mass alone.
+    It is what the motion needs besides the generalised `force` Q.
+
+    **Arguments**: `change` u''; `a` the acceleration of the points that carry the loads, by axis; `kappa`, 1 for mass alone.
     """
     turning, needed = found.turning, []
     for i, (column, metric, f, size) in enumerate(zip(found.columns, found.metric, force, found.sizes, strict=True)):
@@ -75,33 +77,33 @@ def missing_force(
     return needed
 
 
-class Slid(NamedTuple):
-    """Loads that stick or slide, each by itself: the inertia factor, the generalised force, the friction of what slides."""
+class ContactSolution(NamedTuple):
+    """Inertia factor, generalised force and friction of loads, each of which rolls or slides."""
 
     kappa: Array
     force: list[Array]
     friction: list[Friction]
 
 
-def slid(
+def resolve_contact(
     loads: Loads,
     found: Kinematics,
     slip: Coordinates,
     limit: SlipRelease,
-    pressing: Pressing,
+    normal_force: NormalForce,
     a: Mapping[int, Array],
     needed: Sequence[Array],
     rolling: Sequence[Array],
     centre: Sequence[Array],
     friction: Sequence[Friction],
-) -> Slid:
-    """How each load goes on, from the motion in which all of them roll: by that what the contact is asked for is known.
+) -> ContactSolution:
+    """Decide from the motion in which all loads roll which of them slide, and return the forces on each.
 
-    **Arguments**: `needed` along the track by that motion, N; `a` its acceleration of what carries the loads; the generalised
-    force of what acts on a load that is `rolling`, and at its `centre` alone; `friction` of the rolling.
+    **Arguments**: `needed`, the force along the track in that motion, N; `a`, its acceleration of the points that carry loads;
+    generalised forces on a load that is `rolling`, and at its `centre` alone; `friction` of the rolling.
     """
     kappa = loads.inertia_factor()
-    normal = pressing.at(a)
+    normal = normal_force.at(a)
     hold = limit.coefficient * (jnp.maximum(normal, 0.0) if loads.one_sided else jnp.abs(normal))
     wanted = [f - hold * c / limit.width for f, c in zip(needed, slip, strict=True)]
     fast = dot(slip, slip) > limit.width**2
@@ -109,7 +111,7 @@ def slid(
     along = [jnp.where(fast, -c, f) for c, f in zip(slip, wanted, strict=True)]
     size = jnp.sqrt(jnp.where(slides, dot(along, along), 1.0))
     levers = [jnp.where(slides, limit.coefficient * f / size, 0.0) * arm for f, arm in zip(along, found.sizes, strict=True)]
-    rubbing = Friction(levers[0], pressing.reaction, pressing.normal, tuple(levers[1:]), loads.one_sided).signed(a)
+    rubbing = Friction(levers[0], normal_force.reaction, normal_force.normal, tuple(levers[1:]), loads.one_sided).signed(a)
     # A slip within the width dies out while the load rolls.
     dying = [arm * kappa * hold * c / limit.width for c, arm in zip(slip, found.sizes, strict=True)]
     force = [jnp.where(slides, c, r - d) for c, r, d in zip(centre, rolling, dying, strict=True)]
@@ -119,11 +121,11 @@ def slid(
         )
         for each in friction
     ]
-    return Slid(jnp.where(slides, 1.0, kappa), force, [*kept, rubbing])
+    return ContactSolution(jnp.where(slides, 1.0, kappa), force, [*kept, rubbing])
 
 
 def slip_rates(loads: Loads, u: Coordinates, rate: Coordinates, slip: Coordinates, change: Sequence[Array]) -> Coordinates:
-    """How the slip along each coordinate changes: `change` (c')_t, and what the turning of the tangents adds."""
+    """Return the rate of the slip along each coordinate: `change` (c')_t and the part of the turning tangents."""
 
     def tangents(*v: Array) -> list[list[Array]]:
         columns = [jax.jvp(loads.position, v, _unit(v, i))[1] for i in range(len(v))]
@@ -141,10 +143,10 @@ def _unit(u: Coordinates, i: int) -> Coordinates:
 
 
 def total(values: Iterable[Array]) -> Array:
-    """The sum of arrays."""
+    """Return the sum of arrays."""
     return functools.reduce(operator.add, values)
 
 
 def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
-    """The sum of the products of two vectors' components."""
+    """Return the scalar product of two vectors."""
     return total(a * b for a, b in zip(x, y, strict=True))

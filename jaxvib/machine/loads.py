@@ -1,4 +1,4 @@
-"""Balls, rollers and pendulums: what runs free in the auto-balancer."""
+"""Loads on a circle: balls, rollers and pendulums."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from jaxvib.units.known import when_known
 
 __all__ = [
     "CircularLoads",
+    "DrillingSpin",
     "Loads",
-    "Pressing",
-    "Twisting",
+    "NormalForce",
     "balls",
     "own_radius",
     "pendulums",
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 
-class Pressing(NamedTuple):
+class NormalForce(NamedTuple):
     """The force N = `reaction` + `normal` . a with which each load presses on its track, a the acceleration of its carrier.
 
     `reaction` (count,) N; `normal` (across, up) in kg, (count,) each.
@@ -44,11 +44,13 @@ class Pressing(NamedTuple):
         return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
 
 
-class Twisting(NamedTuple):
-    """What a spin s of each load about the normal of its contact, relative to its track, does and what changes it.
+class DrillingSpin(NamedTuple):
+    """Dynamics of the spin s of each load about the normal of its contact, relative to its track.
 
-    s' = `rate` (count,) rad/s^2 while nothing holds it; generalised forces s `force`, a (count,) array for each coordinate;
-    energy `inertia` s^2/2, kg m^2; s = `still` (count,) rad/s of a load that does not turn in space.
+    - `rate` s' (count,) rad/s^2 of a free spin
+    - `force`, generalised forces per s, a (count,) array for each coordinate
+    - `inertia`, kg m^2, of the energy inertia s^2/2
+    - `still`, s (count,) rad/s of a load that does not rotate in space
     """
 
     rate: Array
@@ -71,71 +73,72 @@ class Loads(eqx.Module):
     kind: eqx.AbstractVar[str]
 
     circular: ClassVar[bool] = False
-    """Whether the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
+    """True if the loads run on a circle about the rotor's axis and have no other coordinate, as `CircularLoads`."""
 
     one_sided: ClassVar[bool] = False
-    """Whether the track holds a load by pressing alone: where N (`pressing`) is negative the load would leave it."""
+    """True if the track only pushes: a load whose normal force is negative would leave it."""
 
     @property
     def has_bearing(self) -> bool:
-        """Whether each load hangs on the shaft by a bearing of its own, as a pendulum does."""
+        """True if each load hangs on the shaft by a bearing of its own, as a pendulum does."""
         return False
 
     @abc.abstractmethod
     def position(self, *u: Array) -> tuple[Array, ...]:
-        """The load's own position p(u), m: (across, up) in the rotor's plane, and along its axis where it moves there."""
+        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along its axis if it moves there."""
 
     def tangent_lengths(self) -> tuple[Array, ...] | None:
-        """|dp/du_i| m, where they are the same all along the track and the tangents square to each other; else None.
+        """Return |dp/du_i| m if they are constant along the track and the tangents are orthogonal; otherwise None.
 
-        J^T J is then a constant diagonal, and J^T (dJ/dt) u' = 0, J = dp/du: the equations need compute neither.
+        J^T J is then a constant diagonal matrix, and J^T (dJ/dt) u' = 0, J = dp/du: the equations need to compute neither.
         """
         return None
 
     @abc.abstractmethod
     def rest(self) -> tuple[Array, ...]:
-        """The coordinates u of loads at rest, all at one point, (count,) each."""
+        """Return the coordinates u of loads at rest, all at one point, (count,) each."""
 
     def arm(self) -> Array:
-        """How far from the rotor's axis each load is at rest, (count,) m."""
+        """Return the distance of each load at rest from the rotor's axis, (count,) m."""
         across, up, *_ = self.position(*self.rest())
         return jnp.hypot(across, up)
 
     @abc.abstractmethod
     def inertia_factor(self) -> Array:
-        """kappa: the load's inertia along its track is kappa times that of its mass alone."""
+        """Return kappa, the inertia of a load along its track relative to that of its mass alone."""
 
     @abc.abstractmethod
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
-        """Generalised force of the viscous resistance against the rotor that turns at `speed`, N m."""
+        """Return the generalised force of the viscous resistance against the rotor that turns at `speed`, N m."""
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
-        """Generalised force of a rolling load's own rotation besides kappa, N m; it does no work. None where there is none."""
+        """Return the gyroscopic generalised force of a rolling load's rotation, N m, which does no work; None without one."""
         return None
 
-    def twisting(
+    def drilling_spin(
         self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
-    ) -> Twisting | None:
-        """What a spin about the normal of the contact does, see `Twisting`; None for loads that nothing couples to it. `slip`
-        of the contact along each coordinate, m/s, where it may slide."""
+    ) -> DrillingSpin | None:
+        """Return the dynamics of a spin about the normal of the contact; None for loads that are not coupled to it.
+
+        **Arguments**: `slip` of the contact along each coordinate, m/s, if it may slide.
+        """
         return None
 
-    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing | None:
-        """How hard the loads press on their track under gravity `g` (by axis, m/s^2 upward); None where nothing says it."""
+    def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce | None:
+        """Return the force of the loads on their track under gravity `g` (by axis, m/s^2 upward); None if it is not defined."""
         return None
 
     def offsets(self) -> Array:
-        """How far ahead of the middle each load is, (count,) rad, where loads at rest that cannot all be at one point lie side
-        by side."""
+        """Return the angles of loads at rest that lie side by side, relative to their middle, (count,) rad; 0 at one point."""
         return jnp.zeros((self.count,), dtype=jnp.result_type(self.mass))
 
-    def own_frequency(self, speed: Array) -> Array | None:
-        """The frequency of the loads' own motions that a step must resolve beside the rotor's `speed`, rad/s; or None."""
+    def natural_frequency(self, speed: Array) -> Array | None:
+        """Return the natural frequency of the loads, rad/s, which steps must resolve beside the rotor's `speed`; or None."""
         return None
 
 
 def own_radius(loads: Loads, field: str = "loads.own_radius") -> Array:
-    """r m of loads that have a size. **Raises** `InputError`, of `field`, for others."""
+    """Return the radius r of loads that have a size, m. **Raises** `InputError` for others, naming the `field`."""
     own = getattr(loads, "own_radius", None)
     if own is None:
         advice = "give balls or rollers their own_radius"
@@ -170,57 +173,57 @@ class CircularLoads(Loads):
 
     @property
     def has_bearing(self) -> bool:
-        """A pendulum has one; a ball or a roller rolls in its track."""
+        """True for pendulums; balls and rollers roll on their track."""
         return self.inertia is not None
 
     @property
     def alike(self) -> bool:
-        """Whether all loads share every number."""
+        """True if all loads share every number."""
         return all(x is None or x.ndim == 0 for x in (self.mass, self.radius, self.drag, self.inertia))
 
     def position(self, *u: Array) -> tuple[Array, Array]:
-        """R (cos phi, sin phi)."""
+        """Return R (cos phi, sin phi)."""
         (phi,) = u
         return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
 
     def tangent_lengths(self) -> tuple[Array]:
-        """R."""
+        """Return R."""
         return (self.radius,)
 
     def rest(self) -> tuple[Array]:
-        """At the bottom of the track, phi = -pi/2."""
+        """Return phi = -pi/2, the bottom of the track."""
         return (jnp.full((self.count,), -0.5 * jnp.pi, dtype=jnp.result_type(self.radius)),)
 
     def inertia_factor(self) -> Array:
-        """7/5 (ball), 3/2 (roller), 1 + J_C/(m R^2) (pendulum)."""
+        """Return 7/5 (ball), 3/2 (roller), 1 + J_C/(m R^2) (pendulum)."""
         if self.inertia is not None:
             return 1.0 + self.inertia / (self.mass * self.radius**2)
         return jnp.asarray({"ball": 1.4, "roller": 1.5}[self.kind], dtype=self.mass.dtype)
 
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
-        """- b_W R^2 (phi' - speed)."""
+        """Return - b_W R^2 (phi' - speed)."""
         (rate_phi,) = rate
         return (self.drag * self.radius**2 * (speed - rate_phi),)
 
-    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing:
-        """N = m (R phi'^2 - n . (a + g)), n the load's direction: away from the axis."""
+    def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce:
+        """Return N = m (R phi'^2 - n . (a + g)), n the load's direction, away from the axis."""
         (phi,), (turn,), m = u, rate, self.mass
         normal = (jnp.cos(phi), jnp.sin(phi))
-        return Pressing(m * (self.radius * turn**2 - g.get(1, 0.0) * normal[1]), (-m * normal[0], -m * normal[1]))
+        return NormalForce(m * (self.radius * turn**2 - g.get(1, 0.0) * normal[1]), (-m * normal[0], -m * normal[1]))
 
     def offsets(self) -> Array:
-        """How far ahead of the middle each load is when they are collected, (count,) rad: (2 j - N + 1) arcsin(r/R)."""
+        """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads side by side relative to their middle."""
         if self.own_radius is None:
             return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
         return side_by_side(self.count, self.own_radius / self.radius)
 
     def unbalance(self) -> Array:
-        """The unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
+        """Return the unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
         whole = jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
         return whole if self.own_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
 
     def drag_sum(self) -> Array:
-        """sum b_W R^2 of all loads, N m s: the torque that turns them, per speed difference to the rotor."""
+        """Return sum b_W R^2 of all loads, N m s: the driving torque per speed difference to the rotor."""
         return jnp.sum(jnp.broadcast_to(self.drag * self.radius**2, (self.count,)))
 
 
@@ -253,20 +256,20 @@ def _circular(
 
 
 def _fit(loads: CircularLoads, r: Array) -> None:
-    """**Raises** `InputError` for loads with an own radius that have no room side by side."""
+    """**Raises** `InputError` for loads with a radius that have no room side by side."""
     if not loads.alike:
         raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
     when_known(partial(require_side_by_side, loads.count), loads.radius, r)
 
 
 def side_by_side(count: int, ratio: Array) -> Array:
-    """(2 j - N + 1) arcsin(r/R), (count,) rad: angles about their middle of loads that touch, `ratio` r/R."""
+    """Return (2 j - N + 1) arcsin(r/R), (count,) rad: angles about their middle of loads that touch, `ratio` r/R."""
     angle = jnp.arcsin(ratio)
     return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 
 
 def require_side_by_side(count: int, radius: float, own_radius: float) -> None:
-    """**Raises** `InputError` where so many loads of an own radius have no room side by side on a circle of `radius`, m."""
+    """**Raises** `InputError` if `count` loads with a radius have no room side by side on a circle of `radius`, m."""
     most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
     if not own_radius < most:
         problem = f"{count} side by side on a circle of {radius:.6g} m have room below {most:.6g} m"

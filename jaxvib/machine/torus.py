@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.loads import Loads, Pressing, Twisting, require_side_by_side, side_by_side
+from jaxvib.machine.loads import DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
 from jaxvib.units import Number, number, numbers
 from jaxvib.units import count as whole
 from jaxvib.units.known import when_known
@@ -92,9 +92,9 @@ class TorusBalls(Loads):
         turn = _ROLLING * self.mass * speed * self._arm(u[1]) * self.gap * jnp.cos(u[1])
         return turn * rate[1], -turn * rate[0]
 
-    def twisting(
+    def drilling_spin(
         self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
-    ) -> Twisting:
+    ) -> DrillingSpin:
         """s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r, forces (2/5) m r s (B a', - rho sin a f'), s = w cos a of none."""
         (_, a), (turn, climb), m, own = u, rate, self.mass, self.own_radius
         arm, up = self._arm(a), jnp.sin(a)
@@ -102,16 +102,16 @@ class TorusBalls(Loads):
         change = climb * (speed * arm - self.radius * turn)
         if slip is not None:
             change = change + slip[0] * climb - slip[1] * turn * up
-        return Twisting(change / own, (lever * arm * climb, -lever * self.gap * up * turn), lever * own, speed * jnp.cos(a))
+        return DrillingSpin(change / own, (lever * arm * climb, -lever * self.gap * up * turn), lever * own, speed * jnp.cos(a))
 
-    def pressing(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> Pressing:
+    def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce:
         """N, against the tube's wall."""
         (f, a), m = u, self.mass
         normal = (jnp.sin(a) * jnp.cos(f), jnp.sin(a) * jnp.sin(f), -jnp.cos(a))
         held = self._arm(a) * rate[0] ** 2 * jnp.sin(a) + self.gap * rate[1] ** 2
-        return Pressing(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
+        return NormalForce(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
 
-    def own_frequency(self, speed: Array) -> Array:
+    def natural_frequency(self, speed: Array) -> Array:
         """w sqrt((R + rho) / (kappa rho)): of small motions about the outer equator of balls that turn with the rotor."""
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 

@@ -335,9 +335,9 @@ class _FieldWithDetachment(eqx.Module):
 
     def __call__(self, t: Array, state: State) -> State:
         scene, change = self.scene, self.equations(t, _plain(state))
-        pressing = scene.loads.pressing(state.angle, state.rate, total_gravity(scene.effects))
-        assert pressing is not None
-        force = pressing.at(scene.machine.carrier().point_rates(change.velocity))
+        normal_force = scene.loads.normal_force(state.angle, state.rate, total_gravity(scene.effects))
+        assert normal_force is not None
+        force = normal_force.at(scene.machine.carrier().point_rates(change.velocity))
         return _with_detachment(change, jnp.maximum(-force, 0.0))
 
 

@@ -49,7 +49,7 @@ class StepControl(eqx.Module):
 
 def repeat_per_coordinate(unit: State, number: int) -> State:
     """Natural units with one for each of so many coordinates of a load."""
-    spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.twist, unit.spin.slip * number)
+    spin = unit.spin if unit.spin is None or unit.spin.slip is None else Spin(unit.spin.drilling, unit.spin.slip * number)
     return State(unit.displacement, unit.velocity, unit.angle * number, unit.rate * number, unit.rotor, spin)
 
 
@@ -98,7 +98,7 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
     """
     scene = jax.lax.stop_gradient(scene)
     frequencies, speed = estimated_frequencies(scene), scene.drive.speed
-    own = scene.loads.own_frequency(speed)
+    own = scene.loads.natural_frequency(speed)
     fastest = jnp.maximum(speed, jnp.max(frequencies))
     fastest = fastest if own is None else jnp.maximum(fastest, jnp.max(own))
     fastest = jnp.maximum(fastest, effects_rate(scene))

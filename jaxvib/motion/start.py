@@ -157,37 +157,40 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     """
     if turning not in get_args(Turning):
         raise InputError("turning", f"is {quoted(turning)}; it must be 'rolling' or 'still'")
-    twists = has_term(scene.effects, DrillingSpinRelease)
-    slips = has_term(scene.effects, SlipRelease)
-    if not (twists or slips):
+    has_drilling = has_term(scene.effects, DrillingSpinRelease)
+    has_slip = has_term(scene.effects, SlipRelease)
+    if not (has_drilling or has_slip):
         if state.spin is not None:
             raise InputError("start.spin", "is given, but no effect of the scene makes it free; leave it out, or add FreeSpin")
         return state
     if state.spin is not None:
         n = (scene.loads.count,)
-        needed = (n if twists else None, (n,) * len(state.angle) if slips else None)
-        twist, slip = state.spin.twist, state.spin.slip
-        found = (None if twist is None else jnp.shape(twist), None if slip is None else tuple(map(jnp.shape, slip)))
+        needed = (n if has_drilling else None, (n,) * len(state.angle) if has_slip else None)
+        drilling, slip = state.spin.drilling, state.spin.slip
+        found = (None if drilling is None else jnp.shape(drilling), None if slip is None else tuple(map(jnp.shape, slip)))
         if found != needed:
-            problem = f"has shapes {found} of twist and slip; this scene needs {needed} (None where no effect frees it)"
+            problem = f"has shapes {found} of drilling and slip; this scene needs {needed} (None where no effect frees it)"
             raise InputError("start.spin", problem)
         return state
     zero = jnp.zeros_like(state.azimuth)
-    twist, slip = zero, tuple(zero for _ in state.angle)
+    drilling, slip = zero, tuple(zero for _ in state.angle)
     if turning == "still":
         loads, u, rate, w = scene.loads, state.angle, state.rate, scene.drive.rotor_speed(jnp.zeros(()), state.rotor)
-        twisting, pressing = loads.twisting(u, rate, w), loads.pressing(u, rate, {})
-        twist = zero if twisting is None else twisting.still
-        if slips:
-            assert pressing is not None
+        spin, normal_force = loads.drilling_spin(u, rate, w), loads.normal_force(u, rate, {})
+        drilling = zero if spin is None else spin.still
+        if has_slip:
+            assert normal_force is not None
             own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
-            across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), pressing.normal, strict=False))
+            across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), normal_force.normal, strict=False))
             along = jax.jvp(loads.position, u, rate)[1]
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])
             found = kinematics(loads, u, rate)
             slip = tuple(dot(column, relative) / size for column, size in zip(found.columns, found.sizes, strict=True))
     return eqx.tree_at(
-        lambda s: s.spin, state, Spin(twist if twists else None, slip if slips else None), is_leaf=lambda leaf: leaf is None
+        lambda s: s.spin,
+        state,
+        Spin(drilling if has_drilling else None, slip if has_slip else None),
+        is_leaf=lambda leaf: leaf is None,
     )
 
 

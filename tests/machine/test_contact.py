@@ -119,7 +119,7 @@ def test_steps_of_captures_and_ensembles_resolve_a_contact():
     swing = np.sqrt(1e5 / (0.7 * float(s.loads.mass) / (1.0 - (OWN / 0.2025) ** 2)))
     np.testing.assert_allclose(frequency_bounds(touching)[0], swing, rtol=1e-12)
     np.testing.assert_allclose(steps_per_second(touching), 2.0 * swing, rtol=1e-12)
-    assert steps_per_second(bare) == float(bare.loads.own_frequency(140.0)) < swing
+    assert steps_per_second(bare) == float(bare.loads.natural_frequency(140.0)) < swing
 
 
 def test_touching_jammed_balls_have_the_unbalance_of_their_arc():

@@ -34,7 +34,7 @@ def compared(run):
     end = jax.tree.map(lambda leaf: np.asarray(leaf[-1, 0]), (run.trajectory.state.angle, run.trajectory.state.rate))
     (f, a), (turn, climb) = end
     arm = RADIUS + GAP * np.sin(a)
-    twist = float(run.trajectory.state.spin.twist[-1, 0])
+    twist = float(run.trajectory.state.spin.drilling[-1, 0])
     return np.array([turn, climb, arm * np.cos(f), arm * np.sin(f), np.mod(a, 2.0 * np.pi), twist])
 
 
@@ -67,7 +67,7 @@ def test_sliding_ball_starts_to_roll_like_a_rigid_ball():
     start = jv.with_spin(plain, at(*START), "still")
     along = RIGID.slip(still) @ np.array([-np.sin(0.3), np.cos(0.3), 0.0])
     np.testing.assert_allclose(start.spin.slip[0], along, rtol=1e-12)
-    np.testing.assert_allclose(start.spin.twist, RIGID.coordinates(still)[-1], rtol=1e-12)
+    np.testing.assert_allclose(start.spin.drilling, RIGID.coordinates(still)[-1], rtol=1e-12)
 
     def ends(until, width):
         s = one_ball(jv.FreeSpin(), jv.Sliding(0.1, width))
@@ -171,7 +171,7 @@ def test_they_go_through_files_named_starts_and_ensembles():
     again = jv.scene_from_toml(jv.scene_to_toml(s))
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), s, again))
     rest = jv.initial_state(s)
-    assert rest.spin.twist.shape == (2,) and len(rest.spin.slip) == 2
+    assert rest.spin.drilling.shape == (2,) and len(rest.spin.slip) == 2
 
     one = one_ball(*BOTH)
 
@@ -181,7 +181,7 @@ def test_they_go_through_files_named_starts_and_ensembles():
     steps = jv.EqualSteps(200)
     many = jv.ensemble(make, jnp.asarray([50.0, 60.0]), 0.03, stepsize_controller=steps, estimate=False)
     run = jv.simulate(one, 0.03, start=make(60.0)[1], stepsize_controller=steps, samples=2, estimate=False)
-    np.testing.assert_allclose(many.state.spin.twist[1], run.trajectory.state.spin.twist[-1], rtol=1e-9)
+    np.testing.assert_allclose(many.state.spin.drilling[1], run.trajectory.state.spin.drilling[-1], rtol=1e-9)
     np.testing.assert_allclose(many.state.angle[1][1], run.trajectory.state.angle[1][-1], rtol=1e-9)
 
 

@@ -138,7 +138,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
     a = jnp.asarray([0.5 * jnp.pi + 1e-5])
     turning = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1), a), (jnp.full(1, SPEED), jnp.zeros(1)))
     stiffness = -evaluate(s, jnp.asarray(0.0), turning).rate[1][0] / 1e-5
-    np.testing.assert_allclose(jnp.sqrt(stiffness), s.loads.own_frequency(s.drive.speed), rtol=1e-6)
+    np.testing.assert_allclose(jnp.sqrt(stiffness), s.loads.natural_frequency(s.drive.speed), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -117,4 +117,4 @@ class DryFriction(Effect):
             return Friction(lever, m * r * speed**2 * jnp.ones_like(turn), None)
         if self.reaction == "run_up":
             return Friction(lever, m * r * (turn**2 - 2.0 * speed * (speed - turn)), None)
-        return Friction(lever, *loads.pressing(u, rate, g))
+        return Friction(lever, *loads.normal_force(u, rate, g))

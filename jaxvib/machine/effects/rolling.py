@@ -28,10 +28,10 @@ class RollingFriction(Effect):
 
         Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
-    J = dp/du, so that v is the velocity of the load's centre along the wall, seen from the rotor that turns at w; N is the
-    force with which the load presses on its track, found together with the accelerations (`Loads.pressing`); r the load's own
-    radius. A load that does not press has no friction. A load that would have to stick under the share s < 1 of what friction
-    can hold creeps at width artanh(s), which goes to zero with the width.
+    J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w. N is the normal
+    force (`Loads.normal_force`), solved together with the accelerations; r the radius of the load. A load that does not press
+    has no friction. A load that would have to stick under the share s < 1 of the largest friction creeps at width artanh(s),
+    which goes to zero with the width.
 
     **Arguments**: `coefficient` k, m (about 2e-5 to 4e-5 for steel balls on steel), 0 for none; `direction` "along" the
     rolling, or "each": for each coordinate of the load by itself, d_i = tanh(v_i/width), as the paper prints, so that the
@@ -76,8 +76,8 @@ class RollingFriction(Effect):
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
         """Return -(k/r) J^T d and N."""
-        pressing = loads.pressing(u, rate, g)
-        assert pressing is not None
+        normal_force = loads.normal_force(u, rate, g)
+        assert normal_force is not None
         slip = (rate[0] - speed, *rate[1:])
         scale = self.coefficient / own_radius(loads)
         if self.direction == "each":
@@ -90,7 +90,7 @@ class RollingFriction(Effect):
             share = jnp.where(moving, sliding_sign(speed_, self.width) / jnp.where(moving, speed_, 1.0), 1.0 / self.width)
             levers = jax.vjp(loads.position, *u)[1](tuple(share * x for x in v))
         first, *others = (-scale * lever for lever in levers)
-        return Friction(first, pressing.reaction, pressing.normal, tuple(others), loads.one_sided)
+        return Friction(first, normal_force.reaction, normal_force.normal, tuple(others), loads.one_sided)
 
     def _lever(self, loads: Loads, u: tuple[Array, ...], i: int, slip: Array) -> Array:
         """|dp/du_i| tanh(|dp/du_i| slip / width)."""

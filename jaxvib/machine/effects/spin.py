@@ -22,7 +22,7 @@ class FreeSpin(Effect):
 
         J s' = J a' (w B - R f') / r,    Q = (2/5) m r s (B a', - rho sin a f'),    J = (2/5) m r^2
 
-    s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.twist`, 0 at the
+    s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, 0 at the
     start unless given); the forces Q act on its two coordinates beside those of `TorusBalls`, whose s is held at 0 by the
     contact. No moment acts about the normal of a contact at a point, so that the ball's angular velocity there changes by the
     turning of the normal alone, s' = Omega . n' + (w cos a)'. While f' is constant, s grows by (w B - R f')/r for each radian
@@ -57,8 +57,8 @@ class FreeSpin(Effect):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads that are not coupled to their spin."""
         rest = loads.rest()
-        if jax.eval_shape(loads.twisting, rest, rest, jnp.zeros(())) is None:
-            problem = f"goes with balls in a torus; nothing couples {loads.kind!r} to a spin about the normal (twisting)"
+        if jax.eval_shape(loads.drilling_spin, rest, rest, jnp.zeros(())) is None:
+            problem = f"goes with balls in a torus; nothing couples {loads.kind!r} to a spin about the normal (drilling_spin)"
             raise InputError("effects.free_spin", problem)
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.machine.carrier import Carrier
-from jaxvib.machine.loads import Loads, Pressing
+from jaxvib.machine.loads import Loads, NormalForce
 
 __all__ = [
     "ContactFriction",
@@ -178,7 +178,7 @@ class Friction(NamedTuple):
     def _reaction(self, a: Mapping[int, Array]) -> Array:
         if self.normal is None:
             return self.reaction
-        return Pressing(self.reaction, self.normal).at(a)
+        return NormalForce(self.reaction, self.normal).at(a)
 
 
 @final
@@ -198,7 +198,7 @@ class ContactFriction:
 @final
 @dataclass(frozen=True)
 class DrillingSpinRelease:
-    """Freedom of rolling loads to spin about the normal of their contact (`Loads.twisting`, `Spin.twist`)."""
+    """Freedom of rolling loads to spin about the normal of their contact (`Loads.drilling_spin`, `Spin.drilling`)."""
 
     is_smooth: ClassVar[bool] = True
 

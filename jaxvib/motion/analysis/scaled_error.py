@@ -39,9 +39,9 @@ def natural_units(scene: Scene) -> State:
     speed = scene.drive.speed
     one = jnp.ones_like(speed)
     rotor = None if scene.drive.ideal else (one, speed)
-    twist = speed if has_term(scene.effects, DrillingSpinRelease) else None
+    drilling = speed if has_term(scene.effects, DrillingSpinRelease) else None
     slip = (speed * arm,) if has_term(scene.effects, SlipRelease) else None
-    spin = None if twist is None and slip is None else Spin(twist, slip)
+    spin = None if drilling is None and slip is None else Spin(drilling, slip)
     return jax.lax.stop_gradient(State(length, length * speed, (one,), (speed,), rotor, spin))
 
 
@@ -62,10 +62,10 @@ def error_scale(state: State, unit: State) -> State:
 
     spin = None
     if unit.spin is not None and state.spin is not None:
-        twist, slip = unit.spin.twist, unit.spin.slip
+        drilling, slip = unit.spin.drilling, unit.spin.slip
         slip = None if slip is None else tuple(xp.asarray(slip[0]) for _ in state.angle)
         # A spin grows with nothing but chance to bound it.
-        spin = Spin(None if twist is None or state.spin.twist is None else largest(state.spin.twist, twist), slip)
+        spin = Spin(None if drilling is None or state.spin.drilling is None else largest(state.spin.drilling, drilling), slip)
     return State(
         largest(state.displacement, unit.displacement),
         largest(state.velocity, unit.velocity),

@@ -97,7 +97,7 @@ def steps_per_second(scene: Scene, equations: Equations = vector_field) -> float
     slips, which do not act there, are those that effects tell.
     """
     values = np.linalg.eigvals(np.asarray(_jacobian(scene, equations)))
-    own = scene.loads.own_frequency(scene.drive.speed)
+    own = scene.loads.natural_frequency(scene.drive.speed)
     oscillation = max(np.max(np.abs(values.imag)), float(scene.drive.speed if own is None else jnp.max(own)))
     decay, added = np.max(-values.real, initial=0.0), float(effects_rate(scene))
     return float(max(_STEPS_PER_RADIAN * oscillation, decay / _DECAY_PER_STEP, _STEPS_PER_ADDED_RADIAN * added))

@@ -190,7 +190,7 @@ def test_a_threshold_is_that_of_no_step_and_of_no_smoothed_sign(width, finer):
     """The row p = 0.010, without chaotic outcomes: to 1e-3 of the rotor speed."""
     scene = published_torus(2.7, width=width)
     turns, speed = 1000, float(scene.drive.speed)
-    radians = 2.0 * np.pi * turns * float(scene.loads.own_frequency(speed)) / speed
+    radians = 2.0 * np.pi * turns * float(scene.loads.natural_frequency(speed)) / speed
     steps = jv.EqualSteps(finer * int(np.ceil(radians)))
     found = jv.capture(scene, THRESHOLD + np.linspace(-8e-3, 8e-3, 32), turns=turns, stepsize_controller=steps)
     assert abs(float(found.threshold) - THRESHOLD) < 1e-3
