@@ -70,14 +70,12 @@ def elastic(
         rows[:, np.arange(count), d + k + np.arange(count)] = -1.0
         return rows
 
-    nothing = np.zeros((s, 0, n))
-    positive = row(np.zeros((s, me + mi, d)), 0, me + mi) if me + mi else nothing
     rows = np.concatenate(
         [
-            row(a_rows, 0, me) if me else nothing,
-            row(-a_rows, 0, me) if me else nothing,
-            row(c_rows, me, mi) if mi else nothing,
-            positive,
+            row(a_rows, 0, me),
+            row(-a_rows, 0, me),
+            row(c_rows, me, mi),
+            row(np.zeros((s, me + mi, d)), 0, me + mi),
             row(identity, 0, 0),
             row(-identity, 0, 0),
         ],
