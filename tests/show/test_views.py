@@ -1,0 +1,83 @@
+"""Drawings of machines: what moves is drawn where it is, parts lie beside each other."""
+
+import numpy as np
+import pytest
+
+import jaxvib as jv
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.show.views import view_of
+from jaxvib.show.wheel import at_rest
+
+REACH = 20.0
+PLATFORMS = ["one_mass", "two_mass", "three_mass", "network"]
+
+
+def drawn(kind, displacement=None):
+    """The scene of a template and the outlines of its view at a displacement."""
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    pose = at_rest(scene)
+    if displacement is not None:
+        pose = pose._replace(displacement=np.asarray(displacement, float))
+    return scene, [part.points for part in view_of(scene).parts(pose, REACH)]
+
+
+def loads_of(points):
+    """Middles of the loads' outlines (n, 2): circles of 31 points."""
+    return np.array([np.mean(each[:-1], axis=0) for each in points if len(each) == 31])
+
+
+@pytest.mark.parametrize("kind", PLATFORMS)
+def test_loads_move_with_the_exciters_platform(kind):
+    scene, before = drawn(kind)
+    displacement = 1e-3 * np.arange(1.0, 1.0 + len(scene.machine.structure().coordinates))
+    after = drawn(kind, displacement)[1]
+    platforms = [np.mean(b[:, 1] - a[:, 1]) for a, b in zip(before, after, strict=True) if len(a) == 5]
+    np.testing.assert_allclose(platforms, REACH * displacement, rtol=1e-9)
+    exciter = int(np.argmax(_pushed(scene)))
+    np.testing.assert_allclose(
+        loads_of(after) - loads_of(before), np.tile([0.0, REACH * displacement[exciter]], (3, 1)), atol=1e-12
+    )
+
+
+def _pushed(scene):
+    """How much each platform is accelerated by loads that turn on a machine at rest."""
+    state = jv.initial_state(scene)
+    return np.abs(np.asarray(jv.vector_field(scene)(0.0, state).velocity))
+
+
+def test_a_rotors_loads_move_across_and_up():
+    _, before = drawn("planar_rotor")
+    _, after = drawn("planar_rotor", [1e-3, 2e-3])
+    np.testing.assert_allclose(loads_of(after) - loads_of(before), np.tile(REACH * np.array([1e-3, 2e-3]), (4, 1)), atol=1e-12)
+
+
+def test_a_tilting_rotors_loads_move_by_their_stations():
+    """The side view has them at their stations, moving up; the front view together, moving as the mass centre."""
+    scene, before = drawn("rotor")
+    size, stations = len(scene.machine.structure().coordinates), np.asarray(scene.machine.stations)
+    shift = loads_of(drawn("rotor", [1e-3, 2e-3, *[0.0] * (size - 2)])[1]) - loads_of(before)
+    np.testing.assert_allclose(shift[:4], np.tile([0.0, REACH * 2e-3], (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(shift[4:], np.tile(REACH * np.array([1e-3, 2e-3]), (4, 1)), atol=1e-12)
+    for k in range(2, size):
+        tilt = 1e-3 * (np.arange(size) == k)
+        shift = loads_of(drawn("rotor", tilt)[1]) - loads_of(before)
+        np.testing.assert_allclose(shift[:4, 0], 0.0, atol=1e-12)
+        np.testing.assert_allclose(shift[:4, 1] * stations[0], stations * shift[0, 1], atol=1e-12)
+        np.testing.assert_allclose(shift[4:], 0.0, atol=1e-12)
+
+
+def test_both_views_of_a_rotor_have_its_loads_at_one_height():
+    _, points = drawn("rotor")
+    side, front = np.split(loads_of(points), 2)
+    np.testing.assert_allclose(side[:, 1], front[:, 1], atol=1e-12)
+    assert np.ptp(front[:, 1]) > 0.5 and np.min(front[:, 0]) > np.max(side[:, 0]) + 0.5
+
+
+@pytest.mark.parametrize("kind", ["one_mass", "planar_rotor"])
+def test_a_spring_and_its_damper_lie_beside_each_other(kind):
+    scene = jv.scene_from_toml(TEMPLATES[kind])
+    ties = [part.points for part in view_of(scene).parts(at_rest(scene), 0.0) if part.look.get("lw") == 1.2 and not part.filled]
+    spring, damper = (each[np.all(np.isfinite(each), axis=1)] for each in ties[:2])
+    across = (spring[0] + spring[-1]) / 2.0 - (np.min(damper, axis=0) + np.max(damper, axis=0)) / 2.0
+    along = spring[-1] - spring[0]
+    assert np.hypot(*across) > 0.2 and abs(along @ across) < 1e-9 * np.hypot(*along)
