@@ -14,7 +14,7 @@ from parts import native
 from parts.common import as_first_written, best, first, flat, published, reach, say, thrown
 
 import jaxvib as jv
-from jaxvib.runtime.many import cores
+from jaxvib.runtime.parallel import cores
 
 
 def ensemble(quick: bool = False, error: float = 1e-5) -> None:

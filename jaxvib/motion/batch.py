@@ -19,7 +19,7 @@ from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.system import PackedSystem
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.types import Y as Held
-from jaxvib.runtime.compat import short_end
+from jaxvib.runtime.compat import fast_diffrax_loop_end
 
 __all__ = ["BATCH_SIZE", "PARTS", "BatchPlan", "BatchRun", "advance", "pack_batch", "run_in_batch", "stretches"]
 
@@ -34,7 +34,7 @@ _DOUBLINGS = 40
 """Implicit steps in the first one, each twice as long as that before it: the shortest is 1e-12 of it."""
 
 
-@short_end()
+@fast_diffrax_loop_end()
 def advance(
     motion: PackedSystem, held: Held, begin: Array, length: Array, step: Array, *, implicit: bool = False
 ) -> tuple[Held, Array]:

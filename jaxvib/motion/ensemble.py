@@ -32,7 +32,7 @@ from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.refused import REFUSED, without_numbers

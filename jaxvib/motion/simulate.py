@@ -31,7 +31,7 @@ from jaxvib.motion.stiffness import advice, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
-from jaxvib.runtime.many import in_threads
+from jaxvib.runtime.parallel import in_threads
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.refused import refuse_unknowns
 from jaxvib.units import Number, count, known_number, traced

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 
 from jaxvib.ode.batching import flat_tangents
 from jaxvib.ode.types import Args, Y
-from jaxvib.runtime.compat import no_host_checks, short_end
+from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
 
 __all__ = ["solve"]
 
@@ -66,7 +66,7 @@ def solve(
 
 
 @no_host_checks()
-@short_end()
+@fast_diffrax_loop_end()
 def _solve(
     inputs: _Inputs,
     controller: diffrax.AbstractStepSizeController,

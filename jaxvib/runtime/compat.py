@@ -41,20 +41,20 @@ __all__ = [
     "Var",
     "accepted_flags",
     "backend_started",
-    "beneath",
     "custom_vmap",
     "enumeration_names",
     "enumeration_of",
     "evaluating",
+    "fast_diffrax_loop_end",
     "jaxpr_as_fun",
     "no_host_checks",
-    "no_places",
     "operation_like",
+    "primal_of",
     "rewritten",
-    "short_end",
     "traced",
     "user_folder",
     "wide_vectors_are_right",
+    "without_source_locations",
 ]
 
 _TESTED = ((0, 10), (0, 12))
@@ -137,7 +137,7 @@ def traced(value: object) -> bool:
         return True
 
 
-def beneath(tracer: object) -> object | None:
+def primal_of(tracer: object) -> object | None:
     """What a derivative or a batch is taken of where `tracer` stands for it; None where that is not known, as under `jit`."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
@@ -150,7 +150,7 @@ def evaluating() -> contextlib.AbstractContextManager[None]:
 
 
 @contextlib.contextmanager
-def no_places() -> Iterator[None]:
+def without_source_locations() -> Iterator[None]:
     """What is traced in here does not note for each operation from where it was called, and does not ask anew for each check at
     run time which of the callers' files are JAX's own: a tenth of the time until a program is compiled. Without JAX's names for
     these it does."""
@@ -293,7 +293,7 @@ _ULPS_ONE_BY_ONE = re.compile(rf"for _ in range\({_ULPS}\):\s+t1_clip_floor = eq
 
 
 @contextlib.contextmanager
-def short_end() -> Iterator[None]:
+def fast_diffrax_loop_end() -> Iterator[None]:
     """What is traced in here has diffrax's time loops find the time `_ULPS` units in the last place before their end at once.
 
     diffrax takes as many steps of one unit, written out: 300 operations, 2000 of the compiler's, 0.4 s for each loop. Where its

@@ -22,7 +22,7 @@ from jax import Array
 from jaxvib.errors import InputError
 from jaxvib.imported import code_state
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import beneath, traced
+from jaxvib.runtime.compat import primal_of, traced
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.operations import pruned
 from jaxvib.runtime.primitive import HAS_RULES, is_zero, primitive, pulled_back, zero_of
@@ -92,7 +92,7 @@ class CachedFunction(Generic[P, T]):
 
 def _is_simple(tracer: object) -> bool:
     """Whether one derivative or one batch is asked for, of numbers that are known."""
-    value = beneath(tracer)
+    value = primal_of(tracer)
     return value is not None and not traced(value)
 
 

@@ -31,7 +31,7 @@ from jax.sharding import Sharding, SingleDeviceSharding
 
 from jaxvib.imported import CodeState, clear_derived, code_state, digest_of_sources
 from jaxvib.runtime.cache import program_folder
-from jaxvib.runtime.compat import evaluating, no_host_checks, no_places
+from jaxvib.runtime.compat import evaluating, no_host_checks, without_source_locations
 from jaxvib.runtime.cpu import processor
 from jaxvib.runtime.devices import arrays_on_device
 from jaxvib.runtime.structure import KNOWN_PACKAGES, Description, Skeleton, Slot, Undescribable, describe, leaf_key, rebuild
@@ -151,7 +151,7 @@ class StoredFunction(Generic[T]):
 
         jitted = jax.jit(flat)
         try:
-            with no_places(), _uncollected():
+            with without_source_locations(), _uncollected():
                 exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers

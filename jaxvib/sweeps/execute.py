@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from typing import NamedTuple
 
-from jaxvib.runtime.many import in_parallel
+from jaxvib.runtime.parallel import in_parallel
 from jaxvib.sweeps.definition import Study
 from jaxvib.sweeps.program import Chunk, compute
 

@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.numerics.linalg import small_solve
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Point, Problem, derive
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from optimize.search.problem import Known, Point, Problem, evaluate, looked_up
 

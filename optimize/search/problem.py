@@ -19,7 +19,7 @@ from jax import Array
 
 from jaxvib.machine.scene import Scene
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, guesses

@@ -107,7 +107,7 @@ def test_known_numbers_are_computed_with_while_jax_transforms():
 def test_places_are_left_out_and_come_back():
     frames = importlib.import_module("jax._src.traceback_util")
     asked = frames.include_filename
-    with compat.no_places():
+    with compat.without_source_locations():
         assert jax.config.jax_traceback_in_locations_limit == 0
         assert frames.include_filename("/somewhere/else.py") and not frames.include_filename(frames.__file__)
     assert frames.include_filename is asked
@@ -203,7 +203,7 @@ def test_time_loops_find_their_end_at_once(dtype):
 
     end = jnp.asarray(0.7, dtype)
     plain, expected = operations(run(100), end), run(100)(end)
-    with compat.short_end():
+    with compat.fast_diffrax_loop_end():
         assert plain - operations(run(101), end) > 290
         assert run(101)(end) == expected
     assert operations(run(102), end) == plain
@@ -212,14 +212,14 @@ def test_time_loops_find_their_end_at_once(dtype):
 
 
 def short_in_a_thread(run, end):
-    with compat.short_end():
+    with compat.fast_diffrax_loop_end():
         return float(run(end))
 
 
 def test_time_loops_that_are_written_otherwise_stay(monkeypatch):
     loop = diffrax._integrate.loop
     monkeypatch.setattr(compat, "_source", lambda function: "")
-    with compat.short_end():
+    with compat.fast_diffrax_loop_end():
         assert diffrax._integrate.loop is loop
 
 

@@ -214,14 +214,14 @@ def test_what_lies_beneath_a_tracer_is_found(tracer):
     seen = []
 
     def look(x):
-        seen.append(compat.beneath(x))
+        seen.append(compat.primal_of(x))
         return x * 1.0
 
     {"grad": jax.grad(look), "jvp": lambda x: jax.jvp(look, (x,), (x,)), "vmap": lambda x: jax.vmap(look)(x[None])}[tracer](
         SHIFT
     )
     assert seen[0] is not None and not compat.traced(seen[0]) and float(jnp.ravel(seen[0])[0]) == float(SHIFT)
-    jax.jit(lambda x: seen.append(compat.beneath(x)))(SHIFT)
+    jax.jit(lambda x: seen.append(compat.primal_of(x)))(SHIFT)
     assert seen[1] is None
 
 

@@ -19,7 +19,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.results.fields import in_unit
 from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of

@@ -10,7 +10,7 @@ from jax import Array
 
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.runtime.devices import on_device
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.phases import Parts, influence_of, torques_at

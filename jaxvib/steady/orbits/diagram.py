@@ -22,7 +22,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.numerics.roots import next_share
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-from jaxvib.runtime.many import in_chunks
+from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.jams.picture import branch_summary, picture

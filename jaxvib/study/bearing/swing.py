@@ -20,7 +20,7 @@ from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
-from jaxvib.runtime.compat import short_end
+from jaxvib.runtime.compat import fast_diffrax_loop_end
 from jaxvib.runtime.programs import cached
 from jaxvib.units import Number, Numbers, count, number, numbers, traced
 
@@ -211,7 +211,7 @@ def controller_to(tolerance: float) -> diffrax.AbstractStepSizeController:
 
 
 @cached
-@short_end()
+@fast_diffrax_loop_end()
 def swing_states(
     pendulum: BearingPendulum,
     times: Array,

@@ -17,7 +17,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.runtime.many import in_parallel
+from jaxvib.runtime.parallel import in_parallel
 from jaxvib.steady.balance.criterion import criterion
 from jaxvib.steady.balance.states import balanced_growth, stability_changes
 

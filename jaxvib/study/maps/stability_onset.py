@@ -15,7 +15,7 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.runtime.many import in_parallel
+from jaxvib.runtime.parallel import in_parallel
 from jaxvib.steady.jams.picture import MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 from jaxvib.units import number

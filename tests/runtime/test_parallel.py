@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvib.runtime import many
+from jaxvib.runtime import parallel
 from jaxvib.runtime.cache import keep_programs
 from jaxvib.runtime.programs import cached
 
 
 def test_items_are_taken_as_there_is_room(monkeypatch):
-    monkeypatch.setattr(many, "cores", lambda: 3)
+    monkeypatch.setattr(parallel, "cores", lambda: 3)
     taken = []
 
     def items():
@@ -30,15 +30,15 @@ def test_items_are_taken_as_there_is_room(monkeypatch):
         return k * k
 
     finished = 0
-    for k, found in many.in_parallel(computed, items()):
+    for k, found in parallel.in_parallel(computed, items()):
         finished += 1
         assert found == k * k and len(taken) - finished <= 4
     assert finished == 20
-    assert list(many.in_parallel(computed, [])) == []
+    assert list(parallel.in_parallel(computed, [])) == []
 
 
 def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
-    monkeypatch.setattr(many, "cores", lambda: 2)
+    monkeypatch.setattr(parallel, "cores", lambda: 2)
     begun = []
 
     def computed(k):
@@ -47,17 +47,17 @@ def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
             raise KeyError("three")
 
     with pytest.raises(KeyError, match="three"):
-        list(many.in_parallel(computed, range(1000)))
+        list(parallel.in_parallel(computed, range(1000)))
     assert len(begun) < 20
     with pytest.raises(KeyboardInterrupt):
-        for _ in many.in_parallel(lambda k: begun.append(k), range(1000, 2000)):
+        for _ in parallel.in_parallel(lambda k: begun.append(k), range(1000, 2000)):
             raise KeyboardInterrupt
     assert len(begun) < 30
 
 
 @pytest.mark.parametrize("stored", [True, False])
 def test_threads_compile_a_new_program_once(monkeypatch, tmp_path, unwatched, stored):
-    monkeypatch.setattr(many, "cores", lambda: 4)
+    monkeypatch.setattr(parallel, "cores", lambda: 4)
     keep_programs(tmp_path if stored else None)
     traces, compiled = [], []
 
@@ -72,7 +72,7 @@ def test_threads_compile_a_new_program_once(monkeypatch, tmp_path, unwatched, st
     function = cached(tripled)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        found = many.in_threads(lambda k: function(np.full(2, float(k))).tolist(), 4)
+        found = parallel.in_threads(lambda k: function(np.full(2, float(k))).tolist(), 4)
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert found == [[3.0 * k] * 2 for k in range(4)]
@@ -81,14 +81,14 @@ def test_threads_compile_a_new_program_once(monkeypatch, tmp_path, unwatched, st
 
 
 def test_items_are_computed_side_by_side(monkeypatch):
-    monkeypatch.setattr(many, "cores", lambda: 2)
+    monkeypatch.setattr(parallel, "cores", lambda: 2)
     both = threading.Barrier(2, timeout=20.0)
-    assert sorted(many.in_threads(lambda _: both.wait(), 2)) == [0, 1]
-    assert sorted(found for _, found in many.in_parallel(lambda _: both.wait(), range(2))) == [0, 1]
+    assert sorted(parallel.in_threads(lambda _: both.wait(), 2)) == [0, 1]
+    assert sorted(found for _, found in parallel.in_parallel(lambda _: both.wait(), range(2))) == [0, 1]
 
 
 def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
-    monkeypatch.setattr(many, "cores", lambda: 3)
+    monkeypatch.setattr(parallel, "cores", lambda: 3)
     begun = []
 
     def computed(x):
@@ -98,21 +98,21 @@ def test_an_error_in_a_chunk_ends_all_threads(monkeypatch):
         return x
 
     with pytest.raises(KeyError, match="five"):
-        many.in_chunks(1, computed, np.arange(1000.0))
+        parallel.in_chunks(1, computed, np.arange(1000.0))
     assert len(begun) < 30
 
 
 def test_nobody_waits_for_a_thread_that_has_not_begun(monkeypatch):
     """The calling thread computes everything if all others are busy, for example with work that needs threads itself."""
     pool, free = ThreadPoolExecutor(1), threading.Event()
-    monkeypatch.setattr(many, "_threads", lambda: pool)
+    monkeypatch.setattr(parallel, "_threads", lambda: pool)
     busy = pool.submit(free.wait)
 
     def squared(k):
         return k * k, threading.current_thread()
 
     try:
-        assert many.in_threads(squared, 3) == [(k * k, threading.current_thread()) for k in range(3)]
+        assert parallel.in_threads(squared, 3) == [(k * k, threading.current_thread()) for k in range(3)]
         assert not busy.done()
     finally:
         free.set()
@@ -124,8 +124,8 @@ def test_threads_have_the_options_of_the_caller():
         return jnp.zeros(1).dtype.name, jnp.result_type(float).name
 
     with jax.enable_x64(False):
-        assert {found for _, found in many.in_parallel(kind, range(5))} == {("float32", "float32")}
-    assert {found for _, found in many.in_parallel(kind, range(5))} == {("float64", "float64")}
+        assert {found for _, found in parallel.in_parallel(kind, range(5))} == {("float32", "float32")}
+    assert {found for _, found in parallel.in_parallel(kind, range(5))} == {("float64", "float64")}
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 13])
@@ -137,14 +137,14 @@ def test_chunks_are_put_together_in_their_order(count):
         return {"sum": x["a"] + y[:, 0] + common, "pair": jnp.stack([x["a"], x["a"]], axis=1)}
 
     x, y = {"a": np.arange(count, dtype=float)}, jnp.arange(2.0 * count).reshape(count, 2)
-    found = many.in_chunks(4, function, x, y, shared=(1.0,))
+    found = parallel.in_chunks(4, function, x, y, shared=(1.0,))
     np.testing.assert_array_equal(found["sum"], 3.0 * np.arange(count) + 1.0)
     assert found["pair"].shape == (count, 2) and set(sizes) == {(4,)}
 
 
 def test_chunks_within_a_transformation():
     def total(scale):
-        return many.in_chunks(4, lambda x, scale: jnp.sin(scale * x), np.arange(10.0), shared=(scale,))
+        return parallel.in_chunks(4, lambda x, scale: jnp.sin(scale * x), np.arange(10.0), shared=(scale,))
 
     value, slope = jax.jvp(total, (2.0,), (1.0,))
     np.testing.assert_allclose(value, np.sin(2.0 * np.arange(10.0)), rtol=1e-14)
@@ -159,9 +159,9 @@ jv.prepare_cpu(3)
 jv.use_cache({str(tmp_path)!r})
 import jax, jax.numpy as jnp
 from jaxvib import imported
-from jaxvib.runtime import many, programs
-assert many.shared_devices() == [None]  # processors are one, however they are divided
-many.shared_devices = jax.local_devices
+from jaxvib.runtime import parallel, programs
+assert parallel.shared_devices() == [None]  # processors are one, however they are divided
+parallel.shared_devices = jax.local_devices
 imported._code.differences = list  # as `unwatched`
 
 def doubled(x):
@@ -169,7 +169,7 @@ def doubled(x):
 
 function = programs.cached(doubled)
 doubled.__module__ = "jaxvib.doubled"
-for k, found in many.in_parallel(lambda k: function(jnp.full(2, float(k))), range(7)):
+for k, found in parallel.in_parallel(lambda k: function(jnp.full(2, float(k))), range(7)):
     assert found.devices() == {{jax.devices()[k % 3]}} and found.tolist() == [2.0 * k] * 2, (k, found.devices())
 assert None not in function.stored.ready.values() and len(list(programs.program_folder().glob("*.program"))) == 1
 """
@@ -207,6 +207,6 @@ def test_workers_of_a_machine_have_a_device_each(tmp_path):
 
 
 def test_no_case_at_all_has_a_result_of_its_form():
-    found = many.in_chunks(4, lambda x, y: {"sum": x + y, "low": x[:, 0] < y}, np.zeros((0, 2)), shared=(1.0,))
+    found = parallel.in_chunks(4, lambda x, y: {"sum": x + y, "low": x[:, 0] < y}, np.zeros((0, 2)), shared=(1.0,))
     assert found["sum"].shape == (0, 2) and found["low"].shape == (0,) and found["low"].dtype == bool
-    assert jax.jit(lambda x: many.in_chunks(4, jnp.sin, x))(jnp.zeros((0, 3))).shape == (0, 3)
+    assert jax.jit(lambda x: parallel.in_chunks(4, jnp.sin, x))(jnp.zeros((0, 3))).shape == (0, 3)
