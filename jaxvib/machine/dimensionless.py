@@ -1,4 +1,4 @@
-"""The dimensionless forms of the two platform papers: a way to build a scene and to read its results."""
+"""Dimensionless forms of the two platform papers, which build a scene and convert its results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _KINDS = {1: "one_mass", 2: "two_mass", 3: "three_mass"}
 
 
 class Dimensionless(eqx.Module):
-    """A platform machine in the papers' dimensionless numbers; the exciter is on platform 2 (1 where there is only one).
+    """Platform machine in the dimensionless numbers of the papers; the exciter is on platform 2, or on the only platform.
 
     With the exciter's total mass M2S = M2 + N m (loads included), time tau = w t, unbalance scale s~ and length y~ = s~/M2S:
 
@@ -36,7 +36,7 @@ class Dimensionless(eqx.Module):
     - `form="antiphase"`: s~ = m R, so that s_y = sum sin phi_j, collected loads have s = N, eps is that of one load
     - `form="criterion"`: s~ = N m R, so that s_y = (1/N) sum sin phi_j, s = 1, eps is that of all loads
 
-    **Arguments**: `natural` n_i and `damping` h_i, one a platform; `link_natural` n_ij and `link_damping` h_ij, one a link
+    **Arguments**: `natural` n_i and `damping` h_i, one per platform; `link_natural` n_ij and `link_damping` h_ij, one per link
     (12 for two masses; 12, 13, 23 for three); `rho` rho_i of the platforms without the exciter, in order; `eps`, `beta`,
     `speed` n; `count` N. The machine's size is free: `mass_scale` M2S kg, `frequency_scale` w rad/s, `radius` R m,
     `kappa` at least 1 (the loads are pendulums with that kappa).
@@ -117,17 +117,17 @@ class Dimensionless(eqx.Module):
 
     @property
     def length(self) -> Array:
-        """y~ = s~/M2S in m, the unit of v_2; it equals eps kappa R in both forms."""
+        """Length y~ = s~/M2S in m, the unit of v_2; it equals eps kappa R in both forms."""
         return self.eps * self.kappa * self.radius
 
     @property
     def lengths(self) -> Array:
-        """The unit rho_i y~ of each platform's v_i, (n,) m."""
+        """Unit rho_i y~ of each platform's v_i, (n,) m."""
         return self._by_platform(self.rho, 1.0) * self.length
 
     @property
     def force(self) -> Array:
-        """M2S w^2 y~ in N, the unit of the foundation force."""
+        """Force M2S w^2 y~ in N, the unit of the foundation force."""
         return self.mass_scale * self.frequency_scale**2 * self.length
 
     def _by_platform(self, others: Array, exciter: float) -> Array:
@@ -135,7 +135,7 @@ class Dimensionless(eqx.Module):
         return jnp.concatenate([others[:where], jnp.full((1,), exciter, dtype=others.dtype), others[where:]])
 
     def scene(self) -> Scene:
-        """The scene in SI numbers, at the chosen size."""
+        """Return the scene in SI numbers, at the chosen size."""
         n = self.natural.shape[0]
         w, m_total, m = self.frequency_scale, self.mass_scale, self._load_mass
         mass = m_total / self._by_platform(self.rho, 1.0)
@@ -164,7 +164,7 @@ class Dimensionless(eqx.Module):
     def read(
         self, *, omega: Array | None = None, amplitude: Array | complex | None = None, force: Array | None = None
     ) -> dict[str, Array]:
-        """Results in SI as the paper's numbers; any of them may be given.
+        """Convert results in SI to the numbers of the paper.
 
         **Arguments**: `omega` rad/s, any shape; `amplitude` m, real or complex, last axis over the platforms; `force` N, any
         shape. NaN in an array, of modes that do not exist, stays NaN.

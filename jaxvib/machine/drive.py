@@ -1,4 +1,4 @@
-"""Drives: ideal ones, which give the rotor's speed, and motors of limited power."""
+"""Drives of the rotor: ideal drives with a prescribed speed, and motors of limited power."""
 
 from __future__ import annotations
 
@@ -17,84 +17,84 @@ __all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", 
 
 
 Rotor = tuple[Array, Array] | None
-"""The rotor's angle (rad) and speed (rad/s) where they are states of the motion, else None."""
+"""Angle (rad) and speed (rad/s) of the rotor if they are states of the motion, otherwise None."""
 
 
 class Drive(eqx.Module):
-    """The drive of the rotor; `speed` is its working speed without a load, rad/s.
+    """Drive of the rotor; `speed` is its working speed without a load, rad/s.
 
-    An `IdealDrive` turns the rotor at speeds that no load can change; with a `Motor` the rotor's angle and speed are states.
+    An `IdealDrive` prescribes the rotor speed; with a `Motor` the rotor's angle and speed are states.
     """
 
     speed: eqx.AbstractVar[Array]
     kind: eqx.AbstractVar[str]
 
     ideal: ClassVar[bool]
-    """Whether the rotor's speed is given as a function of time, whatever the loads do."""
+    """True if the rotor speed is a function of time that no load changes."""
 
     constant: ClassVar[bool] = False
-    """Whether the rotor turns at `speed` from the start."""
+    """True if the rotor turns at `speed` from the start."""
 
     @abc.abstractmethod
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """The rotor's speed at time `t` (s), rad/s, in the state `rotor`."""
+        """Return the rotor speed at time `t` (s), rad/s, in the state `rotor`."""
 
     @abc.abstractmethod
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """The rotor's angle at time `t` (s), rad, in the state `rotor`."""
+        """Return the rotor's angle at time `t` (s), rad, in the state `rotor`."""
 
     @abc.abstractmethod
     def rotor_acceleration(self, t: Array) -> Array | None:
-        """The rotor's angular acceleration at time `t` (s), rad/s^2; None where it follows from the torques on the rotor."""
+        """Return the rotor's angular acceleration at time `t` (s), rad/s^2; None if it follows from torques."""
 
     @abc.abstractmethod
     def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
-        """T at the rotor's `speed` (rad/s), N m, and its inertia J, kg m^2; None where no torque changes its speed."""
+        """Return T at the rotor's `speed` (rad/s), N m, and its inertia J, kg m^2; None if no torque changes the speed."""
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Times at which the acceleration jumps, on which an integrator has to put a step."""
+        """Return the times at which the acceleration jumps, which must be ends of steps."""
         return ()
 
 
 class IdealDrive(Drive):
-    """A drive that gives the rotor's speed as a function of time."""
+    """Drive that prescribes the rotor speed as a function of time."""
 
     ideal = True
 
     @abc.abstractmethod
     def speed_at(self, t: Array) -> Array:
-        """The rotor's speed at time t (s), rad/s."""
+        """Return the rotor speed at time t (s), rad/s."""
 
     @abc.abstractmethod
     def angle_at(self, t: Array) -> Array:
-        """The rotor's angle at time t, rad: the integral of its speed from 0."""
+        """Return the rotor's angle at time t, rad: the integral of its speed from 0."""
 
     @abc.abstractmethod
     def acceleration_at(self, t: Array) -> Array:
-        """The rotor's angular acceleration at time t, rad/s^2."""
+        """Return the rotor's angular acceleration at time t, rad/s^2."""
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """`speed_at`."""
+        """Return `speed_at`."""
         return self.speed_at(t)
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """`angle_at`."""
+        """Return `angle_at`."""
         return self.angle_at(t)
 
     def rotor_acceleration(self, t: Array) -> Array:
-        """`acceleration_at`."""
+        """Return `acceleration_at`."""
         return self.acceleration_at(t)
 
     def torque_and_inertia(self, speed: Array) -> None:
-        """None."""
+        """Return None: no torque changes the speed."""
 
 
 class Motor(Drive):
-    """A drive of limited power: the rotor turns as its torque and the loads let it.
+    """Drive of limited power; the rotor's motion follows from its torque and the loads.
 
-        J theta'' = T(theta') - torque that the loads take off
+        J theta'' = T(theta') - torque of the loads on the rotor
 
-    J is the rotor's whole moment of inertia about its axis, what is out of balance included, loads not.
+    J is the moment of inertia of the whole rotor about its axis, its imbalance included, loads not.
     """
 
     ideal = False
@@ -102,29 +102,29 @@ class Motor(Drive):
     inertia: eqx.AbstractVar[Array]
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """That of the state."""
+        """Return the speed in the state."""
         assert rotor is not None
         return rotor[1]
 
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """That of the state."""
+        """Return the angle in the state."""
         assert rotor is not None
         return rotor[0]
 
     def rotor_acceleration(self, t: Array) -> None:
-        """None."""
+        """Return None: it follows from the torques."""
 
     def torque_and_inertia(self, speed: Array) -> tuple[Array, Array]:
-        """`torque` and `inertia`."""
+        """Return `torque` and `inertia`."""
         return self.torque(speed), self.inertia
 
     @abc.abstractmethod
     def torque(self, speed: Array) -> Array:
-        """T at the rotor's `speed` (rad/s), N m."""
+        """Return T at the rotor's `speed` (rad/s), N m."""
 
 
 class ConstantSpeed(IdealDrive):
-    """A rotor that turns at a constant speed whatever the loads do.
+    """Rotor at a constant speed that the loads do not change.
 
     **Arguments**: `speed` n, rad/s or a text such as "1500 rpm"; greater than 0.
 
@@ -145,24 +145,24 @@ class ConstantSpeed(IdealDrive):
         self.kind = "constant_speed"
 
     def speed_at(self, t: Array) -> Array:
-        """n at every t."""
+        """Return n."""
         return self.speed
 
     def angle_at(self, t: Array) -> Array:
-        """n t."""
+        """Return n t."""
         return self.speed * t
 
     def acceleration_at(self, t: Array) -> Array:
-        """0."""
+        """Return 0."""
         return jnp.zeros_like(self.speed)
 
 
 class SpinUp(IdealDrive):
-    """A rotor brought smoothly from rest to its working speed, then held there.
+    """Smooth spin-up of the rotor from rest to its working speed, which is then constant.
 
         speed(t) = n (10 x^3 - 15 x^4 + 6 x^5),  x = min(t / duration, 1)
 
-    twice continuously differentiable, so that an integrator meets no kink.
+    The speed is twice continuously differentiable.
 
     **Arguments**: `speed` n, rad/s or text, greater than 0; `duration` s or text, greater than 0.
 
@@ -184,28 +184,28 @@ class SpinUp(IdealDrive):
         self.kind = "spin_up"
 
     def speed_at(self, t: Array) -> Array:
-        """The smooth step from 0 to n."""
+        """Return the smooth step from 0 to n."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         return self.speed * x**3 * (10.0 + x * (6.0 * x - 15.0))
 
     def angle_at(self, t: Array) -> Array:
-        """n duration (5 x^4/2 - 3 x^5 + x^6) on the way up, from there on with speed n."""
+        """Return n duration (5 x^4/2 - 3 x^5 + x^6) during the spin-up; afterwards the angle grows with n."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         rise = self.duration * x**4 * (2.5 + x * (x - 3.0))
         return self.speed * (rise + jnp.maximum(t - self.duration, 0.0))
 
     def acceleration_at(self, t: Array) -> Array:
-        """30 n x^2 (1 - x)^2 / duration."""
+        """Return 30 n x^2 (1 - x)^2 / duration."""
         x = jnp.clip(t / self.duration, 0.0, 1.0)
         return 30.0 * self.speed / self.duration * (x * (1.0 - x)) ** 2
 
 
 class RunUp(IdealDrive):
-    """A rotor run up at a constant angular acceleration, then held at its working speed.
+    """Run-up of the rotor at a constant angular acceleration to its working speed, which is then constant.
 
         speed(t) = min(acceleration t, n)
 
-    The acceleration jumps where the working speed is reached; `simulate` puts a step on that time.
+    The acceleration jumps when the working speed is reached; `simulate` ends a step at that time.
 
     **Arguments**: `speed` n, rad/s or text, greater than 0; `acceleration` rad/s^2 or text, greater than 0.
 
@@ -232,25 +232,25 @@ class RunUp(IdealDrive):
         return self.speed / self.acceleration
 
     def speed_at(self, t: Array) -> Array:
-        """min(acceleration t, n)."""
+        """Return min(acceleration t, n)."""
         return jnp.where(t < self._end(), self.acceleration * t, self.speed)
 
     def angle_at(self, t: Array) -> Array:
-        """acceleration t^2 / 2, from the kink on with speed n."""
+        """Return acceleration t^2 / 2 during the run-up; afterwards the angle grows with n."""
         end = self._end()
         return jnp.where(t < end, 0.5 * self.acceleration * t**2, self.speed * (t - 0.5 * end))
 
     def acceleration_at(self, t: Array) -> Array:
-        """The acceleration before the kink, 0 after it."""
+        """Return the acceleration of the run-up, 0 afterwards."""
         return jnp.where(t < self._end(), self.acceleration, 0.0)
 
     def jump_ts(self) -> tuple[Array, ...]:
-        """Where the working speed is reached."""
+        """Return the time at which the working speed is reached."""
         return (self._end(),)
 
 
 class DCMotor(Motor):
-    """A direct-current motor switched on at t = 0: its torque falls linearly with the speed.
+    """Direct-current motor, switched on at t = 0, whose torque falls linearly with the speed.
 
         T = stall_torque (1 - theta' / speed)
 
@@ -277,17 +277,17 @@ class DCMotor(Motor):
         self.kind = "dc_motor"
 
     def torque(self, speed: Array) -> Array:
-        """The straight line from the stall torque to the speed without a load."""
+        """Return the torque on the straight line from the stall torque to 0 at the speed without a load."""
         return self.stall_torque * (1.0 - speed / self.speed)
 
 
 class InductionMotor(Motor):
-    """An induction motor switched on at t = 0, by Kloss's formula.
+    """Induction motor, switched on at t = 0, with Kloss's formula.
 
         T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed
 
-    **Arguments**: `speed` synchronous, rad/s or text; `breakdown_torque` T_b N m, the greatest there is; `breakdown_slip` s_b,
-    the slip at which it is reached, below 1; `inertia` J of the whole rotor, kg m^2; all greater than 0.
+    **Arguments**: `speed` synchronous, rad/s or text; `breakdown_torque` T_b N m, the largest torque; `breakdown_slip` s_b,
+    the slip at that torque, below 1; `inertia` J of the whole rotor, kg m^2; all greater than 0.
 
     **Raises** `InputError` for a wrong unit or a value that is not allowed.
 
@@ -296,7 +296,7 @@ class InductionMotor(Motor):
     >>> round(float(motor.torque(0.8 * motor.speed)), 6)
     4.0
 
-    Source: Kloss's formula for the steady torque; the currents' transients are left out.
+    Source: Kloss's formula for the steady torque; transients of the currents are neglected.
     """
 
     speed: Array
@@ -314,7 +314,7 @@ class InductionMotor(Motor):
         self.kind = "induction_motor"
 
     def torque(self, speed: Array) -> Array:
-        """Kloss's formula."""
+        """Return the torque of Kloss's formula."""
         slip = 1.0 - speed / self.speed
         return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)
 

@@ -1,4 +1,4 @@
-"""The scene as a field of a result: in files it is TOML, and it knows the names of coordinates and loads."""
+"""Field of a result that holds the scene, as TOML in files, with the names of coordinates and loads."""
 
 from __future__ import annotations
 

@@ -22,23 +22,22 @@ _ROLLING = 0.4
 
 
 class TorusBalls(Loads):
-    """Balls that roll on the inner wall of a tube bent to a ring, u = (f, a).
+    """Balls on the inner wall of a tube bent to a ring, u = (f, a).
 
         p = (B cos f, B sin f, -rho cos a),    B = R + rho sin a,    rho = R_1 - r
 
-    f is the angle about the rotor's axis, a that in the tube's cross-section: 0 where the axial coordinate is least, the bottom
-    of a tube that lies level, pi/2 at the outer equator. With n the direction from the tube's middle to the ball, v = B f' and
+    f is the angle about the rotor's axis, a the angle in the cross-section of the tube: 0 at the smallest axial coordinate (the
+    bottom of a level tube), pi/2 at the outer equator. With n the direction from the tube's middle to the ball, v = B f' and
     kappa = 7/5
 
         kappa m (B f'' + 2 rho cos a a' f') = (2/5) m w rho cos a a' + F_f
         kappa m (rho a'' - B f'^2 cos a)    = - (2/5) m w B cos a f' + F_a
         N = m (B f'^2 sin a + rho a'^2 - n . (port's acceleration + gravity upward))
 
-    w is the rotor's speed. A ball that rolls without slipping and does not twist about its point of contact turns with the wall
-    and rolls on it; its own rotation then adds the inertia kappa - 1 and the terms with w, which do no work: by them the
-    rolling counts with B f' (f' - w) and not with B f'^2, and a ball that rests on a tube at rest, or turns with it, presses
-    up its wall with the centrifugal force of its mass alone. The wall's acceleration, where w changes, is left out, as the
-    gyroscopic matrix of a rotor leaves it out. On the equator the ball is one of a plane track of radius R + rho.
+    w is the rotor speed. A ball rolls without slip and without drilling spin. Its rotation adds the inertia kappa - 1 and the
+    terms with w, which do no work: with them the rolling enters by B f' (f' - w) and not by B f'^2, and a ball that turns with
+    the tube feels the centrifugal force of its mass alone. The acceleration of the wall when w changes is neglected, as in the
+    gyroscopic matrix of a rotor. On the equator the ball is that of a plane track of radius R + rho.
 
     **Attributes** (scalar, or (count,) for `mass` and `drag`): `mass` m kg; `radius` R m of the tube's middle line; `tube` R_1
     m, the radius of its cross-section; `own_radius` r m of a ball; `drag` b_W N s/m, viscous resistance of a ball against the
@@ -59,43 +58,46 @@ class TorusBalls(Loads):
 
     @property
     def gap(self) -> Array:
-        """rho = R_1 - r, m: the radius of the circle in the cross-section on which the ball's centre runs."""
+        """Radius rho = R_1 - r, m, of the circle in the cross-section on which the ball's centre runs."""
         return self.tube - self.own_radius
 
     def _arm(self, a: Array) -> Array:
         return self.radius + self.gap * jnp.sin(a)
 
     def position(self, *u: Array) -> tuple[Array, Array, Array]:
-        """(B cos f, B sin f, -rho cos a)."""
+        """Return (B cos f, B sin f, -rho cos a)."""
         f, a = u
         return self._arm(a) * jnp.cos(f), self._arm(a) * jnp.sin(f), -self.gap * jnp.cos(a)
 
     def rest(self) -> tuple[Array, Array]:
-        """At the outer equator, f = -pi/2: where a balancer works, and at the bottom of a torus that stands upright."""
+        """Return the outer equator at f = -pi/2, the bottom of an upright torus."""
         quarter = jnp.full((self.count,), 0.5 * jnp.pi, dtype=jnp.result_type(self.radius))
         return -quarter, quarter
 
     def offsets(self) -> Array:
-        """Side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
+        """Return angles side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
         return side_by_side(self.count, self.own_radius / (self.radius + self.gap))
 
     def inertia_factor(self) -> Array:
-        """7/5."""
+        """Return 7/5."""
         return jnp.asarray(1.0 + _ROLLING, dtype=self.mass.dtype)
 
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
-        """- b_W (B^2 (f' - w), rho^2 a')."""
+        """Return - b_W (B^2 (f' - w), rho^2 a')."""
         return self.drag * self._arm(u[1]) ** 2 * (speed - rate[0]), -self.drag * self.gap**2 * rate[1]
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, Array]:
-        """(2/5) m w B rho cos a (a', -f')."""
+        """Return (2/5) m w B rho cos a (a', -f')."""
         turn = _ROLLING * self.mass * speed * self._arm(u[1]) * self.gap * jnp.cos(u[1])
         return turn * rate[1], -turn * rate[0]
 
     def drilling_spin(
         self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array, slip: tuple[Array, ...] | None = None
     ) -> DrillingSpin:
-        """s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r, forces (2/5) m r s (B a', - rho sin a f'), s = w cos a of none."""
+        """Return s' = (a' (w B - R f') + c_f a' - c_a f' sin a)/r and the forces (2/5) m r s (B a', - rho sin a f').
+
+        s is w cos a for a ball that does not rotate in space.
+        """
         (_, a), (turn, climb), m, own = u, rate, self.mass, self.own_radius
         arm, up = self._arm(a), jnp.sin(a)
         lever = _ROLLING * m * own
@@ -105,22 +107,22 @@ class TorusBalls(Loads):
         return DrillingSpin(change / own, (lever * arm * climb, -lever * self.gap * up * turn), lever * own, speed * jnp.cos(a))
 
     def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce:
-        """N, against the tube's wall."""
+        """Return N against the wall of the tube."""
         (f, a), m = u, self.mass
         normal = (jnp.sin(a) * jnp.cos(f), jnp.sin(a) * jnp.sin(f), -jnp.cos(a))
         held = self._arm(a) * rate[0] ** 2 * jnp.sin(a) + self.gap * rate[1] ** 2
         return NormalForce(m * (held - sum(normal[axis] * x for axis, x in g.items())), (-m * normal[0], -m * normal[1]))
 
     def natural_frequency(self, speed: Array) -> Array:
-        """w sqrt((R + rho) / (kappa rho)): of small motions about the outer equator of balls that turn with the rotor."""
+        """Return w sqrt((R + rho) / (kappa rho)): small motions about the outer equator of balls that turn with the rotor."""
         return speed * jnp.sqrt((self.radius + self.gap) / (self.inertia_factor() * self.gap))
 
 
 def in_torus(loads: Loads, asking: str) -> TorusBalls:
-    """The loads, where they are balls in a torus. **Raises** `InputError`, which says who is `asking` for them, for others."""
+    """Return the loads if they are balls in a torus. **Raises** `InputError` for others, which names the function `asking`."""
     if not isinstance(loads, TorusBalls):
-        told = f"{asking} asks for balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
-        raise InputError("loads.kind", f"is {quoted(loads.kind)}; {told}")
+        advice = f"{asking} needs balls in a torus: torus_balls(...), in a file as `jaxvib new torus` prints it"
+        raise InputError("loads.kind", f"is {quoted(loads.kind)}; {advice}")
     return loads
 
 
@@ -133,9 +135,9 @@ def torus_balls(
     own_radius: Number,
     drag: Number | Sequence[Number] = 0.0,
 ) -> TorusBalls:
-    """Balls that roll in a tube bent to a ring around the rotor's axis, kappa = 7/5.
+    """Return balls that roll in a tube bent to a ring around the rotor's axis, kappa = 7/5.
 
-    Their first coordinate is the angle about the axis, their second the angle in the tube's cross-section, see `TorusBalls`.
+    Their first coordinate is the angle about the axis, the second the angle in the cross-section of the tube, see `TorusBalls`.
     Dry friction is the effect `RollingFriction`, gravity along a vertical axis `Gravity(along="axis")`.
 
     **Arguments**: `count` N; `mass` kg of each, one number or N; `radius` R m of the tube's middle line; `tube` m, radius of

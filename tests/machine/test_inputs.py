@@ -72,7 +72,7 @@ WRONG = {
     "no drive": (lambda: jv.Scene(machine(), balls(), 5.0), "drive is 5.0; it must be a Drive, for example ConstantSpeed("),
     "bearings of balls": (
         lambda: scene(effects=(jv.DryFriction(0.1, 0.01),)),
-        "effects.dry_friction is that of a bearing, and a ball rolls without one (property has_bearing); give pendulums",
+        "effects.dry_friction needs loads with bearings, and a ball has none (property has_bearing); give pendulums",
     ),
     "no effect": (lambda: scene(effects=(5,)), "effects[0] is 5; it must be an Effect, for example Gravity()"),
     "twice": (lambda: scene(effects=(jv.Gravity(), jv.Gravity())), "effects names gravity 2 times; once is allowed"),

@@ -1,1 +1,1 @@
-"""Effects that a scene may call for."""
+"""Effects of a scene beyond machine, loads and drive."""

@@ -22,11 +22,11 @@ Reaction = Literal["exact", "run_up", "steady"]
 
 
 def sliding_sign(slip: Array, width: Array) -> Array:
-    """tanh(slip / width): the sign of a sliding speed, smooth over the `width`, so that sticking is a creep below it.
+    """Return tanh(slip / width), the sign of a sliding speed, smooth over the `width`.
 
-    A joint that has to stick under the share f < 1 of what friction can hold creeps at width artanh(f): nothing is lost
-    but that creep, and it goes to zero with the width. A swing whose speed goes up to v loses the share (pi^2/24) (width/v)^2
-    less to dry friction than with the sharp sign.
+    A joint that would have to stick under the share f < 1 of the largest friction creeps at width artanh(f), which goes to zero
+    with the width. A swing with the largest speed v loses the share (pi^2/24) (width/v)^2 less to dry friction than with the
+    exact sign.
 
     >>> [round(float(sliding_sign(x, 0.1)), 4) for x in (-1.0, 0.0, 0.05, 1.0)]
     [-1.0, 0.0, 0.4621, 1.0]
@@ -35,7 +35,7 @@ def sliding_sign(slip: Array, width: Array) -> Array:
 
 
 def dry_lever(coefficient: Array, diameter: Array, slip: Array, width: Array) -> Array:
-    """mu2 (d/2) sign(slip), m: what a bearing's radial load |N| is multiplied with to give the torque of dry friction, N m.
+    """Return mu2 (d/2) sign(slip), m: the torque of dry friction per radial load |N| of a bearing.
 
     >>> round(float(dry_lever(0.0015, 0.02, -3.0, 0.01)), 9)
     -1.5e-05
@@ -44,21 +44,21 @@ def dry_lever(coefficient: Array, diameter: Array, slip: Array, width: Array) ->
 
 
 class DryFriction(Effect):
-    """Dry friction in the bearing of each load, proportional to the radial load N that the bearing carries.
+    """Dry friction in the bearing of each load, proportional to the radial load N of the bearing.
 
         M = mu2 (d / 2) |N| sign(speed - phi')
 
     - `reaction="exact"`: N = m (R phi'^2 - n . a - g sin phi), n the load's direction, a the acceleration of the point that
-      carries it, g that of the scene's gravity. N is linear in the accelerations and is solved together with them
-    - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as the paper prints for a run-up (its second term mixes frames)
-    - `"steady"`: N = m R speed^2, as the paper prints for loads that turn with the rotor
+      carries it, g the gravity of the scene. N is linear in the accelerations and is solved together with them
+    - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as printed for a run-up (its second term mixes frames)
+    - `"steady"`: N = m R speed^2, as printed for loads that turn with the rotor
 
     **Arguments**: `coefficient` mu2 (about 0.0015 for ball bearings); `diameter` d, m, of the bearing; `reaction`; `width`,
     rad/s, of the sliding speed over which the sign is smoothed, see `sliding_sign`. Viscous bearing friction is the loads'
     `drag`, mu1 = b_W R^2.
 
-    The sign of N is that of the motion without this friction: where it differs from the one with it, N is smaller than
-    mu2 times the other forces, and so is the error.
+    The sign of N is that of the motion without this friction. If the sign with friction differs, N is smaller than mu2 times
+    the other forces, and so is the error.
 
     **Raises** `InputError` for values that are not allowed.
 
@@ -86,7 +86,7 @@ class DryFriction(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """A ball bearing as wide as a fifth of the loads' radius."""
+        """Return a ball bearing whose diameter is a fifth of the loads' radius."""
         if not loads.circular:
             return None
         assert isinstance(loads, CircularLoads)
@@ -100,11 +100,11 @@ class DryFriction(Effect):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads that do not hang on bearings on a circle."""
         if not loads.circular:
-            raise InputError("effects.dry_friction", f"goes with loads on a circle, not with {quoted(loads.kind)}")
+            raise InputError("effects.dry_friction", f"needs loads on a circle, and the loads are {quoted(loads.kind)}")
         if not loads.has_bearing:
             raise InputError(
                 "effects.dry_friction",
-                f"is that of a bearing, and a {loads.kind} rolls without one (property has_bearing); give pendulums, or drag",
+                f"needs loads with bearings, and a {loads.kind} has none (property has_bearing); give pendulums, or drag",
             )
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:

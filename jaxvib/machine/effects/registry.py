@@ -1,4 +1,4 @@
-"""The effects that scene files and audits know, by their names there."""
+"""Effects by their names in scene files and audits."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ EFFECTS = {
     "free_spin": FreeSpin,
     "sliding": Sliding,
 }
-"""Each builds its effect from the fields of its table."""
+"""Constructors of effects from the fields of their tables."""

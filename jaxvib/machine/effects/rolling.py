@@ -1,4 +1,4 @@
-"""Resistance to rolling of loads that press on their track."""
+"""Rolling friction of balls and rollers on their track."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Direction = Literal["along", "each"]
 
 
 class RollingFriction(Effect):
-    """Resistance to rolling, Coulomb's: a moment k N at the contact against the rolling of a load on the rotor's wall.
+    """Coulomb's rolling friction: a moment k N at the contact against the rolling of a load on the rotor's wall.
 
         Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
@@ -34,8 +34,8 @@ class RollingFriction(Effect):
     which goes to zero with the width.
 
     **Arguments**: `coefficient` k, m (about 2e-5 to 4e-5 for steel balls on steel), 0 for none; `direction` "along" the
-    rolling, or "each": for each coordinate of the load by itself, d_i = tanh(v_i/width), as the paper prints, so that the
-    motion around the axis does not spare the one across it; `width` m/s, over which the sign is smoothed.
+    rolling, or "each": for each coordinate separately, d_i = tanh(v_i/width), as printed in the paper, so that motion around
+    the axis does not reduce the friction across it; `width` m/s, over which the sign is smoothed.
 
     The sign of N is that of the motion without this friction.
 
@@ -63,7 +63,7 @@ class RollingFriction(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Steel on steel."""
+        """Return k of steel on steel."""
         return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
     def terms(self) -> tuple[Term, ...]:
@@ -93,7 +93,7 @@ class RollingFriction(Effect):
         return Friction(first, normal_force.reaction, normal_force.normal, tuple(others), loads.one_sided)
 
     def _lever(self, loads: Loads, u: tuple[Array, ...], i: int, slip: Array) -> Array:
-        """|dp/du_i| tanh(|dp/du_i| slip / width)."""
+        """Return |dp/du_i| tanh(|dp/du_i| slip / width)."""
         direction = tuple(jnp.ones_like(x) if k == i else jnp.zeros_like(x) for k, x in enumerate(u))
         size = _length(jax.jvp(loads.position, u, direction)[1])
         return size * sliding_sign(size * slip, self.width)

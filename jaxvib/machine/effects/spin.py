@@ -1,4 +1,4 @@
-"""Freedoms of a rolling ball: its spin about the normal of its contact, and sliding before it rolls."""
+"""Released contacts of rolling loads: drilling spin about the normal, and sliding."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ __all__ = ["FreeSpin", "Sliding"]
 
 
 class FreeSpin(Effect):
-    """Balls in a torus spin freely about the normal of their point of contact.
+    """Free drilling spin of balls in a torus, about the normal of their point of contact.
 
         J s' = J a' (w B - R f') / r,    Q = (2/5) m r s (B a', - rho sin a f'),    J = (2/5) m r^2
 
-    s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, 0 at the
-    start unless given); the forces Q act on its two coordinates beside those of `TorusBalls`, whose s is held at 0 by the
-    contact. No moment acts about the normal of a contact at a point, so that the ball's angular velocity there changes by the
-    turning of the normal alone, s' = Omega . n' + (w cos a)'. While f' is constant, s grows by (w B - R f')/r for each radian
-    up the wall: a ball that left the equator with s = 0 is drawn back to it as a point mass is, with m rho B f'^2 in place of
-    m rho B (7/5 f'^2 - 2/5 w f') for each radian, kappa staying in its inertia. Real contacts lie between both.
+    s is a ball's spin about the normal relative to the wall, one more velocity of each ball (`State.spin.drilling`, default: 0
+    at the start). The forces Q act on its two coordinates beside those of `TorusBalls`, where the contact keeps s = 0. A point
+    contact exerts no moment about its normal, so the ball's angular velocity about it changes with the direction of the normal
+    only, s' = Omega . n' + (w cos a)'. While f' is constant, s grows by (w B - R f')/r per radian up the wall: a ball that left
+    the equator with s = 0 returns to it like a point mass, with m rho B f'^2 instead of m rho B (7/5 f'^2 - 2/5 w f') per
+    radian, with kappa in its inertia. Real contacts lie between both.
 
-    It goes with drives of given speed; the wall's acceleration, where w changes, is left out as by `TorusBalls`.
+    The effect needs a drive of given speed; the acceleration of the wall when w changes is neglected, as in `TorusBalls`.
 
-    **Raises** `InputError`, by the scene, for loads that nothing couples to such a spin, as on a plane track, and for a motor.
+    **Raises** `InputError`, by the scene, for loads that are not coupled to such a spin, as on a plane track, and for a motor.
 
     >>> import jaxvib as jv
     >>> jv.FreeSpin().terms()
     (DrillingSpinRelease(),)
 
-    Source: derived here from Newton's and Euler's equations of the ball; asked for by no paper.
+    Source: derived here from Newton's and Euler's equations of the ball.
     """
 
     kind: str = eqx.field(static=True)
@@ -47,7 +47,7 @@ class FreeSpin(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """It has no number."""
+        """Return the effect, which has no number."""
         return Typical(cls(), "no moment about the normal of a contact at a point")
 
     def terms(self) -> tuple[Term, ...]:
@@ -58,25 +58,25 @@ class FreeSpin(Effect):
         """**Raises** `InputError` for loads that are not coupled to their spin."""
         rest = loads.rest()
         if jax.eval_shape(loads.drilling_spin, rest, rest, jnp.zeros(())) is None:
-            problem = f"goes with balls in a torus; nothing couples {loads.kind!r} to a spin about the normal (drilling_spin)"
+            problem = f"needs balls in a torus; {loads.kind!r} are not coupled to a spin about the normal (drilling_spin)"
             raise InputError("effects.free_spin", problem)
 
 
 class Sliding(Effect):
-    """The contact of a rolling load holds up to Coulomb's limit; beyond it the load slides on its track.
+    """Sliding of rolling loads beyond Coulomb's limit of their contact.
 
         |F_t| <= mu max(N, 0);    while it slides F_t = - mu N c/|c|,    (kappa - 1) m (c')_t = F_t - what rolling would need
 
-    c is the velocity of the point of contact relative to the track, along each coordinate of a load, further velocities of each
-    load (`State.spin.slip`, 0 at the start unless given: `with_spin(scene, state, "still")` for loads that do not turn yet). A
-    load that slides moves as a mass alone and is turned up by the friction until it rolls, a ball from rest at 2/7 of the
-    track's speed. Rolling is exact: no slip creeps in below the limit. Where |c| is below `width` the force is the nearest to
+    c is the velocity of the point of contact relative to the track along each coordinate of a load (`State.spin.slip`, default:
+    0 at the start; `with_spin(scene, state, "still")` for loads that do not rotate yet). A sliding load moves like a mass
+    alone, and friction accelerates its rotation until it rolls, a ball from rest at 2/7 of the track's speed. Rolling is exact:
+    below the limit there is no creep. If |c| is below `width`, the force is the one within the limit that is nearest to
 
         F_t = (what rolling needs) - mu N c/width
 
-    that the limit allows, so that the rest of a slip dies out as exp(- kappa/(kappa-1) mu N t/(m width)); steps must resolve
-    it, about kappa/(kappa-1) mu R w^2/width of them a second. `RollingFriction` goes on against the motion of the centre while
-    a load slides.
+    The rest of a slip then decays as exp(- kappa/(kappa-1) mu N t/(m width)), which steps must resolve: about
+    kappa/(kappa-1) mu R w^2/width of them per second. `RollingFriction` still acts against the motion of the centre of a
+    sliding load.
 
     **Arguments**: `coefficient` mu (about 0.1 for oiled steel on steel), above 0; `width` m/s.
 
@@ -86,7 +86,7 @@ class Sliding(Effect):
     >>> float(jv.Sliding(0.1).coefficient)
     0.1
 
-    Source: derived here; Coulomb's law. Asked for by no paper.
+    Source: derived here from Coulomb's law.
     """
 
     coefficient: Array
@@ -109,7 +109,7 @@ class Sliding(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Oiled steel on steel."""
+        """Return mu of oiled steel on steel."""
         return Typical(cls(0.1), "mu = 0.1, oiled steel on steel")
 
     def validate(self, machine: Machine, loads: Loads) -> None:

@@ -243,7 +243,7 @@ def test_reverse_derivatives_are_the_forward_ones():
         (lambda s: jv.capture(s, turns=0), "turns is 0; it must be a whole number, at least 1"),
         (
             lambda s: jv.capture(jv.Scene(s.machine, jv.balls(count=1, mass=0.1, radius=0.1, drag=0.1), s.drive)),
-            "loads.kind is 'ball'; capture asks for balls in a torus",
+            "loads.kind is 'ball'; capture needs balls in a torus",
         ),
         (
             lambda s: jv.capture(jv.Scene(s.machine, s.loads, jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1))),
