@@ -35,7 +35,7 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
-from jaxvib.steady.refused import REFUSED, without_numbers
+from jaxvib.steady.outcome import REFUSED, without_numbers
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:

@@ -1,10 +1,10 @@
-"""One time integration, compiled: what `simulate` and ensembles call."""
+"""One time integration of the full equations of motion, compiled: the program behind `simulate`."""
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -27,7 +27,17 @@ from jaxvib.ode.control import PIController
 from jaxvib.ode.replay import solve
 from jaxvib.runtime.programs import cached
 
-__all__ = ["PER_TURN", "WINDOW", "StepControl", "effects_rate", "frequency_bounds", "integrate", "is_finite", "whole_turns"]
+__all__ = [
+    "PER_TURN",
+    "WINDOW",
+    "IntegrationPlan",
+    "StepControl",
+    "effects_rate",
+    "frequency_bounds",
+    "integrate",
+    "is_finite",
+    "whole_turns",
+]
 
 WINDOW = 4096
 """Samples in the window over which amplitudes and speeds are measured."""
@@ -110,68 +120,62 @@ def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.effects, LoadInteraction)
 
 
+class IntegrationPlan(NamedTuple):
+    """Static choices of one time integration: its method, its steps, and what is kept of it.
+
+    **Attributes**: `solver` diffrax's, None for the method of order 8 in the form that is fastest here; `control` of the steps;
+    `adjoint` diffrax's, None for step replay; `samples` states kept of the whole run, 0 for none; `turns` of the slowest motion
+    in the measuring window; `max_steps`; `progress_meter` diffrax's.
+    """
+
+    solver: diffrax.AbstractSolver | None
+    control: diffrax.AbstractStepSizeController | StepControl
+    adjoint: diffrax.AbstractAdjoint | None
+    samples: int
+    turns: Array | np.ndarray
+    max_steps: int
+    progress_meter: diffrax.AbstractProgressMeter | None = None
+
+
 @cached
 def integrate(
-    scene: Scene,
-    end: Array,
-    state: State,
-    solver: diffrax.AbstractSolver | None,
-    controller: diffrax.AbstractStepSizeController | StepControl,
-    adjoint: diffrax.AbstractAdjoint | None,
-    samples: int,
-    turns: Array | np.ndarray,
-    max_steps: int,
-    progress_meter: diffrax.AbstractProgressMeter | None,
-    wanted: Array | np.ndarray | None = None,
+    scene: Scene, end: Array, state: State, plan: IntegrationPlan, is_measured: Array | np.ndarray | None = None
 ) -> Run:
-    """A run from 0 to `end`, measured over a window at its end, if `wanted`; see `simulate` for the other arguments."""
-    # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
+    """Integrate the full equations of motion from 0 to `end` by a plan, and measure a window at the end if `is_measured`."""
+    # A start that does not exist (a jam mode absent in one run of a batch) must not keep the others waiting.
     exists = is_finite(state)
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
-    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
-    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * turns / slowest, longest), end / 2.0)
-    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW))]
-    saves.append(diffrax.SubSaveAt(t1=True))
-    if samples:
-        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
+    saves = _saves(scene, end, slowest, plan)
     single, together = wrap_angles(scene, state.displacement.dtype)
     field = vector_field(scene)
-    motion = PackedSystem(field, state, wrapped=single and solver is None, together=together, solver=solver)
-    if solver is None:
-        solver = motion.method(adjoint)
-    first = None if isinstance(controller, diffrax.StepTo) else 0.05 / fastest
-    if isinstance(controller, StepControl):
-        if controller.steps is not None:
-            first = end / jnp.asarray(controller.steps)
-        if controller.tolerance is not None:
-            # As the error of a step of order 8 asks; two runs, one to a larger tolerance, then make other steps from the first.
-            first = 0.4 * jnp.asarray(controller.tolerance) ** (1.0 / 9.0) / fastest
-        controller = _controller(motion, state, unit, controller)
+    motion = PackedSystem(field, state, wrapped=single and plan.solver is None, together=together, solver=plan.solver)
+    solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
+    first_step, controller = _steps(motion, state, unit, plan.control, end, fastest)
     solution = solve(
         motion.term,
         solver,
         end=end,
-        first_step=first,
+        first_step=first_step,
         y0=motion.pack(state),
         args=motion.args,
         saveat=diffrax.SaveAt(subs=saves),
         controller=on_jumps(scene, controller),
-        adjoint=adjoint,
-        max_steps=max_steps,
-        progress=progress_meter,
+        adjoint=plan.adjoint,
+        max_steps=plan.max_steps,
+        progress=plan.progress_meter,
     )
     assert solution.ts is not None and solution.ys is not None
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
     window = trajectory(scene, times, states)
-    whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if samples else None
-    if wanted is None:
+    whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
+    if is_measured is None:
         numbers = measure(scene, field, times, states, unit)
-    else:  # of a run that another is compared with nobody reads it
-        numbers = jax.lax.cond(wanted, lambda: measure(scene, field, times, states, unit), lambda: unmeasured(states))
+    else:  # the window of a run with larger steps is compared only
+        numbers = jax.lax.cond(is_measured, lambda: measure(scene, field, times, states, unit), lambda: unmeasured(states))
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
-    # A run that did not end has no window; where it stopped says whether it was on its way to infinity.
+    # A run that did not end has no window; the state where it stopped says whether it was on its way to infinity.
     ended = solution.result == diffrax.RESULTS.successful
     bounded = jnp.where(ended, is_finite(states), ~_diverged(unit, state, last))
     steps = solution.stats["num_steps"]
@@ -189,6 +193,36 @@ def integrate(
         scene=scene,
         together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
     )
+
+
+def _saves(scene: Scene, end: Array, slowest: Array, plan: IntegrationPlan) -> list[diffrax.SubSaveAt]:
+    """Times of the states that are kept: the measuring window, the end, and those evenly spaced over the whole run."""
+    longest = 2.0 * jnp.pi * WINDOW / (PER_TURN * jax.lax.stop_gradient(scene.drive.speed))
+    window = jnp.minimum(jnp.minimum(2.0 * jnp.pi * plan.turns / slowest, longest), end / 2.0)
+    saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - window, end, WINDOW)), diffrax.SubSaveAt(t1=True)]
+    if plan.samples:
+        saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, plan.samples)))
+    return saves
+
+
+def _steps(
+    motion: PackedSystem,
+    state: State,
+    unit: State,
+    control: diffrax.AbstractStepSizeController | StepControl,
+    end: Array,
+    fastest: Array,
+) -> tuple[Array | None, diffrax.AbstractStepSizeController]:
+    """Length of the first step, s, and the controller of the others."""
+    if isinstance(control, StepControl):
+        first = 0.05 / fastest
+        if control.steps is not None:
+            first = end / jnp.asarray(control.steps)
+        if control.tolerance is not None:
+            # By the order 8 of the error; runs to two tolerances then differ from their first step on.
+            first = 0.4 * jnp.asarray(control.tolerance) ** (1.0 / 9.0) / fastest
+        return first, _controller(motion, state, unit, control)
+    return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
 def _is_together(angle: Array) -> Array:
@@ -220,7 +254,7 @@ def _stages(solver: diffrax.AbstractSolver) -> int:
 
 
 def is_finite(state: Any) -> Array:
-    """Whether every number of a state is, or of another tree."""
+    """True if every number of a state, or of another tree, is finite."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
 
 

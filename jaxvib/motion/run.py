@@ -26,7 +26,7 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.refused import REFUSED
+from jaxvib.steady.outcome import REFUSED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-import math
 import time
-from collections.abc import Callable
-from typing import Any, Literal, TypeAlias, cast
+from functools import partial
+from typing import Literal, cast
 
 import diffrax
 import equinox as eqx
@@ -18,38 +16,23 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error, turned
-from jaxvib.motion.integrate import PER_TURN, StepControl, frequency_bounds, integrate, whole_turns, wrap_angles
+from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, whole_turns, wrap_angles
+from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
-from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
-from jaxvib.motion.steps import FORMER, Accuracy, EqualSteps, StepChoice, Tolerance, refuse_former, require, small_number
-from jaxvib.motion.stiffness import advice, stiff_solver
-from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.results.status import failure, status_name
+from jaxvib.motion.start import Start
+from jaxvib.motion.steps import FORMER, StepChoice, refuse_former
+from jaxvib.motion.stiffness import advice
+from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.parallel import in_threads
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.refused import refuse_unknowns
-from jaxvib.units import Number, count, known_number, traced
+from jaxvib.steady.outcome import outcome
+from jaxvib.units import Number
 
-__all__ = ["enough_steps", "simulate"]
-
-_Control: TypeAlias = "StepControl | diffrax.AbstractStepSizeController"
-_MOST_STEPS = 2**31 - 1
-_FEW_SAMPLES, _MANY_SAMPLES = 2**14, 2**18
-
-_COARSER = 100.0
-"""The run whose difference to the run itself is its error estimate makes steps to so many times the tolerance."""
-
-_ATTEMPTS = 6
-"""Runs that an `accuracy` may take before it is given up."""
-
-_STRETCH = 2.0e4
-"""Turns after which single precision no longer resolves time; longer runs are cut into stretches."""
+__all__ = ["last_state", "simulate"]
 
 
 @validated
@@ -120,94 +103,96 @@ def simulate(
 
     Source: the antiphase paper, section 5.3; for the method `UnrolledDopri8`.
     """
-    scene = checked(scene)
-    end = known_number(until, "s", "until", low=0.0, open_low=True)
-    if save not in ("all", "window"):
-        raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")
-    samples = _enough_samples(scene, end) if samples is None else count(samples, "samples", low=2, each=_sample_size(scene))
-    periods = np.asarray(count(turns, "turns"), end.dtype)
-    control = _control(end, stepsize_controller, estimate)
-    asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
-    given = isinstance(start, State)
-    state = (
-        validate_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+    plan = plan_run(
+        scene,
+        until,
+        start=start,
+        mode=mode,
+        apart=apart,
+        spin_up=spin_up,
+        save=save,
+        samples=samples,
+        turns=turns,
+        estimate=estimate,
+        solver=solver,
+        steps=stepsize_controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+        throw=throw,
     )
-    fastest = functools.cache(lambda: frequency_bounds(scene)[0])
-    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state)))
-    stiff = stiff_solver(scene, state, fastest()) if solver is None and concrete else None
-    max_steps = enough_steps((1.0 if stiff is None else 16.0) * fastest(), end) if max_steps is None else max_steps
-    if (solver := stiff if solver is None else solver) is None and not concrete and end.dtype.itemsize >= 8:
-        # Derivatives may be asked for; those of the written-out step take several times as long to compile.
-        forward = isinstance(adjoint, diffrax.ForwardMode)
-        solver = LoopDopri8(tangents=forward, reuse=forward or adjoint is None)
-
-    kept, allowed = samples if save == "all" else 0, min(count(max_steps, "max_steps"), _MOST_STEPS)
-    stretches = _stretches(scene, fastest, end, state, save)
-
-    def stretch(span: Array, state: State, chosen: _Control, wanted: bool) -> Run:
-        most, measuring = allowed, None
-        if concrete and adjoint is None:
-            chosen, most = _limited(chosen, allowed)
-            measuring = np.asarray(wanted)
-        return integrate(scene, span, state, solver, chosen, adjoint, kept, periods, most, progress_meter, measuring)
-
-    def run(chosen: _Control, wanted: bool = True) -> Run:
-        if stretches > 1:
-            return _in_stretches(scene, end, stretches, state, chosen, stretch)
-        return stretch(end, state, chosen, wanted)
-
-    begun, estimated = time.perf_counter(), {}
-    if isinstance(stepsize_controller, Accuracy):
-        if not concrete:
-            raise InputError("accuracy", "needs numbers to look at; under a JAX transformation give a Tolerance")
-        assert isinstance(control, StepControl)
-        found = _to_accuracy(scene, fastest(), run, control, stepsize_controller.error)
-    elif not isinstance(control, StepControl) or not (concrete if estimate is None else estimate):
-        found = run(control)
+    begun = time.perf_counter()
+    if plan.accuracy is not None:
+        run = _run_to_accuracy(plan, plan.accuracy)
+    elif plan.is_estimated:
+        run = _run_with_estimate(plan)
     else:
-        coarser = _coarser(control)
-        both = (lambda: run(control)), (lambda: run(coarser, wanted=False))
-        found, coarse = in_threads(lambda k: both[k](), 2) if progress_meter is None else [each() for each in both]
-        estimated = _compared(scene, fastest(), found, coarse, control, coarser, coarse.evaluations)
-    if traced(found.steps):
-        return refuse_unknowns(asked, dataclasses.replace(found, **estimated), RunStatus.refused)
-    jax.block_until_ready((found.steps, estimated))
-    found = _with(found, seconds=time.perf_counter() - begun, **estimated)
-    if throw:
-        _raise_if_failed(found, max_steps, stepsize_controller)
-    return judged_by_separation(found) if concrete and bool(found.settled) else found
+        run = _run(plan, plan.integration.control)
+    if plan.is_known:
+        jax.block_until_ready((run.steps, run.error))
+        run = dataclasses.replace(run, seconds=on_device(np.asarray(time.perf_counter() - begun, run.seconds.dtype)))
+    run = outcome(run, plan.asked, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
+    return judged_by_separation(run) if plan.is_known and bool(run.settled) else run
 
 
-def _limited(chosen: _Control, most: int) -> tuple[_Control, int]:
-    """The control with the limit of its steps as a number of the program, as far as it can be, and what limits the loop."""
-    if not isinstance(chosen, StepControl) or (chosen.steps is not None and float(chosen.steps) > most):
-        return chosen, most
-    limit = None if chosen.tolerance is None else np.asarray(most, np.int32)
-    return StepControl(chosen.tolerance, chosen.steps, limit), _MOST_STEPS
+def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:
+    """Return a run by these steps, in as many stretches as the plan has; measured if that is wanted."""
+    if plan.stretches > 1:
+        return _run_in_stretches(plan, control, is_measured=is_measured)
+    return _run_stretch(plan, plan.end, plan.state, control, is_measured=is_measured)
 
 
-def _control(end: Array, chosen: StepChoice | None, estimate: bool | None) -> _Control:
-    """What was asked for, checked: nothing that the dtype cannot deliver."""
-    require(chosen, Tolerance, Accuracy, EqualSteps, diffrax.AbstractStepSizeController)
-    if isinstance(chosen, diffrax.AbstractStepSizeController):
-        if estimate:
-            problem = "is True together with a controller, whose steps nobody can make larger; give a Tolerance"
-            raise InputError("estimate", problem)
-        return chosen
-    if isinstance(chosen, EqualSteps):
-        return StepControl(steps=np.asarray(count(chosen.number, "steps"), end.dtype))
-    precision = float(jnp.finfo(end.dtype).eps)
-    if isinstance(chosen, Accuracy):
-        if estimate is False:
-            raise InputError("estimate", "is False together with accuracy, which is reached by estimates; give a Tolerance")
-        accuracy = small_number(chosen.error, "accuracy", end, 1e3)
-        return StepControl(tolerance=np.asarray(max(1e-2 * accuracy, 10.0 * precision), end.dtype))
-    default = 1e-8 if precision < 1e-10 else 1e-5
-    tolerance = default if chosen is None else small_number(chosen.tolerance, "tolerance", end, 10.0)
-    return StepControl(tolerance=np.asarray(tolerance, end.dtype))
+def _run_stretch(plan: RunPlan, end: Array, state: State, control: Control, *, is_measured: bool) -> Run:
+    integration, measuring = plan.integration._replace(control=control), None
+    if plan.is_known and plan.integration.adjoint is None:
+        # One program for runs with any limit of steps, measured or not.
+        integration, measuring = _with_limit_as_number(integration), np.asarray(is_measured)
+    return integrate(plan.scene, end, state, integration, measuring)
+
+
+def _with_limit_as_number(integration: IntegrationPlan) -> IntegrationPlan:
+    """Return the plan with its limit of steps as a number that goes to the program, where the steps can have it."""
+    control, most = integration.control, integration.max_steps
+    if not isinstance(control, StepControl) or (control.steps is not None and float(control.steps) > most):
+        return integration
+    limit = None if control.tolerance is None else np.asarray(most, np.int32)
+    return integration._replace(control=StepControl(control.tolerance, control.steps, limit), max_steps=MAX_STEPS)
+
+
+def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> Run:
+    """Return the run of the last of several stretches; each begins at time 0 after whole turns of the rotor, its angles within
+    one turn."""
+    number, end = plan.stretches, float(plan.end)
+    if isinstance(control, StepControl) and control.steps is not None:
+        control = StepControl(steps=np.asarray(np.ceil(control.steps / number), control.steps.dtype))
+    length, state, runs = whole_turns(plan.scene, end / number), plan.state, []
+    for k in range(number):
+        is_last = k == number - 1
+        span = jnp.asarray(end - (number - 1) * length if is_last else length, plan.end.dtype)
+        run = _run_stretch(plan, span, state, control, is_measured=is_measured and is_last)
+        runs.append(run)
+        if status_name(run.status) != "done":
+            break
+        state = last_state(plan.scene, run)
+    last = runs[-1]
+    return dataclasses.replace(
+        last,
+        **{name: _sum([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
+        window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
+        together=on_device(np.all([known(run.together) for run in runs])),
+    )
+
+
+def _sum(counts: list[Array]) -> Array:
+    return on_device(np.sum([np.asarray(each) for each in counts], dtype=counts[0].dtype))
+
+
+_COARSER = 100.0
+"""Times the tolerance of a run that of the second run is, whose difference to the first is the error estimate."""
 
 
 def _coarser(control: StepControl) -> StepControl:
+    """Return the control of the second run, with larger steps."""
     if control.steps is not None:
         return StepControl(steps=np.asarray(np.ceil(control.steps / 2.0), control.steps.dtype))
     assert control.tolerance is not None
@@ -215,36 +200,77 @@ def _coarser(control: StepControl) -> StepControl:
     return StepControl(tolerance=np.asarray(larger, control.tolerance.dtype))
 
 
+def _run_with_estimate(plan: RunPlan) -> Run:
+    """Return a run with the error that a second run with larger steps estimates, side by side where nobody watches."""
+    control = plan.integration.control
+    assert isinstance(control, StepControl)
+    coarser = _coarser(control)
+    both = partial(_run, plan, control), partial(_run, plan, coarser, is_measured=False)
+    if plan.integration.progress_meter is None:
+        fine, coarse = in_threads(lambda k: both[k](), 2)
+    else:
+        fine, coarse = (each() for each in both)
+    return _compared(plan, fine, coarse, control, coarser, coarse.evaluations)
+
+
+_ATTEMPTS = 6
+"""Runs that an `accuracy` may take before it is given up."""
+
+
+def _run_to_accuracy(plan: RunPlan, accuracy: float) -> Run:
+    """Return the run of the smallest tolerance needed for an estimated error of `accuracy`; status `not_accurate` if none
+    is small enough."""
+    control, dtype = plan.integration.control, plan.scene.drive.speed.dtype
+    assert isinstance(control, StepControl)
+    floor, coarser = 10.0 * float(jnp.finfo(dtype).eps), _coarser(control)
+    before = run = _run(plan, coarser)
+    for _ in range(_ATTEMPTS - 1):
+        latest = _run(plan, control)
+        run = _compared(plan, latest, before, control, coarser, known(run.evaluations))
+        if status_name(run.status) != "done" or float(run.error) <= accuracy:
+            return run
+        tolerance = float(cast(Array, control.tolerance))
+        # Smaller steps only add to the share of rounding in the error.
+        radians = plan.fastest * latest.window.time[-1]
+        if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, plan.scene, latest.steps, radians)) > accuracy:
+            break
+        # A little more than what is missing: the error shrinks a little slower than the tolerance.
+        share = min(max(0.2 * (accuracy / float(run.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(run.error)) else 1e-2
+        before, coarser = latest, control
+        control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), dtype))
+    return eqx.tree_at(lambda r: r.status, run, RunStatus.not_accurate)
+
+
+def _compared(
+    plan: RunPlan,
+    fine: Run,
+    coarse: Run,
+    control: StepControl,
+    coarser: StepControl,
+    before: Array | np.ndarray,
+) -> Run:
+    """Return the finer run with its estimated error and the cost of both: so many evaluations were made `before` it."""
+    theirs, counted = (coarse.window.state, coarse.status), (fine.evaluations, before)
+    error, evaluations = _estimated(plan.scene, plan.fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
+    return dataclasses.replace(fine, error=error, evaluations=evaluations)
+
+
 def _shrink(fine: StepControl, coarse: StepControl) -> Array | np.ndarray:
-    """What share of the difference between two runs is the error of the finer one, where the motion is smooth: for a method of
-    order 8 the error falls with the tolerance's power 8/9 and the steps' power 8; less is counted on, 0.45 and 3, so that the
-    estimate errs upward."""
+    """Share of the difference between two runs that is the error of the finer one, if the motion is smooth.
+
+    With a method of order 8 the error falls with the power 8/9 of the tolerance and the power 8 of the number of steps. The
+    powers used here are 0.45 and 3, so that the estimate errs upward.
+    """
     if fine.steps is not None and coarse.steps is not None:
         return (coarse.steps / fine.steps) ** 3
     assert fine.tolerance is not None and coarse.tolerance is not None
     return (fine.tolerance / coarse.tolerance) ** 0.45
 
 
-def _compared(
-    scene: Scene,
-    fastest: Array,
-    fine: Run,
-    coarse: Run,
-    control: StepControl,
-    coarser: StepControl,
-    before: Array | np.ndarray,
-) -> dict[str, Array]:
-    """The estimated error of the finer run, and what all cost: so many evaluations were made `before` it."""
-    theirs = coarse.window.state, coarse.status
-    counted = fine.evaluations, before
-    error, evaluations = _estimated(scene, fastest, fine.window, fine.steps, *theirs, control, coarser, counted)
-    return {"error": error, "evaluations": evaluations}
-
-
 @cached
 def _estimated(
     scene: Scene,
-    fastest: Array,
+    fastest: Array | np.ndarray,
     window: Trajectory,
     steps: Array,
     theirs: State,
@@ -253,9 +279,9 @@ def _estimated(
     coarser: StepControl,
     evaluations: tuple[Array, Array | np.ndarray],
 ) -> tuple[Array, Array]:
-    """The estimated error of a run, from its window and the states and the status of a coarser one, and the sum of these
-    `evaluations`; `fastest` see `frequency_bounds`."""
-    # A run that is compared with itself, or with one that failed, has an error that nobody knows.
+    """Estimated error of a run, from its window and the states and the status of a coarser one, and the sum of the
+    `evaluations`; `fastest` as in `frequency_bounds`."""
+    # The error of a run that is compared with itself, or with one that failed, is not known.
     found = status == RunStatus.done
     if control.steps is not None:
         found = found & (control.steps != coarser.steps)
@@ -264,79 +290,6 @@ def _estimated(
     difference = scaled_error(ours, theirs, error_scale(ours, natural_units(scene)))
     error = estimated_error(difference, _shrink(control, coarser), scene, steps, fastest * window.time[-1])
     return jnp.where(found & jnp.isfinite(error), error, jnp.inf), evaluations[0] + evaluations[1]
-
-
-def _to_accuracy(scene: Scene, fastest: Array, run: Callable[[StepControl], Run], control: StepControl, accuracy: float) -> Run:
-    """Runs with ever smaller tolerances until the estimated error is small enough."""
-    floor = 10.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    before, coarse = run(_coarser(control)), _coarser(control)
-    found, spent = before, known(before.evaluations)
-    for _ in range(_ATTEMPTS - 1):
-        latest = run(control)
-        found = dataclasses.replace(latest, **_compared(scene, fastest, latest, before, control, coarse, spent))
-        if status_name(found.status) != "done":
-            return found
-        tolerance = float(cast(Array, control.tolerance))
-        if float(found.error) <= accuracy:
-            return found
-        # Smaller steps only add to what rounding alone makes of the error.
-        radians = fastest * latest.window.time[-1]
-        if tolerance <= floor or float(estimated_error(jnp.zeros(()), 0.0, scene, latest.steps, radians)) > accuracy:
-            break
-        # A little more than what is missing, for the error shrinks a little slower than the tolerance.
-        share = min(max(0.2 * (accuracy / float(found.error)) ** 1.2, 1e-5), 0.1) if np.isfinite(float(found.error)) else 1e-2
-        before, coarse = latest, control
-        spent = known(found.evaluations)
-        control = StepControl(tolerance=np.asarray(max(share * tolerance, floor), found.error.dtype))
-    return eqx.tree_at(lambda r: r.status, found, RunStatus.not_accurate)
-
-
-def _with(run: Run, **values: Any) -> Run:
-    """The run with these values, in the types of its own where they are numbers of Python."""
-
-    def typed(name: str, value: Any) -> Any:
-        return value if isinstance(value, Array) else np.asarray(value, getattr(run, name).dtype)
-
-    return dataclasses.replace(run, **on_device({name: typed(name, value) for name, value in values.items()}))
-
-
-def _stretches(scene: Scene, fastest: Callable[[], Array], end: Array, state: State, save: str) -> int:
-    """Into how many stretches a run is cut: more than one in single precision, where time would lose its digits."""
-    if state.displacement.dtype.itemsize >= 8 or save != "window" or not scene.drive.constant:
-        return 1
-    if any(traced(leaf) for leaf in jax.tree.leaves((scene, end, state))):
-        return 1
-    return max(1, math.ceil(float(end * fastest()) / (2.0 * math.pi * _STRETCH)))
-
-
-def _in_stretches(
-    scene: Scene,
-    end: Array,
-    number: int,
-    state: State,
-    controller: _Control,
-    integrated: Callable[[Array, State, _Control, bool], Run],
-) -> Run:
-    """The run of the last of several stretches, each `integrated` from a state over a time, measured if that is wanted; each
-    begins at time 0 after whole turns of the rotor, angles within one."""
-    if isinstance(controller, StepControl) and controller.steps is not None:
-        controller = StepControl(steps=np.asarray(np.ceil(controller.steps / number), controller.steps.dtype))
-    length = whole_turns(scene, float(end) / number)
-    last = float(end) - (number - 1) * length
-    taken, rejected, evaluations, together, found = 0, 0, 0, True, None
-    for k in range(number):
-        span = jnp.asarray(length if k < number - 1 else last, end.dtype)
-        found = integrated(span, state, controller, k == number - 1)
-        state = last_state(scene, found)
-        taken, rejected = taken + int(found.steps), rejected + int(found.rejected)
-        evaluations, together = evaluations + int(found.evaluations), found.together & together
-        if status_name(found.status) != "done":
-            break
-    assert found is not None
-    counts = [jnp.asarray(n, found.steps.dtype) for n in (taken, rejected, evaluations)]
-    found = eqx.tree_at(lambda r: [r.steps, r.rejected, r.evaluations], found, counts)
-    found = eqx.tree_at(lambda r: r.window.time, found, found.window.time + length * (number - 1))
-    return _with(found, together=together)
 
 
 def last_state(scene: Scene, run: Run) -> State:
@@ -348,45 +301,20 @@ def last_state(scene: Scene, run: Run) -> State:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))
 
 
-def _enough_samples(scene: Scene, end: Array) -> int:
-    """So many that a picture shows the vibration and no beat of it with the samples; two numbers, so two programs, will do."""
-    if traced(end) or traced(scene.drive.speed):
-        return 2000
-    wanted = PER_TURN * float(end) * float(scene.drive.speed) / (2.0 * math.pi)
-    return _FEW_SAMPLES if wanted <= _FEW_SAMPLES else _MANY_SAMPLES
+_FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_start")
 
 
-def _sample_size(scene: Scene) -> float:
-    """Bytes that a state that is kept takes, with the forces that belong to it, held three times while it is made."""
-    structure, coordinates = scene.machine.structure(), len(scene.loads.rest())
-    numbers = 2 * structure.mass.shape[0] + 2 * coordinates * scene.loads.count + structure.bed_stiffness.shape[0] + 5
-    return 3.0 * scene.drive.speed.dtype.itemsize * numbers
-
-
-def enough_steps(fastest: Array, end: Array) -> int:
-    """500 steps for each turn of what moves `fastest`, rad/s, rounded up to a power of 2: few programs where it is part of
-    one."""
-    if traced(end) or traced(fastest):
-        return 2**20
-    turns = float(end) * float(fastest) / (2.0 * math.pi)
-    steps = 4096 + 500 * turns
-    if not steps <= _MOST_STEPS:
-        raise InputError("until", f"is {float(end):g} s, {turns:.2g} turns of what moves fastest; run shorter stretches")
-    return min(2 ** math.ceil(math.log2(steps)), _MOST_STEPS)
-
-
-def _raise_if_failed(run: Run, max_steps: int, chosen: StepChoice | None) -> None:
-    name, hint = status_name(run.status), ""
-    if name == "done":
-        return
-    kept = run.window if run.trajectory is None else run.trajectory
+def _hint(plan: RunPlan, run: Run, name: str) -> str:
+    """Where a run failed, and the change that may help."""
+    hint, kept = "", run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):
         hint += f", after t = {times[finite][-1]:.6g} s"
     if name == "no_step":
         hint += "; give a smaller tolerance, or an explicit solver"
     if name == "max_steps_reached":
-        hint += f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
-    if isinstance(chosen, Accuracy) and name == "not_accurate":
-        hint += f" ({float(run.error):.1e}, asked for {chosen.error:.1e}); give a larger accuracy, or a shorter run"
-    raise failure(run.status, hint)
+        most = plan.integration.max_steps
+        hint += f" ({most} steps); give a larger max_steps, a larger tolerance or a shorter run{advice(run.scene)}"
+    if name == "not_accurate":
+        hint += f" ({float(run.error):.1e}, asked for {plan.accuracy:.1e}); give a larger accuracy, or a shorter run"
+    return hint

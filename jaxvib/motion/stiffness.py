@@ -60,7 +60,7 @@ def fastest_decay(scene: Scene) -> Array:
     return jnp.maximum(rate, jnp.max(hermitian_modes(damping)[0]))
 
 
-def stiff_solver(scene: Scene, state: State, fastest: Array) -> Rodas4 | None:
+def stiff_solver(scene: Scene, state: State, fastest: Array | np.ndarray) -> Rodas4 | None:
     """The implicit method for a scene of known numbers that decays too fast for explicit steps, otherwise None."""
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(state))
     return Rodas4() if size <= _MAX_IMPLICIT and float(fastest_decay(scene)) > _STIFF * float(fastest) else None

@@ -20,7 +20,7 @@ from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, re
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.refused import REFUSED, refuse_unknowns
+from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import Numbers, numbers
 from jaxvib.units.known import when_known
 
@@ -146,7 +146,7 @@ def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = 
     """
     model = _two_directions(scene)
     speeds = scene.drive.speed[None] if rotor_speed is None else numbers(rotor_speed, "rad/s", "rotor_speed", None, low=0.0)
-    return refuse_unknowns(scene, _whirl(model, jnp.atleast_1d(speeds), loads), WhirlStatus.refused)
+    return outcome(_whirl(model, jnp.atleast_1d(speeds), loads), scene)
 
 
 def _sense_word(speed: float, forward: bool) -> str:
@@ -241,7 +241,7 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 
     Source: Artyunin 2013, section V.
     """
-    return refuse_unknowns(scene, _critical_speeds(_two_directions(scene), loads), WhirlStatus.refused)
+    return outcome(_critical_speeds(_two_directions(scene), loads), scene)
 
 
 @cached

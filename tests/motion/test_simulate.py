@@ -16,15 +16,8 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.integrate import StepControl, effects_rate, frequency_bounds, integrate
-from jaxvib.motion.simulate import (
-    _control,
-    _enough_samples,
-    _raise_if_failed,
-    _sample_size,
-    _shrink,
-    _to_accuracy,
-    enough_steps,
-)
+from jaxvib.motion.plan import _enough_samples, _sample_size, _step_control, enough_steps
+from jaxvib.motion.simulate import _shrink
 from jaxvib.ode.dopri8_loop import LoopDopri8
 
 
@@ -135,7 +128,7 @@ def test_so_many_states_are_kept_unless_said_otherwise(turns, samples):
 
 def test_default_tolerance_depends_on_the_precision():
     for dtype, tolerance in ((jnp.float64, 1e-8), (jnp.float32, 1e-5)):
-        np.testing.assert_allclose(_control(jnp.asarray(1.0, dtype), None, None).tolerance, tolerance, rtol=1e-6)
+        np.testing.assert_allclose(_step_control(jnp.asarray(1.0, dtype), None, None).tolerance, tolerance, rtol=1e-6)
 
 
 def test_estimate_assumes_less_than_order_8():
@@ -165,8 +158,8 @@ class Asked(Exception):
 def test_a_transformed_run_takes_the_method_that_compiles_fast(monkeypatch, double, adjoint):
     """The engine's own method is used in single precision, because it alone keeps angles within a turn."""
 
-    def asked(scene, end, state, solver, *_):
-        raise Asked(solver)
+    def asked(scene, end, state, plan, *_):
+        raise Asked(plan.solver)
 
     monkeypatch.setattr("jaxvib.motion.simulate.integrate", asked)
     with jax.enable_x64(double):
@@ -197,21 +190,24 @@ def test_next_tolerance_has_a_safety_margin(monkeypatch):
     ):
         asked, errors = [], iter([times * 1e-4, 0.5e-4])
 
-        def run(control, asked=asked):
+        def run(plan, control, asked=asked):
             asked.append(float(control.tolerance))
             return base
 
-        compared = lambda *_, errors=errors: {"error": jnp.asarray(next(errors))}  # noqa: E731
+        compared = lambda *_, errors=errors: dataclasses.replace(base, error=jnp.asarray(next(errors)))  # noqa: E731
+        monkeypatch.setattr("jaxvib.motion.simulate._run", run)
         monkeypatch.setattr("jaxvib.motion.simulate._compared", compared)
-        found = _to_accuracy(base.scene, jnp.asarray(1.0), run, StepControl(tolerance=jnp.asarray(1e-6)), 1e-4)
-        assert bool(found.status == jv.RunStatus.done) and len(asked) == 3 and asked[0] > asked[1] == 1e-6
+        found = jv.simulate(base.scene, 20.0, save="window", stepsize_controller=jv.Accuracy(1e-4))
+        assert bool(found.finished) and len(asked) == 3 and asked[0] > asked[1] == pytest.approx(1e-6)
         assert low <= asked[2] / asked[1] <= high, times
 
 
-def test_a_run_to_an_accuracy_that_needs_more_steps_says_so():
+def test_a_run_to_an_accuracy_that_needs_more_steps_says_so(monkeypatch):
     run, asked = small_run(save="window"), jv.Accuracy(1e-6)
     for status, says in ((jv.RunStatus.max_steps_reached, "64 steps"), (jv.RunStatus.not_accurate, "asked for 1.0e-06")):
+        failed = dataclasses.replace(run, status=status)
+        monkeypatch.setattr("jaxvib.motion.simulate._run_to_accuracy", lambda *_, failed=failed: failed)
         with pytest.raises(jv.ComputationError) as error:
-            _raise_if_failed(dataclasses.replace(run, status=status), 64, asked)
+            jv.simulate(run.scene, 20.0, save="window", stepsize_controller=asked, max_steps=64)
         assert says in str(error.value)
         assert ("asked for" in str(error.value)) == (status is jv.RunStatus.not_accurate)

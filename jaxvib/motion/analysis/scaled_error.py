@@ -100,7 +100,11 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
 
 
 def estimated_error(
-    difference: Array, share: Array | np.ndarray | float, scene: Scene, steps: Array | int = 0, radians: Array | int = 0
+    difference: Array,
+    share: Array | np.ndarray | float,
+    scene: Scene,
+    steps: Array | int = 0,
+    radians: Array | np.ndarray | int = 0,
 ) -> Array:
     """The error of a run, from its `difference` to one with larger steps.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import diffrax
@@ -36,12 +37,13 @@ from jaxvib.ode.replay import solve
 from jaxvib.ode.rodas4 import Rodas4
 from jaxvib.ode.scalarize import MAX_SCALARS, scalarized_program, scalars_of
 from jaxvib.ode.types import Args, IntScalarLike, RealScalarLike, Terms
-from jaxvib.results.status import failure, member, status_name
+from jaxvib.results.status import member, status_name
 from jaxvib.runtime.compat import jaxpr_as_fun
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.balance.monodromy import at_constant_speed
-from jaxvib.steady.refused import refuse_unknowns
-from jaxvib.units import Number, count, number, traced
+from jaxvib.steady.outcome import outcome
+from jaxvib.units import Number, count, number
+from jaxvib.units.known import when_known
 
 __all__ = ["envelope"]
 
@@ -195,17 +197,15 @@ def envelope(
     run = _run(
         scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )
-    if traced(run.steps):
-        return refuse_unknowns(asked, run, EnvelopeStatus.refused)
-    if throw:
-        _raise_if_failed(run, max_steps)
-    if bool(run.settled) and status_name(run.status) == "done":
-        return _judged_by_separation(run)
-    return run
+    run = outcome(run, asked, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
+    judged = when_known(lambda *_: _judged_by_separation(run), run.steps, run.status)
+    return run if judged is None else judged
 
 
 def _judged_by_separation(run: Envelope) -> Envelope:
     """Return the run with the status `would_separate` if its loads keep nearly one angle although that is unstable."""
+    if not (bool(run.settled) and status_name(run.status) == "done"):
+        return run
     phase, time = np.asarray(run.window.phase), np.asarray(run.window.time)
     if not is_nearly_one_angle(phase):
         return run
@@ -377,13 +377,12 @@ def _units(scene: Scene) -> _Units:
     return _Units(averaged_loads(scene).unbalance() / mass, scene.drive.speed)
 
 
-def _raise_if_failed(run: Envelope, max_steps: int) -> None:
-    name = status_name(run.status)
-    if name == "done":
-        return
-    hint = {
-        "max_steps_reached": f" ({max_steps} steps); give a larger max_steps, a larger tolerance or a shorter run",
-        "no_step": "; give a smaller tolerance, or leave the solver out",
-        "not_turning": "; integrate the full equations with simulate",
-    }
-    raise failure(run.status, hint.get(name, ""))
+_HINTS = {
+    "max_steps_reached": " ({} steps); give a larger max_steps, a larger tolerance or a shorter run",
+    "no_step": "; give a smaller tolerance, or leave the solver out",
+    "not_turning": "; integrate the full equations with simulate",
+}
+
+
+def _hint(max_steps: int, name: str) -> str:
+    return _HINTS.get(name, "").format(max_steps)

@@ -15,7 +15,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.analysis.measure import AbstractMeasured
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
-from jaxvib.steady.refused import REFUSED
+from jaxvib.steady.outcome import REFUSED
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit

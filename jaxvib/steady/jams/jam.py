@@ -23,8 +23,8 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import status_names
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, Pieces, branch_pieces, branch_tangent, rotor_speed_at
-from jaxvib.steady.refused import REFUSED, refuse_unknowns
-from jaxvib.units import traced
+from jaxvib.steady.outcome import REFUSED, outcome
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
@@ -127,13 +127,17 @@ class JamModes(AbstractJam):
         most = self.mode.shape[0]
         if isinstance(mode, bool) or not isinstance(mode, (int, np.integer)) or not 1 <= mode <= most:
             raise InputError("mode", f"is {quoted(mode)}; this machine's jam modes are numbered 1 to {most}")
-        if throw and not traced(self.omega) and status_names(self.status)[int(mode) - 1] == "absent":
+        if throw:
+            when_known(lambda *_: self._require(int(mode)), self.omega, self.status)
+        return int(mode) - 1
+
+    def _require(self, mode: int) -> None:
+        if status_names(self.status)[mode - 1] == "absent":
             there = ", ".join(map(str, self.mode_numbers()))
             raise ComputationError(
                 "absent",
                 f"jam mode {mode} does not exist at rotor speed {float(self.rotor_speed[0]):.6g} rad/s; there: {there}",
             )
-        return int(mode) - 1
 
     @validated
     def select(self, mode: int, *, throw: bool = True) -> Jam:
@@ -204,7 +208,7 @@ def jam_modes(scene: Scene) -> JamModes:
     """
     scene = checked(scene)
     require_drag(jammed_loads(scene))
-    return refuse_unknowns(scene, jams_of(scene), JamStatus.refused)
+    return outcome(jams_of(scene), scene)
 
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:

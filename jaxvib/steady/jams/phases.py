@@ -27,7 +27,7 @@ from jaxvib.results.status import sentence, status_name
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.newton import damped_newton
 from jaxvib.steady.jams.patterns import PhasePattern, phase_pattern
-from jaxvib.steady.refused import REFUSED, refuse_unknowns
+from jaxvib.steady.outcome import REFUSED, outcome
 from jaxvib.units import number, numbers
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     if np.shape(phase) != (loads.count,):
         raise InputError("phase", f"has shape {np.shape(phase)}; one phase for each load is needed, ({loads.count},)")
     speed, phases = number(omega, "rad/s", "omega", low=0.0, open_low=True), numbers(phase, "rad", "phase", loads.count)
-    return refuse_unknowns(scene, jam_from(scene, speed, phases), PhaseStatus.refused)
+    return outcome(jam_from(scene, speed, phases), scene)
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:

@@ -19,7 +19,6 @@ from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
@@ -27,7 +26,7 @@ from jaxvib.steady.jams.jam import jams_of
 from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
 from jaxvib.steady.orbits.floquet import is_stiff, steps_for
 from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, numbers_of, orbits
-from jaxvib.steady.refused import refuse_unknowns
+from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number, traced
 
 __all__ = ["branch_at", "exact_mode_speeds", "jam_orbit"]
@@ -178,9 +177,7 @@ def jam_orbit(
             wanted = _steps_for(frozen, *speeds, implicit)
             steps = 2 ** int(np.ceil(np.log2(float(wanted))))
         found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, implicit, settle)
-    elif throw and status_name(found.status) in ("absent", "not_converged"):
-        raise failure(found.status)
-    return refuse_unknowns(scene, found, OrbitStatus.refused)
+    return outcome(found, scene, throw=throw and concrete, failures=("absent", "not_converged"))
 
 
 @cached

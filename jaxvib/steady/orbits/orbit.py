@@ -28,7 +28,7 @@ from jaxvib.steady.orbits.collocation import (
     periodic_motion,
 )
 from jaxvib.steady.orbits.floquet import Floquet, floquet
-from jaxvib.steady.refused import REFUSED
+from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from jax import Array
 
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.plan import enough_steps
+from jaxvib.motion.simulate import simulate
 from jaxvib.motion.steps import Tolerance
 from jaxvib.steady.jams.jam import JamStatus, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit

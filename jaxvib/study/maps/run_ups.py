@@ -20,7 +20,8 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.simulate import enough_steps, simulate
+from jaxvib.motion.plan import enough_steps
+from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state, require_start
 from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.fields import in_unit, part

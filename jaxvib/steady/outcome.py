@@ -1,0 +1,74 @@
+"""Outcome of a question: its result, the error that its status stands for, or the status `refused`.
+
+Numbers of a scene may have no value until a compiled program runs. Checks of such numbers are skipped when the scene is built;
+if one of them turns out not to be allowed, the result has the status `refused` and no numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.machine.checked import allowed_unknowns
+from jaxvib.machine.scene import Scene
+from jaxvib.results.result import Result
+from jaxvib.results.status import failure, status_name
+from jaxvib.runtime.compat import enumeration_of
+from jaxvib.units.known import when_known
+
+__all__ = ["REFUSED", "outcome", "without_numbers"]
+
+REFUSED = "a number that was not known while the program was built is not allowed in a scene: build the scene outside to see it"
+"""Sentence of the status `refused`."""
+
+Found = TypeVar("Found", bound=Result)
+
+
+def outcome(
+    result: Found,
+    scene: Scene | None = None,
+    *,
+    throw: bool = False,
+    failures: Collection[str] = (),
+    hint: Callable[[str], str] = lambda _: "",
+) -> Found:
+    """Return the result of a question about `scene`, or raise the error of a known status.
+
+    **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: text after the sentence of the
+    status with that name.
+
+    **Returns** the result; under a JAX transformation with the status `refused` and NaN for numbers if a number of the scene is
+    one that its constructor would not take, such as a negative stiffness. **Raises** `ComputationError`.
+    """
+
+    def check(_: eqx.Enumeration) -> None:
+        if (name := status_name(result.status)) in failures:
+            raise failure(result.status, hint(name))
+
+    if throw:
+        when_known(check, result.status)
+    allowed = None if scene is None else allowed_unknowns(scene)
+    if allowed is None:
+        return result
+    refused = enumeration_of(result.status).refused  # pyright: ignore[reportAttributeAccessIssue]
+    status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), result.status, refused)
+    return eqx.tree_at(lambda result: result.status, without_numbers(allowed, result), status)
+
+
+def without_numbers(allowed: Array, found: Any) -> Any:
+    """The tree with NaN and False in place of its numbers unless `allowed`; a scene in it stays as it is."""
+
+    def kept(value: Any) -> Any:
+        if not isinstance(value, Array):
+            return value
+        if jnp.issubdtype(value.dtype, jnp.inexact):
+            # `jnp.where` would broadcast the condition for each of the arrays.
+            return jax.lax.select(allowed, value, jnp.full_like(value, jnp.nan))
+        return value & allowed if value.dtype == bool else value
+
+    return jax.tree.map(kept, found, is_leaf=lambda value: isinstance(value, Scene))
