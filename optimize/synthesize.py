@@ -15,8 +15,8 @@ from jaxvib.boundary import call_user, validated
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import jammed_loads, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
@@ -114,7 +114,7 @@ def synthesize(
     space, problem, found = _searched(space, objective, demands, options, tell)
     best = found.best
     others = made(problem, neighbours(problem, found))
-    scene = checked(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
+    scene = validate_scene(on_device(jax.tree.map(lambda leaf: np.asarray(leaf)[0], others)))
     kept = found.violation < 10.0 * FEASIBLE
     done = kept & (found.left < _CONVERGED)
     values = np.where(kept, found.point.values[:, 0], np.inf)
@@ -188,7 +188,7 @@ def _checked(space: DesignSpace, objective: Quantity, subject_to: Demand | Seque
     for demand in demands:
         if not isinstance(demand, Demand):
             raise InputError("subject_to", f"has {quoted(demand)}; write demands such as amplitude(mode=3) > '2 mm'")
-    checked(space.scene)
+    validate_scene(space.scene)
     between(space.scene, objective.of)
     if not space.scene.drive.constant:
         raise InputError("drive", f"is {quoted(space.scene.drive.kind)}; a design is sought at one speed, give a ConstantSpeed")
@@ -255,7 +255,7 @@ def _with_loads(space: DesignSpace, loads: int) -> DesignSpace:
     if not getattr(now, "alike", False):
         raise InputError("choices.loads.count", "needs loads that share every number; give one mass, radius and drag for all")
     scene = eqx.tree_at(lambda s: s.loads, space.scene, dataclasses.replace(now, count=loads))
-    return eqx.tree_at(lambda s: s.scene, space, checked(scene))
+    return eqx.tree_at(lambda s: s.scene, space, validate_scene(scene))
 
 
 def _mode_of(objective: Quantity, demands: Sequence[Demand]) -> int | None:

@@ -14,7 +14,6 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -26,6 +25,7 @@ from jaxvib.machine.effects.terms import (
 )
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.results.status import failure
 from jaxvib.runtime.programs import cached
@@ -185,7 +185,7 @@ def natural_frequencies(scene: Scene) -> Array:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    frequencies, lost = _natural_frequencies(checked(scene))
+    frequencies, lost = _natural_frequencies(validate_scene(scene))
     is_lost = when_known(lambda lost, _: bool(np.any(lost)), lost, frequencies)
     if is_lost:
         raise failure(FrequencyStatus.lost_digits)
@@ -194,7 +194,7 @@ def natural_frequencies(scene: Scene) -> Array:
 
 def estimated_frequencies(scene: Scene) -> Array:
     """`natural_frequencies` with the digits that rounding leaves: for marks in figures and choices of step sizes."""
-    return _natural_frequencies(checked(scene))[0]
+    return _natural_frequencies(validate_scene(scene))[0]
 
 
 @cached

@@ -18,9 +18,9 @@ from jaxtyping import PyTree
 from jaxvib.boundary import call_user, validated
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import allowed_unknowns, checked
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
@@ -248,7 +248,7 @@ def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array
         scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
         if not isinstance(scene, Scene) or not isinstance(state, State):
             raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
-        scene = checked(scene)
+        scene = validate_scene(scene)
         allowed = allowed_unknowns(scene)
         return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
 from jaxvib.motion.integrate import whole_turns, wrap_angles
 from jaxvib.motion.run import Run
@@ -140,7 +140,7 @@ def growth(
     Source: Benettin, Galgani, Giorgilli, Strelcyn 1980.
     """
     require_known(scene, "growth", "jam_orbit or simulate")
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError(
             "drive", f"is {quoted(scene.drive.kind)}; how disturbances grow is asked under a constant speed: use ConstantSpeed"

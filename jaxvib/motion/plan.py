@@ -17,8 +17,8 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.integrate import PER_TURN, IntegrationPlan, StepControl, frequency_bounds
 from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
 from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, small_number
@@ -88,7 +88,7 @@ def plan_run(
     throw: bool,
 ) -> RunPlan:
     """Validate the arguments of `simulate` and choose method, steps and sizes of its run. **Raises** `InputError`."""
-    asked = checked(scene)
+    asked = validate_scene(scene)
     end = known_number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):
         raise InputError("save", f"is {quoted(save)}; it must be 'all' or 'window'")

@@ -13,8 +13,8 @@ from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.integrate import frequency_bounds, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
@@ -107,7 +107,7 @@ def settle(
     True
     """
     require_known(scene, "settle", "jam_orbit or simulate")
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")
     count(periods, "periods")

@@ -15,11 +15,11 @@ from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import Spin, State
 from jaxvib.equations.sliding import dot, kinematics
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, LoadInteraction, SlipRelease
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
@@ -78,7 +78,7 @@ def initial_state(
         raise InputError("start", f"is {quoted(start)}; it must be 'rest', 'jam' or 'spin_up'")
     if start != "jam" and mode is not None:
         raise InputError("mode", f"is {quoted(mode)}, which goes with start='jam' only; leave it out or start in a jam")
-    scene = checked(scene)
+    scene = validate_scene(scene)
     n = scene.loads.count
     mass = scene.machine.structure().mass
     zero = np.zeros(mass.shape[:1], mass.dtype)

@@ -14,9 +14,9 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import Folds, fold_points
@@ -127,7 +127,7 @@ def branches(
 
     Source: the antiphase paper, equations (35)-(39), numbers (41), (42).
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if exact:
         from jaxvib.steady.orbits.diagram import exact_branches  # needs the time integrator: only who asks pays
 

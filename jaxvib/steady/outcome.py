@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.checked import allowed_unknowns
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of

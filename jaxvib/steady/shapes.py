@@ -11,8 +11,8 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import linear_model
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -75,7 +75,7 @@ def mode_shapes(scene: Scene) -> ModeShapes:
 
     Source: the antiphase paper, equations (19), (23).
     """
-    return _mode_shapes(checked(scene))
+    return _mode_shapes(validate_scene(scene))
 
 
 @cached

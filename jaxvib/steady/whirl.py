@@ -14,8 +14,8 @@ from jaxvib.boundary import validated
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Carrier
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, relative_to
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -264,7 +264,7 @@ def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
 
 
 def _two_directions(scene: Scene) -> LinearModel:
-    scene = checked(scene)
+    scene = validate_scene(scene)
     model = linear_model(scene)
     carrier = model.carrier
     if carrier.axes != (0, 1):

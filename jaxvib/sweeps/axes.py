@@ -13,9 +13,9 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.units import Number, count, number
 from optimize.space.numbers import Place, changed, places_of, value_of
 
@@ -187,7 +187,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
             raise InputError(f"axes.{name}", "has a value twice; name each one once")
         axis = Axis(name, unit, values, float(np.min(values)), float(np.max(values)), False, spot)
     for end in (axis.low, axis.high):  # what one number may be, its constructor knows
-        checked(put(scene, (spot,), jnp.asarray([end])))
+        validate_scene(put(scene, (spot,), jnp.asarray([end])))
     return axis
 
 

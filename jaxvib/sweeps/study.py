@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TypeAlias, cast
 
 from jaxvib.errors import ComputationError, InputError, quoted, require_one_of
-from jaxvib.machine.checked import checked
 from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.start import Start, initial_state
 from jaxvib.results.fields import Plain
 from jaxvib.sweeps.axes import SAMPLINGS, AxisSpec, Grid, axis_of, corners, require_apart, tile_of
@@ -53,7 +53,7 @@ def study(
     chunk: int | None = None,
 ) -> Study:
     """A study, checked; for the arguments see `sweep`. **Raises** `InputError` for values that are not allowed."""
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if not isinstance(axes, Mapping) or not axes:
         raise InputError("axes", "is empty; name at least one number that changes, such as drive.speed")
     found = tuple(axis_of(scene, name, spec) for name, spec in axes.items())

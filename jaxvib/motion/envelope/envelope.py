@@ -20,10 +20,10 @@ from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, avera
 from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import LoadPotential
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
@@ -176,7 +176,7 @@ def envelope(
 
     Source: see `averaged_field`.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     averaged_loads(scene)
     end = number(until, "s", "until", low=0.0, open_low=True)
     if save not in ("all", "window"):

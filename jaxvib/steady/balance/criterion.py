@@ -12,7 +12,6 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import circular_loads, require_one_point, require_terms, turning
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.terms import (
     ContactFriction,
     DrillingSpinRelease,
@@ -23,6 +22,7 @@ from jaxvib.machine.effects.terms import (
     SupportForce,
 )
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
@@ -150,7 +150,7 @@ def criterion(scene: Scene) -> Criterion:
 
     Source: Filimonikhin et al. 2022, sections 5.1-5.3, for any carrier.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     require_one_point(scene)
     if scene.loads.count < 2:
         raise InputError(

@@ -13,8 +13,8 @@ from jax import Array
 
 from jaxvib.equations.linear import LinearModel, linear_model, require_one_point
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import allowed_unknowns, checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.numerics.linalg import hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
 from jaxvib.numerics.roots import bracketed_root
 from jaxvib.results.fields import in_unit
@@ -166,7 +166,7 @@ def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
 
     Source: Filimonikhin et al. 2022, equations (12), (32)-(38), (53)-(59) with their misprints mended, for any carrier.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     require_one_point(scene)
     found, *parts = _characteristic_speeds(scene)
     when_known(partial(_require_port_that_moves, scene), *parts)

@@ -15,12 +15,12 @@ from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure
@@ -138,7 +138,7 @@ def balanced_states(scene: Scene) -> BalancedStates:
 
     Source: Filimonikhin et al. 2022, section 2 (families from three loads on, the common turn counted); derived here.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     loads = _sides(circular_loads(scene))
     n = loads.size
     imbalance = _imbalance(scene)

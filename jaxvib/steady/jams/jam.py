@@ -14,8 +14,8 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import JammedModel, jammed_loads, jammed_model, peak_force, require_drag
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.numerics.roots import bracketed_root, known_root
 from jaxvib.results.fields import in_unit, part
@@ -206,7 +206,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
     Source: the antiphase paper, section 5.2, equations (30)-(39).
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     require_drag(jammed_loads(scene))
     return outcome(jams_of(scene), scene)
 

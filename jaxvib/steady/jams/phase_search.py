@@ -13,9 +13,9 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import averaged_growth
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.scene_field import SCENE
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.status import sentence, status_names
 from jaxvib.runtime.devices import on_device
@@ -151,7 +151,7 @@ def phase_jams(
 
     Source: Artyunin 2013, section V; leading order of the loads' mass, see `jam_modes` for loads at one angle.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if near is not None:
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)

@@ -15,9 +15,9 @@ from jaxvib.boundary import validated
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
@@ -103,7 +103,7 @@ def jam_orbit(
     if len(named) != 1:
         given = " and ".join(named) if named else "none"
         raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
-    scene = checked(scene)
+    scene = validate_scene(scene)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, omega, near)))
     # What is known has no gradient to stop: a scene that was checked stays itself, and numbers need no operation.
     frozen = scene if concrete else jax.tree.map(lambda x: jax.lax.stop_gradient(x) if traced(x) else x, scene)

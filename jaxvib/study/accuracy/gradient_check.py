@@ -15,8 +15,8 @@ from jax.typing import ArrayLike
 
 from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.errors import ComputationError, InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -170,7 +170,7 @@ def check_gradients(
 
     Source: Ridders 1982, for the extrapolation and its error.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if scene.drive.speed.dtype.itemsize < 8:
         raise InputError("scene", "is in single precision; differences need double: switch JAX to float64 before it is made")
     unknown = [route for route in routes if route not in _MODES]

@@ -12,9 +12,9 @@ import numpy as np
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import member
@@ -149,7 +149,7 @@ def audit(
     for k, effect in enumerate(possible or ()):
         if not isinstance(effect, Effect):
             raise InputError(f"possible[{k}]", f"is {quoted(effect)}; it must be an Effect, for example Gravity()")
-    scene = checked(scene)
+    scene = validate_scene(scene)
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
     question, words = _question(scene, mode, end, start)

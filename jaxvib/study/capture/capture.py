@@ -15,11 +15,11 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import SlipRelease
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.run import Run
 from jaxvib.motion.start import Turning, with_spin
@@ -200,7 +200,7 @@ def capture(
 
     Source: Strautmanis et al. 2018, section 3, where each speed has one start.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     in_torus(scene.loads, "capture")
     if not scene.drive.constant:
         raise InputError(

@@ -13,8 +13,8 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import made
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import make_scene
 from jaxvib.motion.ensemble import Equations
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -102,7 +102,7 @@ def threshold_curve(
         raise InputError("values", f"is {quoted(values)}; one finite number at least is needed, in a row")
     found = [
         capture(
-            made(make, float(value)),
+            make_scene(make, float(value)),
             speeds,
             turns=turns,
             starts=starts,

@@ -13,11 +13,11 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.machine.checked import checked
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import REGIMES, Regime
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.plan import enough_steps
@@ -147,7 +147,7 @@ def run_ups(
 
     Source: Artyunin 2013, section V, where one set of angles stands for all.
     """
-    scene = checked(scene)
+    scene = validate_scene(scene)
     if not scene.loads.circular:
         raise InputError(
             "loads.kind",

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.checked import made
 from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import make_scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -87,7 +87,7 @@ def stability_map(
     x = np.asarray(values, dtype=float)
     if x.ndim != 1 or x.size == 0 or not np.all(np.diff(x) > 0.0):
         raise InputError("values", f"are {quoted(values)}; give numbers in ascending order")
-    scenes = [made(make, float(v)) for v in x]
+    scenes = [make_scene(make, float(v)) for v in x]
 
     def diagram(k: int) -> ExactBranches:
         return exact_branches(scenes[k], points=points, least=omega[0], most=omega[1])
@@ -134,7 +134,7 @@ def stability_onset(
     """
 
     def there(x: float) -> bool:
-        diagram = exact_branches(made(make, x), points=points, least=omega[0], most=omega[1])
+        diagram = exact_branches(make_scene(make, x), points=points, least=omega[0], most=omega[1])
         return any(point.kind == kind for point in diagram.special)
 
     number(accuracy, "", "accuracy", low=0.0, open_low=True)

@@ -1,4 +1,4 @@
-"""A scene is checked once more where a question is asked: `equinox.tree_at` puts in whatever it is given."""
+"""Validation of scenes by public functions, since `equinox.tree_at` can replace numbers of a scene without a check."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from jaxvib.runtime.compat import evaluating
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
-__all__ = ["allowed_unknowns", "checked", "made"]
+__all__ = ["allowed_unknowns", "make_scene", "validate_scene"]
 
-_FOUND_GOOD: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
-"""Scenes that need not be looked at again, by their identity: a scene never changes."""
+_VALID_SCENES: weakref.WeakValueDictionary[int, Scene] = weakref.WeakValueDictionary()
+"""Scenes that were validated, by their identity: a scene never changes."""
 
 
-def checked(scene: Scene) -> Scene:
-    """The scene, every number in it an array; where all of them are known, each is one that its constructor would take.
+def validate_scene(scene: Scene) -> Scene:
+    """Return the scene with arrays for all its numbers. If all are known, check that the constructors allow them.
 
-    **Raises** `InputError` for what is no scene, and for a number that is not allowed where it stands.
+    **Raises** `InputError` for an object that is not a scene, and for a number that is not allowed.
 
     >>> import equinox as eqx, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
     ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
-    >>> checked(eqx.tree_at(lambda s: s.drive.speed, scene, -60.0))
+    >>> validate_scene(eqx.tree_at(lambda s: s.drive.speed, scene, -60.0))
     Traceback (most recent call last):
         ...
     jaxvib.errors.InputError: drive.speed is -60 rad/s; it must be greater than 0
     """
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
-    if _FOUND_GOOD.get(id(scene)) is scene:
+    if _VALID_SCENES.get(id(scene)) is scene:
         return scene
     leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
     arrays = [_number(f"scene{jax.tree_util.keystr(path)}", leaf) for path, leaf in leaves]
@@ -49,20 +49,21 @@ def checked(scene: Scene) -> Scene:
         scene = jax.tree.unflatten(structure, arrays)
     if is_known(arrays):
         numbers = structure, *((leaf.shape, leaf.dtype, leaf.tobytes()) for leaf in map(np.asarray, arrays))
-        with evaluating():  # a derivative around this has no part in it, and would make it slower
+        with evaluating():  # outside an enclosing derivative, which would make it slower
             try:
                 hash(structure)
             except TypeError:
-                _require_good.__wrapped__(_Asked(numbers, scene))
+                _require_valid.__wrapped__(_SceneKey(numbers, scene))
             else:
-                _require_good(_Asked(numbers, scene))
-        _FOUND_GOOD[id(scene)] = scene
+                _require_valid(_SceneKey(numbers, scene))
+        _VALID_SCENES[id(scene)] = scene
     return scene
 
 
 def allowed_unknowns(scene: Scene) -> Array | None:
-    """True if constructors would take the numbers of a scene that have no value yet, as one traced Boolean; None if all of
-    its numbers are known, and therefore checked.
+    """Return a traced Boolean, True if constructors allow the numbers of a scene that have no value yet.
+
+    None if all of its numbers are known, and therefore validated.
 
     >>> import equinox as eqx, jax, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -87,25 +88,25 @@ def _rebuild(scene: Scene) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Asked:
-    """A scene, known by all its numbers: under a derivative a question makes the same one again and again."""
+class _SceneKey:
+    """Scene identified by all its numbers: under a derivative the same scene is made several times."""
 
     numbers: Hashable
     scene: Scene = dataclasses.field(compare=False)
 
 
 @functools.lru_cache(256)
-def _require_good(asked: _Asked) -> None:
-    """**Raises** `InputError` for a number that is not allowed where it stands."""
-    scene = asked.scene
+def _require_valid(key: _SceneKey) -> None:
+    """**Raises** `InputError` for a number that is not allowed."""
+    scene = key.scene
     _rebuild(scene)
     require_comparable(scene.machine, scene.loads, scene.drive)
 
 
-def made(make: Callable[..., Scene], *values: object) -> Scene:
-    """The scene that a user's function makes of some values. **Raises** `InputError` for what is no scene, as `checked` does.
+def make_scene(make: Callable[..., Scene], *values: object) -> Scene:
+    """Return the scene that a user's function makes of some values. **Raises** `InputError` as `validate_scene`.
 
-    >>> made(lambda x: None, 1.0)
+    >>> make_scene(lambda x: None, 1.0)
     Traceback (most recent call last):
         ...
     jaxvib.errors.InputError: make(1.0) is None; it must return a Scene
@@ -114,11 +115,11 @@ def made(make: Callable[..., Scene], *values: object) -> Scene:
     if not isinstance(scene, Scene):
         call = f"make({', '.join(map(quoted, values))})"
         raise InputError(call, f"is {quoted(scene)}; it must return a Scene")
-    return checked(scene)
+    return validate_scene(scene)
 
 
 def _number(name: str, leaf: object) -> Array:
-    """A leaf as a floating-point array. **Raises** `InputError` for a text, and for what is known and not finite."""
+    """Return a leaf as a floating-point array. **Raises** `InputError` for text and for known numbers that are not finite."""
     if not isinstance(leaf, str):
         require_real(leaf, "", name)
     if not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact):

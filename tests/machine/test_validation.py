@@ -9,8 +9,8 @@ from plugins.effect import SealFriction
 from scenes import BALLS, machines, scene
 
 import jaxvib as jv
-from jaxvib.machine import checked as module
-from jaxvib.machine.checked import checked
+from jaxvib.machine import validation as module
+from jaxvib.machine.validation import validate_scene
 
 
 def changed(where, value, s=None):
@@ -58,7 +58,7 @@ QUESTIONS = {
 def test_a_wrong_number_is_named(case):
     make, says = WRONG[case]
     with pytest.raises(jv.InputError) as error:
-        checked(make())
+        validate_scene(make())
     assert str(error.value).startswith(says), error.value
 
 
@@ -70,11 +70,11 @@ def test_every_question_looks(question):
 
 def test_plain_numbers_are_numbers():
     for value in (130.0, 130, np.float64(130.0), np.asarray(130), jnp.asarray(130)):
-        s = checked(changed(lambda s: s.drive.speed, value))
+        s = validate_scene(changed(lambda s: s.drive.speed, value))
         assert s.drive.speed.dtype == jnp.float64 and float(s.drive.speed) == 130.0
     # What needs no change is handed on as it is, a scene being differentiated too.
     s = scene()
-    assert checked(s) is s and checked(s) is s
+    assert validate_scene(s) is s and validate_scene(s) is s
     plain, exact = (jv.jam_modes(changed(lambda s: s.drive.speed, x)).omega for x in (130.0, jnp.asarray(130.0)))
     np.testing.assert_array_equal(plain, exact)
     slope = jax.grad(lambda m: jv.natural_frequencies(changed(lambda s: (s.machine.mass, s.drive.speed), (m, 130.0)))[0])
@@ -113,10 +113,10 @@ def test_arrays_that_no_memory_holds_are_refused():
 def test_the_same_numbers_are_looked_at_once(monkeypatch):
     looked = []
     monkeypatch.setattr(module, "rebuilt", lambda part, section: looked.append(section))
-    module._require_good.cache_clear()
+    module._require_valid.cache_clear()
 
     for _ in range(3):
-        checked(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 90.0])))
+        validate_scene(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 90.0])))
     assert looked == ["machine", "loads", "drive"]
-    checked(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 80.0])))
+    validate_scene(changed(lambda s: s.machine.mass, jnp.asarray([120.0, 80.0])))
     assert len(looked) == 6
