@@ -1,4 +1,4 @@
-"""Primitives with rules of their own, by which JAX differentiates, maps and transposes what it cannot look into."""
+"""Primitives with rules of their own for derivatives, batches and transposes of functions that JAX does not trace."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxvib.runtime.compat import HAS_JAXPRS, Primitive
 
-__all__ = ["HAS_RULES", "is_zero", "primitive", "pulled_back", "zero_of"]
+__all__ = ["HAS_RULES", "apply_pullback", "is_zero", "primitive", "zero_of"]
 
 
 def _module(name: str) -> Any:
@@ -33,55 +33,61 @@ HAS_RULES = HAS_JAXPRS and all(
         (mlir, "register_lowering"),
     )
 )
-"""Rules of primitives. Without them derivatives of cached functions are traced in each process."""
+"""True if JAX lets other packages define primitives. Otherwise derivatives of cached functions are traced in each process."""
 
 
 def primitive(
     name: str,
     *,
-    computed: Callable[..., list[Array]],
-    in_batch: Callable[..., tuple],
-    differentiated: Callable[..., tuple] | None = None,
-    transposed: Callable[..., list] | None = None,
-    traced: Callable[..., list[Array]] | None = None,
+    evaluate: Callable[..., list[Array]],
+    batch: Callable[..., tuple],
+    differentiate: Callable[..., tuple] | None = None,
+    transpose: Callable[..., list] | None = None,
+    trace: Callable[..., list[Array]] | None = None,
     abstract: Callable[..., Sequence] | None = None,
 ) -> Callable[..., list[Array]]:
-    """A function of arrays, and of what else it is given by name, of which JAX knows no more than these rules.
+    """Define a primitive of arrays, with further parameters by name, by its rules.
 
-    **Arguments**: what it computes, in numbers; in a batch, of arrays and the axis of each; differentiated, of arrays and
-    tangents; transposed, of cotangents and arrays; what is traced in its place, and the types of its results. **Returns** a
-    function, of numbers only where rules have another form (`HAS_RULES`).
+    **Arguments**
+
+    - `evaluate`: arrays to outputs, for known numbers
+    - `batch`: arrays and the axis of each to outputs and their axes
+    - `differentiate`: arrays and tangents to outputs and their tangents
+    - `transpose`: cotangents and arrays to cotangents
+    - `trace`: arrays to outputs, inside `jit`
+    - `abstract`: types of arrays to types of outputs
+
+    **Returns** a function of arrays. Without `HAS_RULES` it is `evaluate`.
     """
     if not HAS_RULES:
-        return computed
-    made = Primitive(name)
-    made.multiple_results = True
-    made.def_impl(computed)
-    batching.primitive_batchers[made] = in_batch
-    if differentiated is not None:
-        ad.primitive_jvps[made] = differentiated
-    if transposed is not None:
-        ad.primitive_transposes[made] = transposed
+        return evaluate
+    defined = Primitive(name)
+    defined.multiple_results = True
+    defined.def_impl(evaluate)
+    batching.primitive_batchers[defined] = batch
+    if differentiate is not None:
+        ad.primitive_jvps[defined] = differentiate
+    if transpose is not None:
+        ad.primitive_transposes[defined] = transpose
     if abstract is not None:
-        made.def_abstract_eval(abstract)
-    if traced is not None:
-        mlir.register_lowering(made, mlir.lower_fun(traced, multiple_results=True))
-    return made.bind
+        defined.def_abstract_eval(abstract)
+    if trace is not None:
+        mlir.register_lowering(defined, mlir.lower_fun(trace, multiple_results=True))
+    return defined.bind
 
 
 def is_zero(tangent: object) -> bool:
-    """Whether a rule of a `primitive` is given no tangent."""
+    """Return True if a rule of a `primitive` gets a symbolic zero in place of a tangent."""
     return isinstance(tangent, ad.Zero)
 
 
 def zero_of(x: Array) -> object:
-    """No tangent of `x`, as rules of a `primitive` return it."""
+    """Return the symbolic zero tangent of `x`, for rules of a `primitive`."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
-def pulled_back(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
-    """What a function that `jax.vjp` returned gives, of cotangents that may be `zero_of`; with JAX 0.10.0, whose functions know
-    no such zeros, of numbers 0 in their place."""
+def apply_pullback(pullback: Callable[[list], Sequence[Array]], cotangents: list) -> list[Array]:
+    """Apply a function from `jax.vjp` to cotangents that may be `zero_of`; JAX 0.10.0 gets arrays of zeros instead."""
     try:
         return list(pullback(cotangents))
     except ValueError:

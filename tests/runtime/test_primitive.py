@@ -10,12 +10,12 @@ from jaxvib.runtime import primitive
 def test_primitives_take_rules(monkeypatch):
     """`jax.interpreters`: batches, derivatives, transposes, lowering."""
     assert primitive.HAS_RULES
-    rules = {"computed": lambda x: [2.0 * x], "in_batch": lambda x, axes: ([2.0 * x[0]], axes)}
+    rules = {"evaluate": lambda x: [2.0 * x], "batch": lambda x, axes: ([2.0 * x[0]], axes)}
     doubled = primitive.primitive("doubled", **rules)
     assert doubled(jnp.asarray(2.0)) == [4.0]
     assert jax.vmap(lambda x: doubled(x)[0])(jnp.arange(3.0)).tolist() == [0.0, 2.0, 4.0]
     monkeypatch.setattr(primitive, "HAS_RULES", False)
-    assert primitive.primitive("doubled", **rules) is rules["computed"]
+    assert primitive.primitive("doubled", **rules) is rules["evaluate"]
 
 
 @pytest.mark.parametrize("knows", [True, False])
@@ -28,5 +28,5 @@ def test_reverse_derivatives_take_no_cotangent_for_a_number(knows):
             raise ValueError("unexpected tree structure.")
         return pullback(cotangents)
 
-    (found,) = primitive.pulled_back(pullback if knows else older, [primitive.zero_of(values[0]), jnp.asarray(3.0)])
+    (found,) = primitive.apply_pullback(pullback if knows else older, [primitive.zero_of(values[0]), jnp.asarray(3.0)])
     assert float(found) == 3.0

@@ -12,7 +12,7 @@ from scenes import scene
 import jaxvib as jv
 from jaxvib.runtime import cache, compat, programs, structure
 
-traces, told = [], []
+traces, provided = [], []
 X = jnp.asarray([0.3, -1.2, 2.0])
 SHIFT = jnp.asarray(0.7)
 
@@ -31,7 +31,7 @@ def wave(x, shift, name):
 
 def from_wave(found, x, shift, name):
     """Outputs that follow from a known wave, as if the sine had been searched for."""
-    told.append(name)
+    provided.append(name)
     sine = jax.lax.stop_gradient((found.values - shift) / x) + jnp.cos(x) * (x - jax.lax.stop_gradient(x))
     return Wave(sine * x + shift, None, None, found.name)
 
@@ -40,11 +40,11 @@ def plain(x, shift=SHIFT):
     return wave(x, shift, "plain")
 
 
-@pytest.fixture(params=[None, from_wave], ids=["noted", "from result"])
+@pytest.fixture(params=[None, from_wave], ids=["residuals", "from solution"])
 def asked(tmp_path, monkeypatch, unwatched, request):
     """A function that asks as another process would: no program is held in memory, those on disk are."""
     monkeypatch.setattr(structure, "KNOWN_PACKAGES", structure.KNOWN_PACKAGES | {__name__})
-    monkeypatch.setitem(globals(), "wave", programs.cached(from_result=request.param)(wave))
+    monkeypatch.setitem(globals(), "wave", programs.cached(outputs_from_solution=request.param)(wave))
     cache.keep_programs(tmp_path)
 
     def forgetful(x, shift=SHIFT):
@@ -52,9 +52,15 @@ def asked(tmp_path, monkeypatch, unwatched, request):
 
     def forget():
         traces.clear()
-        told.clear()
+        provided.clear()
         programs._pullbacks.clear()
-        kinds = (programs._pushed, programs._noted, programs._pulled, programs._pulled_again, programs._mapped)
+        kinds = (
+            programs._jvp_program,
+            programs._vjp_forward,
+            programs._vjp_backward,
+            programs._vjp_from_solution,
+            programs._batched_program,
+        )
         for function in (globals()["wave"], *kinds):
             function.stored.ready.clear()
 
@@ -134,15 +140,15 @@ def test_static_arguments_and_results_allow_derivatives(asked, labels, monkeypat
     values, slopes = jax.jvp(lambda x: function(x, labels)["value"], (X,), (X,))
     np.testing.assert_allclose(values, np.sin(X), rtol=1e-15)
     np.testing.assert_allclose(slopes, X * np.cos(X), rtol=1e-15)
-    assert len(list(tmp_path.glob("_mapped-*"))) == 2 or isinstance(labels[0], np.float64)  # a class from outside
+    assert len(list(tmp_path.glob("_batched_program-*"))) == 2 or isinstance(labels[0], np.float64)  # a class from outside
 
 
 def test_an_argument_without_a_hash_is_differentiated_as_before(asked):
     class Bare:
         __hash__ = None
 
-    question = programs._Question(programs.cached(labelled), structure.Skeleton(((X, Bare()), {})))
-    assert not question.is_describable()
+    call = programs._CallSignature(programs.cached(labelled), structure.Skeleton(((X, Bare()), {})))
+    assert not call.is_describable()
 
 
 def test_whole_numbers_have_no_tangent(asked):
@@ -158,7 +164,7 @@ def test_a_reverse_derivative_that_was_not_asked_for_before(asked):
     jax.grad(functools.partial(number, function))(X)
     forget()
     found = jax.grad(lambda x: jnp.sum(function(x).values))(X)
-    assert sorted(traces + told) == ["a"]
+    assert sorted(traces + provided) == ["a"]
     np.testing.assert_allclose(found, np.sin(X) + X * np.cos(X), rtol=1e-14)
 
 
@@ -210,7 +216,7 @@ def test_derivatives_of_jam_modes_equal_those_without_cache(asked):
 
 
 @pytest.mark.parametrize("tracer", ["grad", "jvp", "vmap"])
-def test_what_lies_beneath_a_tracer_is_found(tracer):
+def test_primal_of_a_tracer_is_found(tracer):
     seen = []
 
     def look(x):
@@ -230,11 +236,11 @@ def test_a_reverse_derivative_is_taken_of_what_the_result_tells(asked):
     """The function is traced once more if other outputs are needed."""
     function, _ = asked
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("_noted", "_pulled"):
+        for name in ("_vjp_forward", "_vjp_backward"):
             patch.setattr(programs, name, None)
         values = lambda f: jax.grad(lambda x, shift: jnp.sum(f(x, shift).values ** 2), argnums=(0, 1))(X, SHIFT)  # noqa: E731
         for route, times in ((values, 1), (ROUTES["of two"], 2)):
             found = route(function)
-            assert traces == ["a"] * times and set(told) == {"a"}
+            assert traces == ["a"] * times and set(provided) == {"a"}
             for ours, theirs in zip(found, route(plain_wave), strict=True):
                 np.testing.assert_allclose(ours, theirs, rtol=1e-12)

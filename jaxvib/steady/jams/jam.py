@@ -219,7 +219,7 @@ def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
     return dataclasses.replace(jax.tree.map(lambda _: None, jams), **fields)
 
 
-@cached(from_result=_from_jams)
+@cached(outputs_from_solution=_from_jams)
 def jams_of(scene: Scene) -> JamModes:
     """`jam_modes` of a scene that is known to be right."""
     n, model = scene.drive.speed, jammed_model(scene)

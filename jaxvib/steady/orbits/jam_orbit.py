@@ -216,7 +216,7 @@ def _from_orbit(
     return dataclasses.replace(untold, **numbers_of(collected_model(jammed_model(scene)), orbit, value, start, given, points))
 
 
-@cached(from_result=_from_orbit)
+@cached(outputs_from_solution=_from_orbit)
 def _orbit(
     scene: Scene,
     value: Array,
