@@ -13,7 +13,8 @@ each hostile value, the other arguments valid. A call ends
 - silent: with numbers that are not finite and no status, or with a Boolean, a complex number, a date, bytes or masked values
   taken for a number
 
-Each raw, hanging or silent call is printed as the line that repeats it; the exit code is their presence.
+Each raw, hanging or silent call is printed as the line that repeats it; the exit code is their presence. With `--out`, every
+finished function adds a line to `hostile_calls.jsonl` in that folder, and a further run goes on after the last one.
 """
 
 from __future__ import annotations
@@ -153,6 +154,9 @@ NO_NUMBERS = (
 )
 """Values that are no real numbers and must never be taken for one."""
 
+COMPLEX = ("1j", "np.ones(3) + 1j", "jnp.asarray(1j)")
+"""Values of them that are valid where a parameter is declared as complex."""
+
 
 class Hanging(Exception):
     """A call takes longer than anybody waits."""
@@ -184,15 +188,15 @@ def unsaid(answer: Any) -> bool:
     return any(np.asarray(leaf).dtype.kind == "f" and np.any(np.isnan(leaf)) for leaf in leaves)
 
 
-def takes_numbers(function: Callable[..., Any], name: str, valid: Any) -> bool:
-    """True if a parameter is a number, so that what is no number must be refused."""
-    if isinstance(valid, bool):
+def takes_for_a_number(function: Callable[..., Any], name: str, valid: Any, text: str) -> bool:
+    """True if a parameter is a number and the value is none, so that it must be refused."""
+    if text not in NO_NUMBERS or isinstance(valid, (bool, str)):
         return False
-    number = isinstance(valid, (int, float)) or hasattr(valid, "dtype")
-    with contextlib.suppress(ValueError, TypeError):
+    number, kind = isinstance(valid, (int, float)) or hasattr(valid, "dtype"), ""
+    with contextlib.suppress(ValueError, TypeError, KeyError):
         kind = str(inspect.signature(function).parameters[name].annotation)
         number |= bool(re.search(r"\b(Numbers?|float|int|Array|ndarray|ArrayLike)\b", kind)) and "Callable" not in kind
-    return number and not (isinstance(valid, str) and name in ("start", "value"))
+    return number and not ("complex" in kind and text in COMPLEX)
 
 
 def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
@@ -201,7 +205,7 @@ def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
     if text == "generator":
         value = (each for each in (1.0, 2.0))
     kind, said = judged(lambda: call.function(**{**call.arguments, name: value}), number=not unsaid(value))
-    if kind == "answered" and text in NO_NUMBERS and takes_numbers(call.function, name, call.arguments[name]):
+    if kind == "answered" and takes_for_a_number(call.function, name, call.arguments[name], text):
         return "silent", f"takes {text} for a number"
     return kind, said
 
@@ -264,51 +268,62 @@ def _place(error: BaseException) -> str:
     return place
 
 
-def trials(only: str = "", part: tuple[int, int] = (0, 1), share: float = 1.0, seed: int = 0) -> Iterator[tuple[str, ...]]:
-    """(call, parameter, value, kind, text) of each hostile call."""
-    random_ = random.Random(seed)
-    for k, made in enumerate(calls()):
-        if (only and only != made.named) or (not only and k % part[1] != part[0]):  # pyright: ignore[reportFunctionMemberAccess]
-            continue
-        call = made()
-        if call.name not in LONG:
-            yield call.name, "", "", *judged(lambda call=call: call.function(**call.arguments))
-        for name, valid in call.arguments.items():
-            for text, value in HOSTILE.items():
-                if (value is None and is_default(call, name, valid)) or (call.name in LONG and text in ALL):
-                    continue
-                if random_.random() < share:
-                    yield call.name, name, text, *outcome(call, name, text)
+def trials(made: Callable[[], Call], share: float = 1.0, seed: int = 0) -> Iterator[tuple[str, ...]]:
+    """(call, parameter, value, kind, text) of each hostile call of one function, the valid call first."""
+    random_, call = random.Random(seed), made()
+    if call.name not in LONG:
+        yield call.name, "", "", *judged(lambda: call.function(**call.arguments))
+    for name, valid in call.arguments.items():
+        for text, value in HOSTILE.items():
+            if (value is None and is_default(call, name, valid)) or (call.name in LONG and text in ALL):
+                continue
+            if random_.random() < share:
+                yield call.name, name, text, *outcome(call, name, text)
+
+
+def asked_of(made: Callable[[], Call], share: float, seed: int, show_all: bool) -> dict[str, Any]:
+    """Counts of one function's calls by their ends, those that are not as they must be, and its seconds."""
+    counts: collections.Counter[str] = collections.Counter()
+    bad, began = [], time.process_time()
+    for name, parameter, text, kind, said in trials(made, share, seed):
+        valid = not parameter
+        if not valid:
+            counts[kind] += 1
+        if (kind != "answered") if valid else (kind in ("raw", "hang", "silent")):
+            bad.append([name, parameter, text, kind, said])
+        if show_all or bad[-1:] == [[name, parameter, text, kind, said]]:
+            print(f"{kind}: {name}({parameter}={text}) {said}" if parameter else f"{kind}: valid {name} {said}", flush=True)
+    return {"counts": counts, "bad": bad, "seconds": round(time.process_time() - began, 1)}
 
 
 def main() -> int:
     """Run the trial and print what is not as it must be."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--only", default="", help="one call by its name")
-    parser.add_argument("--part", default="0/1", help="every n-th call from the k-th on, k/n")
     parser.add_argument("--share", type=float, default=1.0, help="share of the hostile values, drawn by --seed")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--list", action="store_true", help="print every call")
-    parser.add_argument("--out", type=pathlib.Path, help="folder of the counts, JSON")
+    parser.add_argument("--out", type=pathlib.Path, help="folder of the counts, a line of JSON for each function")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    k, n = map(int, asked.part.split("/"))
-    counts: collections.Counter[str] = collections.Counter()
-    bad = []
-    for name, parameter, text, kind, said in trials(asked.only, (k, n), asked.share, asked.seed):
-        if not parameter:  # the valid call itself
-            if kind != "answered":
-                print(f"raw: the valid call of {name} is {kind}: {said}", flush=True)
-                bad.append([name, parameter, text, kind, said])
-            continue
-        counts[kind] += 1
-        if kind in ("raw", "hang", "silent") or asked.list:
-            print(f"{kind}: {name}({parameter}={text}) {said}", flush=True)
-            bad += [] if kind in ("refused", "answered") else [[name, parameter, text, kind, said]]
-    print(dict(counts), flush=True)
-    if asked.out:
+    ends: dict[int, dict[str, Any]] = {}
+    file = None
+    if asked.out is not None:
         asked.out.mkdir(parents=True, exist_ok=True)
-        (asked.out / f"hostile_calls_{k}_{n}.json").write_text(json.dumps({"counts": counts, "bad": bad}, indent=1))
+        file = asked.out / "hostile_calls.jsonl"
+        lines = file.read_text().splitlines() if file.exists() else ()
+        ends = {end["number"]: end for end in map(json.loads, lines)}
+    for number, made in enumerate(calls()):
+        named = made.named  # pyright: ignore[reportFunctionMemberAccess]
+        if number in ends or asked.only not in ("", named):
+            continue
+        ends[number] = {"number": number, "name": named, **asked_of(made, asked.share, asked.seed, asked.list)}
+        if file is not None:
+            with file.open("a") as lines:
+                lines.write(json.dumps(ends[number]) + "\n")
+    counts: collections.Counter[str] = sum((collections.Counter(end["counts"]) for end in ends.values()), collections.Counter())
+    bad = [line for end in ends.values() for line in end["bad"]]
+    print(f"{len(ends)} functions, {sum(counts.values())} calls: {dict(counts)}; {len(bad)} not as they must be", flush=True)
     return 1 if bad else 0
 
 

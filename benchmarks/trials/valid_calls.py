@@ -99,6 +99,7 @@ def calls() -> Iterator[Callable[[], Call]]:
 
     later = functools.partial
     s, state = later(scene), later(lambda: jv.initial_state(scene()))
+    scene()  # made here first: under a transformation of JAX the cache would keep its tracers
     path = FOLDER / "file"
     force = later(lambda: op.foundation_force(mode=3))
     demand = later(lambda: (op.foundation_force(mode=3) < 1e5,))
@@ -182,9 +183,8 @@ def calls() -> Iterator[Callable[[], Call]]:
     more = dict(solver=None, stepsize_controller=None, adjoint=None, max_steps=None, progress_meter=None, throw=True)
     yield call("simulate", scene=s, until=0.5, **motion, **more)
     slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, turns=4)
-    yield call(
-        "envelope", scene=s, until=0.5, **slow, **{k: v for k, v in more.items() if k != "progress_meter"} | {"max_steps": 999}
-    )
+    fewer = {k: v for k, v in more.items() if k != "progress_meter"} | {"max_steps": 999}
+    yield call("envelope", scene=s, until=0.5, **slow, **fewer)
     yield call(
         "settle", scene=s, start="jam", mode=3, drift=0.05, periods=4, stretches=2, stepsize_controller=None, throw=False
     )
