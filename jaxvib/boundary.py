@@ -23,9 +23,9 @@ import jax.typing as jax_typing
 import numpy as np
 import numpy.typing as np_typing
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError, quoted, require_path
 
-__all__ = ["call_user", "is_real", "is_whole", "require_path", "validated"]
+__all__ = ["call_user", "is_real", "is_whole", "validated"]
 
 _MAX_ENTRIES = 10**7
 """The longest list whose entries are looked at one by one."""
@@ -96,9 +96,22 @@ def validated(function: F) -> F:
                         bound.arguments[name] = np.asarray(value, dtype=float)
                     elif isinstance(value, (np.ndarray, jax.Array)) and not _is_traced(value) and _is_list(kind):
                         bound.arguments[name] = np.asarray(value).tolist()
-        return function(*bound.args, **bound.kwargs)
+        try:
+            return function(*bound.args, **bound.kwargs)
+        except _NEEDS_VALUE:
+            _require_known(bound.arguments)
+            raise
 
     return typing.cast(F, checked)
+
+
+def _require_known(arguments: Mapping[str, Any]) -> None:
+    """**Raises** `InputError` for the first argument that holds a traced number."""
+    for name, value in arguments.items():
+        if any(map(_is_traced, jax.tree.leaves(value))):
+            holder = type(value).__name__ if name == "self" else name
+            problem = "has a number that JAX traces, and its value is needed here; call this outside of jit, grad and vmap"
+            raise InputError(holder, problem)
 
 
 def _annotations(function: Callable[..., Any], signature: inspect.Signature) -> dict[str, Any]:
@@ -178,22 +191,6 @@ def call_user(function: Callable[..., Any], field: str, *arguments: object) -> A
 def is_whole(value: object) -> bool:
     """Return True for a whole number of Python or NumPy; Booleans and spans of time are none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
-
-
-def require_path(value: object, field: str) -> Path:
-    """Return a path. **Raises** `InputError` for what is none, for an empty one and for the character NUL.
-
-    >>> require_path(3, "path")
-    Traceback (most recent call last):
-        ...
-    jaxvib.errors.InputError: path is 3; it must be the path of a file
-    """
-    if not isinstance(value, (str, os.PathLike)) or isinstance(os.fspath(value), bytes):
-        raise InputError(field, f"is {quoted(value)}; it must be the path of a file")
-    text = os.fspath(value)
-    if not text or "\0" in text or len(text) > 4096 or any("\ud800" <= character <= "\udfff" for character in text):
-        raise InputError(field, f"is {quoted(value)}; it must be the path of a file, without the character NUL")
-    return Path(value)
 
 
 def _require(value: Any, kind: Any, field: str) -> None:

@@ -21,6 +21,7 @@ __all__ = [
     "quoted",
     "read_text",
     "require_one_of",
+    "require_path",
     "written",
 ]
 
@@ -99,6 +100,22 @@ def require_one_of(value: object, allowed: Iterable[str], field: str, verb: str 
     allowed = tuple(allowed)
     if not isinstance(value, str) or value not in allowed:
         raise InputError(field, f"{verb} {quoted(value)}; allowed: {', '.join(allowed)}")
+
+
+def require_path(value: object, field: str) -> Path:
+    """Return a path. **Raises** `InputError` for what is none, for an empty one and for the character NUL.
+
+    >>> require_path(3, "path")
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: path is 3; it must be the path of a file
+    """
+    if not isinstance(value, (str, os.PathLike)) or isinstance(os.fspath(value), bytes):
+        raise InputError(field, f"is {quoted(value)}; it must be the path of a file")
+    text = os.fspath(value)
+    if not text or "\0" in text or len(text) > 4096 or any("\ud800" <= character <= "\udfff" for character in text):
+        raise InputError(field, f"is {quoted(value)}; it must be the path of a file, without the character NUL")
+    return Path(value)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.boundary import call_user, is_real, is_whole, require_path, validated
+from jaxvib.boundary import call_user, is_real, is_whole, validated
+from jaxvib.errors import require_path
 from jaxvib.units import Number
 
 

@@ -39,6 +39,26 @@ def test_hostile_calls_end_in_one_sentence(trial):
     assert number > 500 and bad == []
 
 
+TRACED = {
+    "initial_state", "natural_frequencies", "jam_modes", "phase_jams", "balanced_states", "settle", "growth", "scene_to_toml",
+    "ten_periods", "Record.between", "Quantity *", "Quantity **", "hold", "DesignSpace", "DesignSpace.parameters",
+    "DesignSpace.within", "peak_force", "PhaseJams.follow", "BalancedStates.intervals", "sketch", "capture",
+}  # fmt: skip
+
+
+def test_traced_numbers_are_answered_or_refused_in_a_sentence(trial):
+    ends = {}
+    for made in trial.calls():
+        if made.named in TRACED:
+            call = made()
+            for name, valid in call.arguments.items():
+                if trial.is_inexact(valid):
+                    ends[f"{call.name}({name})"] = trial.judged(lambda call=call, name=name: trial.traced(call, name))
+    assert [(name, said) for name, (kind, said) in ends.items() if kind not in ("refused", "answered")] == []
+    assert ends["jam_modes(scene)"][0] == "answered"
+    assert ends["balanced_states(scene)"][1].startswith("scene has a number that JAX traces, and its value is needed here")
+
+
 def test_a_raw_error_and_a_boolean_as_a_number_are_seen(trial):
     def takes_all(size: float) -> float:
         return size

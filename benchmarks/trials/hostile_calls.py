@@ -4,7 +4,7 @@
     python benchmarks/trials/hostile_calls.py --only simulate --list
 
 Every public function, every constructor that users call and every method of results is called once for each parameter and
-each hostile value, the other arguments valid. A call ends
+each hostile value, the other arguments valid, and once for each number and scene with these traced by JAX. A call ends
 
 - refused: `InputError` or `ComputationError`, or Python's `TypeError` for a missing argument
 - answered: with a result whose numbers are finite or whose status says why they are not
@@ -24,6 +24,7 @@ import collections
 import contextlib
 import datetime
 import decimal
+import functools
 import inspect
 import io
 import json
@@ -57,7 +58,22 @@ LONG = ("stress", "reproduce", "prepare_cpu", "use_cache")
 """Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
 
 
-ALL = ("None", "True", "np.True_", "0", "-1", "10**12", "10**400", "10**5000", "[]", "()", "{}", "set()", "np.zeros(0)")
+ALL = (
+    "None",
+    "True",
+    "np.True_",
+    "0",
+    "-1",
+    "10**12",
+    "10**400",
+    "10**5000",
+    "[]",
+    "()",
+    "{}",
+    "set()",
+    "np.zeros(0)",
+    "['a']",
+)
 """Values that are valid for these, or that select everything."""
 
 
@@ -210,6 +226,22 @@ def outcome(call: Call, name: str, text: str) -> tuple[str, str]:
     return kind, said
 
 
+def is_inexact(value: Any) -> bool:
+    """True for a number that JAX can trace, and for a scene or a part of one."""
+    parts = (jv.Scene, jv.Machine, jv.Loads, jv.Drive)
+    return isinstance(value, (float, *parts)) or getattr(getattr(value, "dtype", None), "kind", "") == "f"
+
+
+def traced(call: Call, name: str) -> None:
+    """Trace a call by the numbers of one argument, as `jax.jit` would, without running it."""
+    numbers, rest = eqx.partition(call.arguments[name], lambda leaf: isinstance(leaf, float) or eqx.is_inexact_array_like(leaf))
+
+    def ask(numbers: Any) -> None:
+        call.function(**{**call.arguments, name: eqx.combine(numbers, rest)})
+
+    jax.eval_shape(ask, numbers)
+
+
 def is_default(call: Call, name: str, valid: Any) -> bool:
     """True if None is a valid value of a parameter."""
     with contextlib.suppress(ValueError, TypeError, KeyError):
@@ -273,6 +305,9 @@ def trials(made: Callable[[], Call], share: float = 1.0, seed: int = 0) -> Itera
     random_, call = random.Random(seed), made()
     if call.name not in LONG:
         yield call.name, "", "", *judged(lambda: call.function(**call.arguments))
+        for name, valid in call.arguments.items():
+            if is_inexact(valid):
+                yield call.name, name, "traced", *judged(functools.partial(traced, call, name))
     for name, valid in call.arguments.items():
         for text, value in HOSTILE.items():
             if (value is None and is_default(call, name, valid)) or (call.name in LONG and text in ALL):

@@ -24,7 +24,7 @@ from jaxvib.machine.rotor import planar_rotor, rotor
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import TEMPLATE as TORUS
 from jaxvib.machine.torus import torus_balls
-from jaxvib.units.known import when_known
+from jaxvib.units.known import require_known, when_known
 
 __all__ = [
     "DRIVES",
@@ -281,6 +281,7 @@ def scene_to_toml(scene: Scene) -> str:
     """
     import tomli_w  # only where a file is written
 
+    require_known(scene, "scene", "scene_to_toml", "write the scene outside")
     tables: dict[str, Tables] = {}
     for name, kinds in SECTIONS.items():
         part = getattr(scene, name)

@@ -35,7 +35,7 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
-from jaxvib.steady.outcome import REFUSED, without_numbers
+from jaxvib.steady.outcome import REFUSED, unknown_is_positive, without_numbers
 from jaxvib.units import Number, count, number, traced
 
 if TYPE_CHECKING:
@@ -187,6 +187,8 @@ def ensemble(
     end = number(until, "s", "until", low=0.0, open_low=True)
     batch = min(count(batch, "batch"), runs)
     scenes, states, allowed = _made(make, values)
+    if (is_positive := unknown_is_positive(end)) is not None:
+        allowed = allowed & is_positive
     made = scenes, states
     require_start(made[0], made[1].angle)
     concrete = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))

@@ -131,7 +131,7 @@ def simulate(
     if plan.is_known:
         jax.block_until_ready((run.steps, run.error))
         run = dataclasses.replace(run, seconds=on_device(np.asarray(time.perf_counter() - begun, run.seconds.dtype)))
-    run = outcome(run, plan.asked, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
+    run = outcome(run, plan.asked, plan.end, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
     return judged_by_separation(run) if plan.is_known and bool(run.settled) else run
 
 

@@ -105,7 +105,9 @@ class StoredFunction(Generic[T]):
                 asked = (_current_code(look=True), question)
                 program = self.ready.get(asked, _UNKNOWN)
                 if program is _UNKNOWN:
-                    program = self.ready[asked] = self._program(folder, arrays_on_device(leaves), treedef, home)
+                    with evaluating():  # JAX would trace these transfers if it transforms what is around this call
+                        moved = arrays_on_device(leaves)
+                    program = self.ready[asked] = self._program(folder, moved, treedef, home)
             _evict_least_recently_used()
         if program is None:
             return self._jitted(leaves, treedef)

@@ -6,6 +6,7 @@ if one of them turns out not to be allowed, the result has the status `refused` 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection
 from typing import Any, TypeVar
 
@@ -19,11 +20,11 @@ from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, status_name
 from jaxvib.runtime.compat import enumeration_of
-from jaxvib.units.known import when_known
+from jaxvib.units.known import is_known, when_known
 
-__all__ = ["REFUSED", "outcome", "without_numbers"]
+__all__ = ["REFUSED", "outcome", "unknown_is_positive", "without_numbers"]
 
-REFUSED = "a number that was not known while the program was built is not allowed in a scene: build the scene outside to see it"
+REFUSED = "a number that was not known while the program was built is not allowed: ask outside of jit, grad and vmap to see it"
 """Sentence of the status `refused`."""
 
 Found = TypeVar("Found", bound=Result)
@@ -32,18 +33,21 @@ Found = TypeVar("Found", bound=Result)
 def outcome(
     result: Found,
     scene: Scene | None = None,
+    end: Array | None = None,
     *,
     throw: bool = False,
     failures: Collection[str] = (),
     hint: Callable[[str], str] = lambda _: "",
 ) -> Found:
-    """Return the result of a question about `scene`, or raise the error of a known status.
+    """Return the result of a question about `scene` up to the time `end`, or raise the error of a known status.
 
     **Arguments**: `throw`: raise if the name of a known status is among the `failures`; `hint`: text after the sentence of the
     status with that name.
 
     **Returns** the result; under a JAX transformation with the status `refused` and NaN for numbers if a number of the scene is
-    one that its constructor would not take, such as a negative stiffness. **Raises** `ComputationError`.
+    one that its constructor would not take, such as a negative stiffness, or if `end` is not positive.
+
+    **Raises** `ComputationError`.
     """
 
     def check(_: eqx.Enumeration) -> None:
@@ -52,12 +56,18 @@ def outcome(
 
     if throw:
         when_known(check, result.status)
-    allowed = None if scene is None else allowed_unknowns(scene)
-    if allowed is None:
+    conditions = (None if scene is None else allowed_unknowns(scene), unknown_is_positive(end))
+    if not (unknown := [each for each in conditions if each is not None]):
         return result
+    allowed = functools.reduce(jnp.logical_and, unknown)
     refused = enumeration_of(result.status).refused  # pyright: ignore[reportAttributeAccessIssue]
     status = jax.tree.map(lambda own, other: jnp.where(allowed, own, other), result.status, refused)
     return eqx.tree_at(lambda result: result.status, without_numbers(allowed, result), status)
+
+
+def unknown_is_positive(number: Array | None) -> Array | None:
+    """True if a number that has no value yet is finite and positive, as one traced Boolean; None for a known number."""
+    return None if number is None or is_known(number) else jnp.isfinite(number) & (number > 0.0)
 
 
 def without_numbers(allowed: Array, found: Any) -> Any:

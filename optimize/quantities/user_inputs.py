@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from jaxvib.units import Number, number, unit_ratio
+from jaxvib.units.known import require_known
 
 __all__ = ["arguments", "number_in", "same_unit"]
 
@@ -32,4 +33,5 @@ def same_unit(one: str, other: str) -> bool:
 
 def number_in(value: Number, unit: str, name: str) -> float:
     """Return a number, or a text with a unit, in a unit. **Raises** `InputError` as `jaxvib.units.number` does."""
+    require_known(value, name, "a quantity", "make it outside")
     return float(number(value, unit, name))

@@ -15,6 +15,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
+from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import Quantity, require_quantity
 from optimize.space.numbers import Place, changed, names_of, places_of, present_places
@@ -205,6 +206,7 @@ class DesignSpace(eqx.Module):
         even = (value - low) / xp.where(width > 0.0, width, 1.0)
         return xp.where(width > 0.0, xp.where(log, xp.log(xp.where(log, value, 1.0) / base) / xp.log(ratio), even), 0.0)
 
+    @validated
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
         """The free numbers of a scene by name, in SI."""
         return {p.name: (p.leaf(scene) if p.entry is None else p.leaf(scene)[p.entry]).tolist() for p in self.places}
@@ -213,6 +215,7 @@ class DesignSpace(eqx.Module):
         """Name in a designer's words and unit of each free number."""
         return [(word, place.unit) for place in self.places for word in names_of(self.scene, place)]
 
+    @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
         """The same space between other bounds (d,), SI; equal ones fix a number."""
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
@@ -227,6 +230,7 @@ def _require_tables(scene: object, free: object, hold: object, ties: object, cho
     """**Raises** `InputError` for what is no scene, and for arguments that are no dictionaries or lists."""
     if not isinstance(scene, Scene):
         raise InputError("scene", f"is {quoted(scene)}; it must be a Scene, for example load_scene('machine.toml')")
+    require_known(scene, "scene", "DesignSpace", "make the space outside")
     for field, table in (("free", free), ("ties", ties), ("choices", choices)):
         if not isinstance(table, Mapping) and (table is not None or field == "free"):
             raise InputError(field, f"is {quoted(table)}; it must be a dictionary of names such as 'machine.stiffness'")

@@ -197,7 +197,7 @@ def envelope(
     run = _run(
         scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )
-    run = outcome(run, asked, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
+    run = outcome(run, asked, end, throw=throw, failures=(*_HINTS, "not_finite", "no_start"), hint=partial(_hint, max_steps))
     judged = when_known(lambda *_: _judged_by_separation(run), run.steps, run.status)
     return run if judged is None else judged
 

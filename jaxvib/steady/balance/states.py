@@ -69,10 +69,12 @@ class BalancedStates(Result):
     names: tuple[str, ...] = eqx.field(metadata=in_unit("", "neutral_direction", name="neutral_direction"))
     scene: Scene = eqx.field(metadata=SCENE)
 
+    @validated
     def stability(self, arrangement: int = 0, *, steps: int | None = None) -> BalancedStability:
         """Whether that arrangement, counted from 0, is stable at the scene's rotor speed, see `balanced_stability`."""
         return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
 
+    @validated
     def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
         """Growth rate of its errors at rotor speeds, 1/s: stable where it is negative, see `balanced_growth`."""
         return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)

@@ -52,6 +52,21 @@ def test_runs_of_forbidden_numbers_end_in_a_status(question):
             assert all(bool(jnp.all(jnp.isnan(leaf))) for leaf in numbers_of(found)), place
 
 
+@pytest.mark.parametrize("question", ["simulate", "envelope", "ensemble"])
+def test_an_end_that_is_not_after_the_start_is_refused(question):
+    """The end time is not known while the program is built; an ensemble ran backward."""
+
+    def ask(until):
+        if question == "ensemble":
+            return jv.ensemble(lambda _: SCENE, jnp.ones(2), until, stepsize_controller=jv.EqualSteps(400))
+        return getattr(jv, question)(SCENE, until, save="window", max_steps=4096)
+
+    program = jax.jit(ask)
+    names = [set(np.ravel(status_names(program(until).status))) for until in (1.0, -1.0, 0.0, jnp.nan, jnp.inf)]
+    assert names == [{"done"}, {"refused"}, {"refused"}, {"refused"}, {"refused"}]
+    assert bool(jnp.all(jnp.isnan(program(-1.0).foundation_force if question != "ensemble" else program(-1.0).load_speed)))
+
+
 def test_runs_of_a_batch_are_refused_one_by_one():
     """The others keep their numbers and their derivatives."""
     stiffness, until = jnp.asarray([4e4, -4e4, 5e4]), 1.0
