@@ -24,12 +24,11 @@ import jax.numpy as jnp  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 from parts.common import machine_line  # noqa: E402
+from parts.machines import published_rotor, published_torus  # noqa: E402
 
 from jaxvib.cli.study.audit import audit_text  # noqa: E402
 from jaxvib.study.audit.numbers import gravity_share  # noqa: E402
 from jaxvib.study.capture.capture import thrown_state  # noqa: E402
-from jaxvib.study.capture.published_torus import published_torus  # noqa: E402
-from jaxvib.study.maps.published_rotor import published_rotor  # noqa: E402
 
 
 def scenes() -> dict[str, tuple[jv.Scene, dict[str, Any]]]:

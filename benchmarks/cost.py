@@ -26,10 +26,10 @@ import jax  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 from parts.common import machine_line, published  # noqa: E402
+from parts.machines import published_rotor  # noqa: E402
 
 from jaxvib.cli.study.cost import cost_document, cost_table  # noqa: E402
 from jaxvib.study.accuracy.cost import WANTED  # noqa: E402
-from jaxvib.study.maps.published_rotor import published_rotor  # noqa: E402
 
 COARSE = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 

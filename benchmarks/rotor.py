@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
+from parts.machines import published_rotor
 
 import jaxvib as jv
-from jaxvib.study.maps.published_rotor import published_rotor
 
 jv.prepare_cpu()
 jax.config.update("jax_enable_x64", True)

@@ -29,11 +29,10 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from parts import native_torus  # noqa: E402
 from parts.common import machine_line  # noqa: E402
+from parts.machines import CONTACT, MODELS, published_tables, published_torus  # noqa: E402
 
 from jaxvib.study.capture.capture import thrown_state  # noqa: E402
-from jaxvib.study.capture.published_torus import published_torus  # noqa: E402
 from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402
-from jaxvib.study.capture.tables import CONTACT, MODELS, published_tables  # noqa: E402
 
 SCENE = published_torus(2.5)
 TOUCHING = jv.Scene(SCENE.machine, SCENE.loads, SCENE.drive, (*SCENE.effects, CONTACT))

@@ -79,14 +79,6 @@ from jaxvib.study.accuracy.work_precision import work_precision
 # What effects are worth
 from jaxvib.study.audit.audit import Audit, AuditStatus, audit
 
-# Hard cases
-from jaxvib.study.stress.result import Stress, StressStatus
-from jaxvib.study.stress.run import stress
-
-# Numbers that the papers print
-from jaxvib.study.published.result import Reproduced, ReproducedStatus
-from jaxvib.study.published.run import reproduce
-
 # Friction of a bearing
 from jaxvib.study.bearing.decrement import ten_periods
 from jaxvib.study.bearing.identify import Identified, IdentifyStatus, identify
@@ -238,14 +230,6 @@ __all__ = [
     "audit",
     "Audit",
     "AuditStatus",
-    # Hard cases
-    "stress",
-    "Stress",
-    "StressStatus",
-    # Numbers that the papers print
-    "reproduce",
-    "Reproduced",
-    "ReproducedStatus",
     # Friction of a bearing
     "BearingPendulum",
     "swing",

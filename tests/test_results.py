@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import subprocess
 import sys
 
@@ -34,13 +33,8 @@ from jaxvib.study.audit.numbers import NumberRow
 from jaxvib.study.audit.tiers import TierRow
 from jaxvib.study.capture.capture import _judged
 from jaxvib.study.capture.curve import ThresholdCurve
-from jaxvib.study.capture.tables import TorusTables
 from jaxvib.study.maps.run_ups import RunUps
 from jaxvib.study.maps.stability_onset import StabilityMap
-from jaxvib.study.published.entry import compared
-from jaxvib.study.published.result import reproduced_of
-from jaxvib.study.stress.case import StressRow
-from jaxvib.study.stress.result import stress_of
 from optimize.pareto import Front
 from optimize.result import Influence, Limit, Machine, Outcome, Row, Synthesis, SynthesisStatus
 
@@ -144,24 +138,10 @@ RESULTS = {
     "Capture": lambda: _judged(
         np.array([-0.5, -0.2]), np.array([[False] * 3, [True] * 3]), np.ones((2, 3), bool), np.eye(2, 3, dtype=bool), 150, 7200
     ),
-    "TorusTables": lambda: TorusTables(
-        *np.array([[0.1, 0.1], [0.005, 0.01], [4e-5, 4e-5], [2.7, 2.7], [-0.89, -0.639]]),
-        ("derived", "printed"),
-        *np.array([[[-0.9, -0.6], [-0.8, np.nan]], [[-0.7, -0.6], [-0.6, np.nan]], [[0.5, 1.0], [1.0, 0.0]]]),
-        np.array([-1.0, -0.1]),
-        np.ones((2, 2, 2), bool),
-        steps_per_turn=np.full((2, 2), 106.0),
-        moved=np.array([[[0.0, np.inf], [0.0, np.nan]]] * 2),
-        resolution=np.asarray(0.02),
-        starts=np.asarray(4),
-        turns=np.asarray(2000),
-    ),
     "ThresholdCurve": lambda: ThresholdCurve(
         *np.array([[1.0, 2.0], [-0.6, np.nan], [1e-3, np.nan], [-0.7, -0.2], [0.0, np.inf]]), turns=np.asarray(2000)
     ),
     "Growth": lambda: Growth(member(GrowthStatus, "chaotic"), 0.1, 0.02, 360.0, np.array([0.2, 0.0, 0.1, 0.1]), np.arange(4.0)),
-    "Stress": lambda: stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)]),
-    "Reproduced": lambda: reproduced_of([compared("criterion", "(12)", "resonance", 1.0, math.nan, within=0.1, note="none")]),
     "Tiers": tiers,
     "HarmonicConvergence": lambda: HarmonicConvergence(
         np.array([5.0]), np.array([3, 5]), np.array([[1e-3], [1e-5]]), np.array([[2e-3], [2e-5]])
@@ -178,7 +158,7 @@ RESULTS = {
 }
 
 # fmt: off
-SEVERAL_PANELS = ["TorusTables", "Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
+SEVERAL_PANELS = ["Run", "Envelope", "JamModes", "Jam", "Branches", "ExactBranches", "Orbit", "CriterionMap",
                   "BalancedStates", "Swing", "Identified", "RunUps", "Audit"]
 # fmt: on
 

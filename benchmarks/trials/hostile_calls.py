@@ -54,7 +54,7 @@ from jaxvib.errors import quoted
 PATIENCE = 20.0
 """Seconds that no call may take, of the processor: others who use it do not count."""
 
-LONG = ("stress", "reproduce", "prepare_cpu", "use_cache")
+LONG = ("prepare_cpu", "use_cache")
 """Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
 
 

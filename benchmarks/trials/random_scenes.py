@@ -4,7 +4,7 @@
 
 Scenes are drawn from a few kinds, so that few programs are compiled, with numbers over many decades. Of each are asked
 
-- `jam_modes`: torques balance by the dense complex algebra of `jaxvib.study.stress.plain`, to 1e-8
+- `jam_modes`: torques balance by the dense complex algebra of `hard_cases.reference_model`, to 1e-8
 - `jam_orbit` of the first mode there is: its state is carried over one turn by SciPy and comes back, to 1e-6
 - `multipliers` of that jam: the largest is that of SciPy's implicit method along the motion, to 1e-6
 - `balance` of two loads and more: the multipliers are those of SciPy's implicit method, to 1e-6
@@ -23,6 +23,7 @@ import dataclasses
 import functools
 import json
 import pathlib
+import sys
 import tempfile
 import time
 import traceback
@@ -37,10 +38,13 @@ import numpy as np
 import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.results.status import status_name
-from jaxvib.study.stress.asked import away, end_of_run, light_force_slope, state_of
-from jaxvib.study.stress.asked import compared_state as compared
-from jaxvib.study.stress.motions import multipliers, run_out
-from jaxvib.study.stress.plain import Plain, figure, light_modes, light_speed, plain
+
+TESTS = pathlib.Path(__file__).parents[2] / "tests"
+sys.path[:0] = [str(TESTS / "helpers"), str(TESTS / "validation")]
+
+from hard_cases.reference_integration import multipliers, run_out  # noqa: E402
+from hard_cases.reference_model import ReferenceModel, light_modes, light_speed, number_of, reference_model  # noqa: E402
+from hard_cases.shared import away, compared_state, end_of_run, light_force_slope, state_of  # noqa: E402
 
 jv.prepare_cpu()
 
@@ -187,7 +191,7 @@ def _rates(
     return np.concatenate((v, change[:nd], rate, change[nd:]))
 
 
-class Fast(Plain):
+class Fast(ReferenceModel):
     """The same dense equations without effects at constant speed, compiled: SciPy asks for them a thousand times a scene."""
 
     @functools.cached_property
@@ -195,14 +199,14 @@ class Fast(Plain):
         own = self.m * self.radius
         matrices = (np.ascontiguousarray(x) for x in (self.whole_mass, self.damping, self.stiffness))
         drag = self.drag * self.radius**2
-        return *matrices, self.at, own, self.kappa * own * self.radius, drag, figure(self.drive, "speed")
+        return *matrices, self.at, own, self.kappa * own * self.radius, drag, number_of(self.drive, "speed")
 
     def field(self, t: float, y: np.ndarray, press: float = 0.0) -> np.ndarray:
         return _rates(y, *self.numbers)
 
 
 def fast(scene: jv.Scene) -> Fast:
-    p = plain(scene)
+    p = reference_model(scene)
     return Fast(**{field.name: getattr(p, field.name) for field in dataclasses.fields(p)})
 
 
@@ -211,7 +215,7 @@ def relative(found: np.ndarray, right: np.ndarray) -> float:
 
 
 def ask_modes(scene: jv.Scene, rng: np.random.Generator) -> str:
-    modes, p, speed = jv.jam_modes(scene), plain(scene), float(scene.drive.speed)
+    modes, p, speed = jv.jam_modes(scene), reference_model(scene), float(scene.drive.speed)
     for k in modes.mode_numbers():
         jam = modes.select(k)
         n, moved, force = light_speed(p, float(jam.omega))
@@ -262,7 +266,7 @@ def ask_multipliers(scene: jv.Scene, rng: np.random.Generator) -> str:
         phi, rate = w * t + (ahead @ lag).real, w * (1.0 + (ahead @ (1j * j * lag)).real)
         return np.concatenate([(moved @ wave).real, w * (moved @ (1j * k * wave)).real, np.tile(phi, n), np.tile(rate, n)])
 
-    right = np.abs(multipliers(plain(scene), motion, 2.0 * np.pi / w))
+    right = np.abs(multipliers(reference_model(scene), motion, 2.0 * np.pi / w))
     right = np.delete(right, np.argmin(np.abs(right - 1.0)))
     miss = abs(float(orbit.multiplier) - np.max(right)) / max(1.0, float(np.max(right)))
     return "right" if miss < 1e-6 else f"wrong: multiplier {float(orbit.multiplier)}, SciPy {np.max(right)} (nd {nd})"
@@ -278,7 +282,7 @@ def ask_balance(scene: jv.Scene, rng: np.random.Generator) -> str:
     def motion(t: float) -> np.ndarray:
         return np.concatenate([np.zeros(2 * nd), angles + speed * t, np.full(angles.size, speed)])
 
-    right = np.sort(np.abs(multipliers(plain(scene), motion, 2.0 * np.pi / speed)))[::-1]
+    right = np.sort(np.abs(multipliers(reference_model(scene), motion, 2.0 * np.pi / speed)))[::-1]
     miss = float(np.max(np.abs(np.abs(found.multipliers) - right))) / max(1.0, float(right[0]))
     return "right" if miss < 1e-6 else f"wrong: multipliers {np.abs(found.multipliers)}, SciPy {right}"
 
@@ -290,7 +294,7 @@ def ask_run(scene: jv.Scene, rng: np.random.Generator) -> str:
     run = jv.simulate(scene, until, start=state_of(scene, y), save="window", throw=False)
     if status_name(run.status) != "done":
         return f"named: {status_name(run.status)}"
-    right = compared(scene, run_out(p, y, until))
+    right = compared_state(scene, run_out(p, y, until))
     error = float(np.max(np.abs(end_of_run(run) - np.asarray(right.values)) / np.asarray(right.scale)))
     return "right" if error <= max(float(run.error), 1e-9) else f"wrong: error {error:.1e}, claimed {float(run.error):.1e}"
 

@@ -211,8 +211,6 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("check_gradients", scene=s, quantity=lambda x: jv.natural_frequencies(x)[0], **gradients)
     asked = dict(accuracy=0.1, mode=3, until=None, start=None, possible=(), tiers=False, repeats=0)
     yield call("audit", scene=s, **asked)
-    yield call("stress", only=("nothing of this name",), precisions=("float64",), report=None)
-    yield call("reproduce", papers=("nothing of this name",), full=False, report=None, figure=None)
     # Bearing
     yield call("BearingPendulum", mass=2.0, length=0.3, inertia=0.0, bearing=0.01, g=9.81)
     p, rec = later(pendulum), later(record)

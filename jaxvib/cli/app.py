@@ -103,12 +103,7 @@ _GROUPS = {
         "show": "study.sweep",
         "identify": "study.identify",
     },
-    "What an answer is worth": {
-        "cost": "study.cost",
-        "audit": "study.audit",
-        "stress": "study.stress",
-        "reproduce": "study.reproduce",
-    },
+    "What an answer is worth": {"cost": "study.cost", "audit": "study.audit"},
 }
 """The commands by what they are for, each with the module of `jaxvib.cli` that holds it."""
 

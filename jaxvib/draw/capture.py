@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from jaxvib.draw.style import COLORS, GUIDE, MARKERS, STROKES, Drawn, Onto, legend_above, panels
+from jaxvib.draw.style import COLORS, GUIDE, STROKES, Drawn, Onto, legend_above, panels
 
-__all__ = ["curve_chart", "tables_chart", "threshold_chart", "torus_paths"]
+__all__ = ["curve_chart", "threshold_chart", "torus_paths"]
 
 
 def threshold_chart(
@@ -103,31 +101,3 @@ def torus_paths(around: np.ndarray, across: np.ndarray, rate: np.ndarray, time: 
 def _within(angle: np.ndarray, least: float) -> np.ndarray:
     """The angle in the turn that begins at `least`, rad."""
     return np.mod(angle - least, 2.0 * np.pi) + least
-
-
-def tables_chart(rows: Sequence[tuple[str, np.ndarray, Mapping[str, np.ndarray]]], *, ax: Onto = None) -> Drawn:
-    """Least initial speeds over the gap.
-
-    **Arguments**: `rows`, a panel for each: its title, the gaps, by name the speeds; "paper" as points alone.
-
-    >>> import numpy as np
-    >>> len(tables_chart([("p = 0.01", np.arange(2.0), {"paper": np.zeros(2), "derived": np.ones(2)})]).axes)
-    1
-    """
-    columns = len(rows) if ax is not None else 2 if len(rows) > 1 else 1
-    figure, axes = panels(-(-len(rows) // columns), columns, size=(5.0, 3.0), ax=ax)
-    for axis in axes[len(rows) :]:
-        axis.set_visible(False)
-    for axis, (title, gap, speeds) in zip(axes, rows, strict=False):
-        for k, (name, speed) in enumerate(speeds.items()):
-            if name == "paper":
-                axis.plot(gap, speed, "o", color="black", label=name)
-            else:
-                look = {"marker": MARKERS[k % len(MARKERS)], "ls": STROKES[k % len(STROKES)], "ms": 4.0}
-                axis.plot(gap, speed, color=COLORS[(k - 1) % len(COLORS)], label=name, **look)
-        axis.set_title(title, loc="right", fontsize="medium")
-        axis.set_xlabel("gap, in eccentricities")
-        axis.set_ylabel("least initial speed relative\nto the rotor, in its speed")
-        axis.set_ylim(-1.03, 0.0)
-    legend_above(axes[0], 2)
-    return figure if ax is None else ax

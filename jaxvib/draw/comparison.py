@@ -16,13 +16,11 @@ from jaxvib.draw.style import COLORS, MARKERS, STROKES, Drawn, Onto, SpeedUnit, 
 
 __all__ = [
     "CostPanel",
-    "StressMark",
     "audit_chart",
     "convergence_chart",
     "cost_chart",
     "stability_chart",
     "steps_chart",
-    "stress_chart",
     "tiers_chart",
 ]
 
@@ -237,55 +235,4 @@ def steps_chart(
     axes.set_xlabel("step, relative")
     axes.set_ylabel(f"differences against {route} mode")
     legend_above(axes)
-    return figure if ax is None else ax
-
-
-class StressMark(NamedTuple):
-    """What `stress_chart` shows of one question: its `case`, `dtype`, `verdict`; the true `error`, the one `claimed` (NaN where
-    there is none) and the `bound`."""
-
-    case: str
-    dtype: str
-    verdict: str
-    error: float
-    claimed: float
-    bound: float
-
-
-def stress_chart(marks: Sequence[StressMark], *, ax: Axes | None = None) -> Drawn:
-    """Errors of hard cases, a row for each: true ones as marks, claimed ones hollow, bounds as bars; a precision has a colour.
-
-    What ended in a named status stands at the right as a square, what failed as a cross.
-
-    >>> figure = stress_chart([StressMark("a fold", "float64", "right", 1e-12, 1e-10, 1e-8)])
-    >>> [label.get_text() for label in figure.axes[0].get_yticklabels()]
-    ['a fold']
-    """
-    cases = list(dict.fromkeys(mark.case for mark in marks))
-    dtypes = list(dict.fromkeys(mark.dtype for mark in marks))
-    figure, (axes,) = panels(1, size=(8.5, 1.8 + 0.27 * len(cases)), ax=ax)
-    floor = 1e-17
-    for mark in marks:
-        which = dtypes.index(mark.dtype)
-        color, y = COLORS[which % len(COLORS)], cases.index(mark.case) + 0.16 * (2 * which - len(dtypes) + 1)
-        if mark.verdict == "right":
-            axes.plot(max(mark.error, floor), y, "o", ms=5, color=color)
-            if np.isfinite(mark.claimed):
-                axes.plot(max(mark.claimed, floor), y, "o", ms=5, mfc="none", color=color)
-            axes.plot(max(mark.bound, floor), y, "|", ms=8, mew=1.5, color=color)
-        else:
-            axes.plot(10.0, y, "s" if mark.verdict == "named" else "x", ms=5, mew=2.0, color=color)
-    axes.set_xscale("log")
-    axes.set_xlim(0.3 * floor, 30.0)
-    axes.set_yticks(range(len(cases)), cases)
-    axes.set_ylim(len(cases) - 0.4, -0.6)
-    axes.set_xlabel("error, relative")
-
-    def shown(marker: str, ms: float = 6.0, mfc: str = "black") -> Line2D:
-        return Line2D([], [], ls="", color="black", marker=marker, ms=ms, mfc=mfc)
-
-    handles = [shown("o"), shown("o", mfc="none"), shown("|", ms=8), shown("s"), shown("x")]
-    handles += [Patch(color=COLORS[k % len(COLORS)]) for k in range(len(dtypes))]
-    names = ["true", "claimed", "bound", "named status", "FAILED", *dtypes]
-    legend_above(axes, 4, handles=handles, labels=names)
     return figure if ax is None else ax

@@ -15,7 +15,6 @@ from jaxvib.cli.app import _HOMES, app, run
 from jaxvib.machine.files import EFFECTS, SECTIONS, TEMPLATES
 from jaxvib.report.arguments import GROUPS, arguments_of
 from jaxvib.study.accuracy.work_precision import QUANTITIES, SOLVERS
-from jaxvib.study.stress.run import PRECISIONS
 
 
 def read(path):
@@ -213,6 +212,5 @@ def test_help_imports_nothing_slow_and_lists_the_choices():
         (name, p.name): tuple(getattr(p.type, "choices", ())) for name in _HOMES for p in app.get_command(None, name).params
     }
     assert options["cost", "quantity"] == QUANTITIES and options["cost", "solvers"] == tuple(SOLVERS)
-    assert options["stress", "precisions"] == PRECISIONS
     machines = tuple(name.replace("_", "-") for name in TEMPLATES)
     assert options["new", "kind"] == (*machines, "design", "measurement", "sweep")

@@ -53,8 +53,9 @@ def scene(machine="two_mass", load="balls", speed=120.0, effects=()):
 
 
 def published(speed=3.0, eps=1e-3, damping=0.01, count=1, form="antiphase", **more):
-    """The machine of the antiphase paper, equation (40)."""
-    numbers = dict(natural=(1 / 3, 1 / 3), damping=(damping, damping), link_natural=2 / 3, link_damping=damping, rho=1.0)
+    """The machine of the antiphase paper, equation (40); `damping` of all, or of both supports with `link_damping`."""
+    pair = np.broadcast_to(damping, 2).tolist()
+    numbers = dict(natural=(1 / 3, 1 / 3), damping=pair, link_natural=2 / 3, link_damping=damping, rho=1.0)
     return jv.Dimensionless(form, **{**numbers, "eps": eps, "beta": 1.0, "speed": speed, "count": count, **more})
 
 

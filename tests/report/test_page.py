@@ -12,8 +12,9 @@ import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.report.page import Report, units_of
-from jaxvib.study.stress.case import StressRow
-from jaxvib.study.stress.result import stress_of
+from jaxvib.study.accuracy.cost import CostRow
+
+RESULT = jv.Cost("amplitude", [1.0], 1e-9, [CostRow("full", "Tsit5", "float64", "1e-3", math.nan, 0.1, 1.0)])
 
 HOSTILE = "<script>alert('x')</script>&\"<img src=http://evil.example/x onerror=alert(1)>"
 
@@ -87,12 +88,11 @@ def test_numbers_that_are_not_finite_and_long_lists():
 
 @pytest.mark.parametrize("kind", TEMPLATES)
 def test_parameters_of_every_template_have_units(kind, tmp_path):
-    result = stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)])
-    path = jv.html_report(result, tmp_path / "r.html", scene=jv.scene_from_toml(TEMPLATES[kind]), figures=[])
+    path = jv.html_report(RESULT, tmp_path / "r.html", scene=jv.scene_from_toml(TEMPLATES[kind]), figures=[])
     text = path.read_text()
     checked(text)
     assert "<td class='unit'>kg</td>" in text and "<td class='unit'>rad/s</td>" in text
-    assert "every case ended in a right answer" in text
+    assert RESULT.message in text
 
 
 def test_units_are_those_of_the_fields():
@@ -103,9 +103,8 @@ def test_units_are_those_of_the_fields():
 def test_wrong_input(tmp_path, capsys):
     with pytest.raises(jv.InputError, match=r"result is .*; it must be a Result"):
         jv.html_report({}, tmp_path / "r.html")
-    run_ = stress_of([StressRow("a fold", "float64", "right", 1e-12, math.nan, 1e-8, "", 0.1)])
     with pytest.raises(jv.InputError, match="cannot be written"):
-        jv.html_report(run_, tmp_path / "none" / "r.html", figures=[])
+        jv.html_report(RESULT, tmp_path / "none" / "r.html", figures=[])
     assert run(["describe", "--report", str(tmp_path / "r.pdf")]) == 2
     assert "--report is" in capsys.readouterr().err
     (tmp_path / "file").write_text("")

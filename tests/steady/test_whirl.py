@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from papers.machines import published_rotor
 from scenes import scene as platforms
 from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.whirl import _held
-from jaxvib.study.maps.published_rotor import published_rotor
 
 
 @pytest.mark.parametrize(

@@ -139,8 +139,8 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
 
     **Returns** `State`. **Raises** `InputError` for loads that are none of a torus.
 
-    >>> from jaxvib.study.capture.published_torus import published_torus
-    >>> state = thrown_state(published_torus(2.5), -0.5)
+    >>> from jaxvib.machine.files import TEMPLATES, scene_from_toml
+    >>> state = thrown_state(scene_from_toml(TEMPLATES["torus"]), -0.5)
     >>> [round(float(x), 4) for x in (state.angle[0][1], state.rate[0][0])]
     [0.1248, 70.0]
     """
@@ -187,14 +187,14 @@ def capture(
       radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time
       constant of the fastest decay
     - `doublings` of the default steps at most; 0 takes the first answer
-    - `equations`: as `ensemble`; `jaxvib.study.capture.published_torus.printed_torus` for the paper's printed ones
+    - `equations`: as `ensemble`
 
     **Returns** `Capture`. **Raises** `InputError` for loads that are none of a torus, a motor, and numbers not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
-    >>> from jaxvib.study.capture.published_torus import published_torus
-    >>> found = jv.capture(published_torus(5.4), [-1.0, -0.2], turns=60)
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> found = jv.capture(jv.scene_from_toml(TEMPLATES["torus"]), [-1.0, -0.2], turns=60)
     >>> found.fraction.tolist(), found.status_name
     ([0.0, 1.0], 'found')
 
@@ -316,10 +316,10 @@ def capture_time(run: Run, within: float = 0.05) -> Array:
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
     >>> from jaxvib.study.capture.capture import capture_time, thrown_state
-    >>> from jaxvib.study.capture.published_torus import published_torus
-    >>> scene = published_torus(5.4)
-    >>> run = jv.simulate(scene, 1.0, start=thrown_state(scene, -0.1), samples=2000, estimate=False)
-    >>> bool(0.0 < capture_time(run) < 1.0)
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> scene = jv.scene_from_toml(TEMPLATES["torus"])
+    >>> run = jv.simulate(scene, 2.0, start=thrown_state(scene, -0.1), samples=2000, estimate=False)
+    >>> bool(0.0 < capture_time(run) < 2.0)
     True
     """
     if run.trajectory is None:

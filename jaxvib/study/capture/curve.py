@@ -90,8 +90,11 @@ def threshold_curve(
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
-    >>> from jaxvib.study.capture.published_torus import published_torus
-    >>> curve = jv.threshold_curve(published_torus, [5.4], [-1.0, -0.2], turns=60)
+    >>> from jaxvib.machine.files import TEMPLATES
+    >>> scene = jv.scene_from_toml(TEMPLATES["torus"])
+    >>> def at_speed(speed):
+    ...     return jv.Scene(scene.machine, scene.loads, jv.ConstantSpeed(speed), scene.effects)
+    >>> curve = jv.threshold_curve(at_speed, [140.0], [-1.0, -0.2], turns=60)
     >>> curve.threshold.tolist()
     [-0.6]
 

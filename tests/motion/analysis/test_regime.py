@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from papers.machines import published_rotor
 from scenes import published
 from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.analysis.regime import _caught
-from jaxvib.study.maps.published_rotor import published_rotor
 
 TIME = jnp.linspace(0.0, 1.0, 801)
 

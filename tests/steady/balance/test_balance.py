@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import scipy.integrate
 from gyroscopic_rotor import rotor
+from hard_cases.reference_integration import multipliers
+from hard_cases.reference_model import reference_model
 from scenes import machines
 from stored_jit import stored_jit
 
@@ -17,8 +19,6 @@ import jaxvib as jv
 from jaxvib.steady.balance import states
 from jaxvib.steady.balance.speeds import characteristic_speeds
 from jaxvib.steady.balance.states import BalanceStatus, balanced_growth, balanced_intervals, balanced_stability
-from jaxvib.study.stress.motions import multipliers
-from jaxvib.study.stress.plain import plain
 
 POINTS = 112
 """Rotor speeds of one scan; the same in all tests, so that each machine is compiled once."""
@@ -347,7 +347,7 @@ def plain_multipliers(s):
     """Multipliers by SciPy's implicit method, from the dense equations; loads at the first arrangement."""
     angles, n, nd = jv.balanced_states(s).angles[0], float(s.drive.speed), s.machine.structure().mass.shape[0]
     motion = lambda t: np.concatenate([np.zeros(2 * nd), angles + n * t, np.full(angles.size, n)])  # noqa: E731
-    return multipliers(plain(s), motion, 2.0 * np.pi / n)
+    return multipliers(reference_model(s), motion, 2.0 * np.pi / n)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Many run-ups of one rotor, and the published one."""
+"""Many run-ups of one rotor."""
 
 import equinox as eqx
 import jax
@@ -7,56 +7,6 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
-from jaxvib.steady.jams.phases import phase_jam
-from jaxvib.study.maps.published_rotor import published_rotor, rotor_regimes
-
-
-def test_published_rotor_at_three_frictions():
-    """First jam 169.6 rad/s with ripple 3.1, second 271.1 in opposite pairs, and balancing, with the data read as c2 = 0."""
-    first = rotor_regimes([9.2e-4, 1.24e-2], ["uncoupled, both dampers"], until=6.0)
-    found = first.computed["uncoupled, both dampers"]
-    assert found.kind[:, 0].tolist() == ["jammed", "jammed"]
-    np.testing.assert_allclose(found.omega[:, 0], [169.6, 271.15], atol=0.1)
-    np.testing.assert_allclose(found.regime.ripple[0, 0], 3.1, atol=0.1)
-    # The torque balance at unequal phases, started from the phases of the run, gives the speed the run has locked to.
-    for k, mu in enumerate(first.mu):
-        jam = phase_jam(published_rotor(float(mu), "uncoupled, both dampers"), found.omega[k, 0], found.regime.phase[k, 0])
-        assert bool(jam.stable)
-        np.testing.assert_allclose(jam.omega, found.omega[k, 0], atol=0.1)
-    assert "together" in first.said("uncoupled, both dampers", 0)
-    assert "opposite" in first.said("uncoupled, both dampers", 1)
-    assert "169.6" in first.summary()
-
-
-@pytest.mark.slow
-def test_published_rotor_over_its_whole_friction():
-    """The paper's numbers, the results of its printed data, and the readings that reproduce the numbers, in one run."""
-    mu = [5e-5, 9.2e-4, 1.0e-3, 1.02e-2, 1.8e-2, 4.6e-2, 1e-1]
-    early, late = rotor_regimes(mu, until=4.0), rotor_regimes(mu, until=12.0)
-
-    def words(found, variant):
-        return [str(kind) for kind in found.computed[variant].kind[:, 0]]
-
-    printed = early.computed["printed"]
-    assert words(early, "printed")[1] != "jammed"  # no stable first jam with the printed c2
-    np.testing.assert_allclose(printed.omega[3, 0], 271.1, atol=0.1)
-    plain = words(late, "uncoupled")
-    assert plain[:2] == ["swinging", "jammed"] and plain[2] != "jammed"
-    assert words(late, "uncoupled, both dampers")[4] == "balanced"
-    # "Turns with the rotor, not balanced" is a matter of when one looks.
-    assert words(early, "uncoupled, both dampers")[5] == "unbalanced"
-    assert words(late, "uncoupled, both dampers")[5:] == ["balanced", "balanced"]
-
-
-@pytest.mark.slow
-def test_first_jam_is_reached_from_equal_starts_only():
-    """The first of 201 starts hangs together; one program for all, which takes longer to compile than to run."""
-    s = published_rotor(9.2e-4, "uncoupled")
-    together, scattered = np.full((1, 4), -np.pi / 2.0), np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 4))
-    found = jv.run_ups(s, 6.0, angles=np.concatenate([together, scattered]), batch=8, stepsize_controller=jv.Tolerance(1e-6))
-    assert np.all(found.finished)
-    near_first = (found.kind[0] == "jammed") & (np.abs(found.omega[0] - 169.6) < 0.1)
-    assert near_first[0] and np.mean(near_first[1:]) < 0.05
 
 
 def test_run_ups_name_each_lane():

@@ -11,6 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from hard_cases.case import Answer, Case, Reference
+from hard_cases.nonsmooth import stop_law
+from hard_cases.reference_integration import orbit_rotor_speed, orbit_speed
+from hard_cases.reference_model import ReferenceModel, light_speed, platforms, reference_model
+from hard_cases.shared import away, final_state, published, run_case, state_of
 from jaxvib.machine.drive import ConstantSpeed, DCMotor, Drive, RunUp
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.supports import CubicSupport, Stop
@@ -21,11 +26,6 @@ from jaxvib.motion.growth import growth
 from jaxvib.motion.simulate import simulate
 from jaxvib.results.status import status_name
 from jaxvib.study.accuracy.gradient_check import check_gradients
-from jaxvib.study.stress.asked import away, final_state, published, run_case, state_of
-from jaxvib.study.stress.bends import stop_law
-from jaxvib.study.stress.case import Answer, Case, Reference
-from jaxvib.study.stress.motions import orbit_rotor_speed, orbit_speed
-from jaxvib.study.stress.plain import Plain, light_speed, plain, platforms
 
 __all__ = ["CASES"]
 
@@ -40,13 +40,13 @@ def _long(scene: Scene) -> Answer:
     return Answer([run.omega], float(run.error), "" if status == "done" else status)
 
 
-def _jam_start(p: Plain, omega: float) -> tuple[np.ndarray, float]:
+def _jam_start(p: ReferenceModel, omega: float) -> tuple[np.ndarray, float]:
     speed, moved, _ = light_speed(p, omega)
     return np.concatenate([moved.imag, omega * moved.real, [0.0, omega]]), speed
 
 
 def _long_again(scene: Scene) -> Reference:
-    p = plain(scene)
+    p = reference_model(scene)
     return Reference(orbit_speed(p, 0.9720, 0.9735, *_jam_start(p, 0.97266), nodes=5), unknown=1e-9)
 
 
@@ -55,7 +55,7 @@ def _lossless() -> Scene:
     return Scene(machine, pendulums(count=1, mass=2.0, radius=0.1, drag=0.0), ConstantSpeed(60.0))
 
 
-def _energy(p: Plain, y: np.ndarray) -> float:
+def _energy(p: ReferenceModel, y: np.ndarray) -> float:
     """T + V of one platform and one load that nothing drives, J."""
     (q, v, phi, rate), m, radius = y, float(p.m[0]), float(p.radius[0])
     load = m * ((radius * np.sin(phi) * rate) ** 2 + (v + radius * np.cos(phi) * rate) ** 2)
@@ -73,7 +73,7 @@ def _conserved(scene: Scene) -> Answer:
     last = run.window.state
     y = [float(x) for x in (last.displacement[-1, 0], last.velocity[-1, 0], last.angle[0][-1, 0], last.rate[0][-1, 0])]
     status = status_name(run.status)
-    return Answer([_energy(plain(scene), np.array(y))], None, "" if status == "done" else status)
+    return Answer([_energy(reference_model(scene), np.array(y))], None, "" if status == "done" else status)
 
 
 def _passing(drive: Drive) -> Scene:
@@ -138,7 +138,7 @@ def _slopes(scene: Scene) -> Answer:
 
 def _slopes_again(scene: Scene) -> Reference:
     """dw/dk at a given rotor speed is -(dn/dk)/(dn/dw), by differences of shooting."""
-    p, speed = plain(scene), float(scene.drive.speed)
+    p, speed = reference_model(scene), float(scene.drive.speed)
     (omega,) = orbit_speed(p, 0.9720, 0.9735, *_jam_start(p, 0.97266), nodes=5)
     start = _jam_start(p, omega)[0]
 
@@ -146,7 +146,7 @@ def _slopes_again(scene: Scene) -> Reference:
         factor = np.ones(2)
         if k < 2:
             factor[k] += step
-        change = np.diag(p.bed_stiffness * (factor - 1.0))
+        change = np.diag(p.foundation_stiffness * (factor - 1.0))
         now = dataclasses.replace(p, stiffness=p.stiffness + change)
         return orbit_rotor_speed(now, omega * (1.0 + step if k == 2 else 1.0), start, speed)[0]
 
@@ -230,7 +230,7 @@ CASES = (
         against="energy at the start",
         scene=_lossless,
         answer=_conserved,
-        reference=lambda scene: Reference([_energy(plain(scene), _swinging(scene))]),
+        reference=lambda scene: Reference([_energy(reference_model(scene), _swinging(scene))]),
         within=(1e-7, 1e-2),
     ),
     run_case(

@@ -1,4 +1,4 @@
-"""What several cases ask alike, of jaxvib and of the reference."""
+"""Questions that several cases share, to jaxvib and to the reference."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from functools import partial
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scenes
 from jax import Array
 
+from hard_cases.case import Answer, Case, Reference
+from hard_cases.reference_integration import Outcome, run_out
+from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
 from jaxvib.equations.dynamics import State
-from jaxvib.machine.dimensionless import Dimensionless
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.steps import StepChoice
 from jaxvib.results.status import status_name, status_names
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.study.stress.case import Answer, Case, Reference
-from jaxvib.study.stress.motions import Outcome, run_out
-from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = [
     "away",
@@ -35,20 +35,9 @@ __all__ = [
 ]
 
 
-def published(
-    speed: float = 3.0,
-    *,
-    damping: tuple[float, float] = (0.01, 0.01),
-    link_natural: float = 2 / 3,
-    link_damping: float = 0.01,
-    eps: float = 1e-3,
-    beta: float = 1.0,
-    count: int = 1,
-) -> Scene:
-    """The machine of the antiphase paper, equation (40), one load; any of its numbers may be another."""
-    link, scale = dict(link_natural=link_natural, link_damping=link_damping), dict(eps=eps, beta=beta, speed=speed)
-    form = Dimensionless("antiphase", natural=(1 / 3, 1 / 3), damping=damping, rho=1.0, count=count, **link, **scale)
-    return form.scene()
+def published(speed: float = 3.0, **change: float) -> Scene:
+    """The machine of the antiphase paper, equation (40), with one load; any of its numbers may be another."""
+    return scenes.published(speed, **change).scene()
 
 
 def _mode_speeds(scene: Scene) -> Answer:
@@ -61,7 +50,7 @@ def _mode_speeds(scene: Scene) -> Answer:
 
 def _mode_speeds_again(scene: Scene) -> Reference:
     """The same as roots of n(Omega) = n, by dense complex algebra and Brent's method."""
-    p = plain(scene)
+    p = reference_model(scene)
     return Reference(light_modes(p, float(scene.drive.speed)))
 
 
@@ -73,7 +62,7 @@ jam_case = partial(
     reference=_mode_speeds_again,
     within=(1e-9, 1e-3),
 )
-run_case = partial(Case, quantity="state at the end of a run", against="SciPy's DOP853 on the plain equations")
+run_case = partial(Case, quantity="state at the end of a run", against="SciPy's DOP853 on the reference model")
 
 
 def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.ndarray:
@@ -85,7 +74,7 @@ def light_force_slope(scene: Scene, mode_near: float, step: float = 1e-5) -> np.
     def force(values: np.ndarray) -> float:
         nd = platforms(scene).stiffness.shape[0]
         changed = eqx.tree_at(_stiffnesses, scene, (values[:nd], values[nd:]))
-        p = plain(changed)
+        p = reference_model(changed)
         roots = light_modes(p, float(scene.drive.speed))
         return light_speed(p, roots[np.argmin(np.abs(roots - mode_near))])[2]
 
@@ -108,7 +97,7 @@ def _stiffnesses(scene: Scene) -> tuple[Array, Array]:
 
 
 def state_of(scene: Scene, y: np.ndarray) -> State:
-    """A state of the scene from the numbers of a `Plain` one, in JAX's precision."""
+    """A state of the scene from the numbers of a `ReferenceModel` one, in JAX's precision."""
     nd, n = scene.machine.structure().mass.shape[0], scene.loads.count
     q, v, phi, rate, *rest = (jnp.asarray(x, float) for x in np.split(y, np.cumsum([nd, nd, n, n])))
     rotor = (rest[0][0], rest[0][1]) if rest and rest[0].size else None
@@ -132,7 +121,7 @@ def _turned(q: np.ndarray, v: np.ndarray, phi: np.ndarray, rate: np.ndarray, *ro
 
 def compared_state(scene: Scene, out: Outcome, unknown: float = 1e-9) -> Reference:
     """A reference's state at the end, with the scales of `Run.error`."""
-    p = plain(scene)
+    p = reference_model(scene)
     nd, n, y = p.mass.shape[0], p.m.size, out.state
     speed = float(scene.drive.speed)
     length = np.sum(p.m * p.radius) / np.sum(p.whole_mass)
@@ -151,7 +140,7 @@ def final_state(
     unknown: float = 1e-9,
     claims: bool = True,
 ) -> tuple[Callable[[Scene], Answer], Callable[[Scene], Reference]]:
-    """The state at the end of a run from `start`, asked by `simulate`, and by SciPy of the plain equations."""
+    """The state at the end of a run from `start`, asked by `simulate`, and by SciPy's integration of the reference model."""
 
     def answer(scene: Scene) -> Answer:
         chosen = steps[0 if scene.drive.speed.dtype.itemsize == 8 else 1]
@@ -161,7 +150,7 @@ def final_state(
         return Answer(end_of_run(run), float(run.error) if claims else None, "" if status == "done" else status)
 
     def reference(scene: Scene) -> Reference:
-        return compared_state(scene, run_out(plain(scene), start(scene), until), unknown)
+        return compared_state(scene, run_out(reference_model(scene), start(scene), until), unknown)
 
     return answer, reference
 
@@ -172,7 +161,7 @@ def away(scene: Scene, *, displacement: float = 0.0, angle: float = -1.0, rate: 
     Platforms are displaced by so many natural units S/M, load j is at `angle` + 0.7 j rad and turns at the share `rate` of the
     rotor's speed.
     """
-    p = plain(scene)
+    p = reference_model(scene)
     nd, n = p.mass.shape[0], p.m.size
     length = np.sum(p.m * p.radius) / np.sum(p.whole_mass)
     motor = [] if scene.drive.ideal else [0.0, 0.0]

@@ -1,4 +1,4 @@
-"""Motions of a `Plain` machine by SciPy: runs, runs from event to event, periodic ones by shooting."""
+"""Motions of a `ReferenceModel` machine by SciPy: runs, runs from event to event, periodic ones by shooting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from jaxvib.study.stress.plain import Plain, figure, root
+from hard_cases.reference_model import ReferenceModel, number_of, root
 
 __all__ = [
     "Event",
@@ -43,7 +43,7 @@ class Outcome(NamedTuple):
     velocity: float
 
 
-def run_out(p: Plain, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Outcome:
+def run_out(p: ReferenceModel, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Outcome:
     """The motion from the state `y` at 0; where the drive jumps a step ends.
 
     Scenes without effects at constant speed whose loads or carrier decay much faster than anything moves are integrated by
@@ -65,28 +65,28 @@ def run_out(p: Plain, y: np.ndarray, until: float, *, rtol: float = 1e-12) -> Ou
     return Outcome(y, *map(float, largest))
 
 
-def is_stiff(p: Plain) -> bool:
-    """True if drag or damping acts 1000 times as fast as the rotor turns and the carrier vibrates, and `Plain.slopes` holds."""
+def is_stiff(p: ReferenceModel) -> bool:
+    """True if drag or damping acts 1000 times as fast as rotor and carrier move, and `ReferenceModel.slopes` holds."""
     if p.effects or getattr(p.drive, "kind", "") != "constant_speed":
         return False
     n = p.m.size
     matrix, _ = p.forces(0.0, np.zeros(2 * (p.mass.shape[0] + n)))
     decay = np.concatenate([np.diag(p.damping), p.drag * p.radius**2]) / np.diag(matrix)
-    motion = max(figure(p.drive, "speed"), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
+    motion = max(number_of(p.drive, "speed"), float(np.sqrt(np.max(np.diag(p.stiffness) / np.diag(p.mass)))))
     return float(np.max(decay)) > 1000.0 * motion
 
 
-def natural_sizes(p: Plain) -> np.ndarray:
+def natural_sizes(p: ReferenceModel) -> np.ndarray:
     """The natural unit of each number of a state, of which absolute tolerances are shares: the loads' unbalance radius S/M for
     displacements, that times the rotor's speed for velocities, 1 rad, the rotor's speed."""
     nd, n = p.mass.shape[0], p.m.size
     length = np.sum(p.m * p.radius) / np.sum(p.whole_mass)
-    speed = figure(p.drive, "speed")
+    speed = number_of(p.drive, "speed")
     motor = [1.0, speed] if getattr(p.drive, "kind", "") == "dc_motor" else []
     return np.array([length] * nd + [length * speed] * nd + [1.0] * n + [speed] * n + motor)
 
 
-def multipliers(p: Plain, motion: Callable[[float], np.ndarray], period: float, *, rtol: float = 1e-10) -> np.ndarray:
+def multipliers(p: ReferenceModel, motion: Callable[[float], np.ndarray], period: float, *, rtol: float = 1e-10) -> np.ndarray:
     """Floquet multipliers of a known periodic motion y(t), by SciPy's implicit Radau method: for any drag and damping."""
     size = natural_sizes(p)
     n = size.size
@@ -155,7 +155,7 @@ def by_events(
     return Outcome(y, *map(float, largest)), changes
 
 
-def orbit_rotor_speed(p: Plain, omega: float, start: np.ndarray, speed: float) -> tuple[float, np.ndarray]:
+def orbit_rotor_speed(p: ReferenceModel, omega: float, start: np.ndarray, speed: float) -> tuple[float, np.ndarray]:
     """The rotor speed at which one load jams at the mean speed `omega`, by shooting over one turn, and the state at phi = 0.
 
     Unknown are q, q', phi' at phi = 0 and the rotor speed: as many as the motion has to repeat; `start`, `speed` begin.
@@ -187,7 +187,7 @@ def orbit_rotor_speed(p: Plain, omega: float, start: np.ndarray, speed: float) -
     return float(z[-1]), np.concatenate([z[: 2 * nd], [0.0], z[2 * nd : 2 * nd + 1]])
 
 
-def _turned(p: Plain, y: np.ndarray, speed: float, period: float) -> np.ndarray:
+def _turned(p: ReferenceModel, y: np.ndarray, speed: float, period: float) -> np.ndarray:
     now = replace(p, drive=_Constant(speed))
     found = solve_ivp(now.field, (0.0, period), y, method="DOP853", rtol=1e-12, atol=1e-14 * natural_sizes(now))
     return found.y[:, -1]
@@ -202,7 +202,7 @@ class _Constant:
         self.speed = speed
 
 
-def orbit_speed(p: Plain, low: float, high: float, start: np.ndarray, speed: float, nodes: int = 9) -> np.ndarray:
+def orbit_speed(p: ReferenceModel, low: float, high: float, start: np.ndarray, speed: float, nodes: int = 9) -> np.ndarray:
     """Load speeds between `low` and `high` at which one load jams at the scene's rotor speed, ascending, through a fold too.
 
     n(Omega) is single-valued there: it is found at Chebyshev points by shooting, from `start` and `speed` on, and interpolated.
@@ -214,7 +214,7 @@ def orbit_speed(p: Plain, low: float, high: float, start: np.ndarray, speed: flo
         speed, start = orbit_rotor_speed(p, float(w), start, speed)
         speeds.append(speed)
     curve = np.polynomial.chebyshev.Chebyshev.fit(omega, speeds, nodes - 1, domain=[low, high])
-    wanted, slope, grid = figure(p.drive, "speed"), curve.deriv(), np.linspace(low, high, 201)
+    wanted, slope, grid = number_of(p.drive, "speed"), curve.deriv(), np.linspace(low, high, 201)
     turns = [root(slope, a, b) for a, b in itertools.pairwise(grid) if slope(a) * slope(b) < 0.0]
     ends = np.unique([low, *turns, high])
     pairs = [(a, b) for a, b in itertools.pairwise(ends) if (curve(a) - wanted) * (curve(b) - wanted) < 0.0]

@@ -1,8 +1,7 @@
-"""The published toroidal balancer: its data, its tables, and its equations as printed."""
+"""Equations of the published toroidal balancer as printed, and its tables."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple, cast
 
 import equinox as eqx
@@ -10,27 +9,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.equations.dynamics import State
-from jaxvib.errors import InputError
-from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.rotor import PlanarRotor, planar_rotor
+from jaxvib.machine.rotor import PlanarRotor
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.torus import TorusBalls, in_torus, torus_balls
-from jaxvib.units import Number, number
+from jaxvib.machine.torus import TorusBalls, in_torus
+from papers.machines import ECCENTRICITY
 
-__all__ = [
-    "TABLES",
-    "PrintedTorus",
-    "PublishedRow",
-    "cosine_torus",
-    "gap_torus",
-    "printed_torus",
-    "published_scene",
-    "published_torus",
-]
-
-_SPEED, _ECCENTRICITY, _RADIUS, _TUBE, _DENSITY = 140.0, 1e-3, 0.2, 15e-3, 7812.0
+__all__ = ["TABLES", "PrintedTorus", "PublishedRow", "cosine_torus", "gap_torus", "printed_torus"]
 
 _TURN_WIDTH, _CLIMB_WIDTH = 0.02, 0.1
 """Width of the smoothed signs in the printed model: of psi' in w, of the velocity rho a' along the wall in e w."""
@@ -89,61 +75,6 @@ TABLES = (
 """Tables 1 and 2 of the paper: four rows, and two."""
 
 
-def published_torus(
-    gap: float,
-    *,
-    damping: float = 0.1,
-    stiffness: float = 0.01,
-    friction: float = 4e-5,
-    mass: Number = 7.0,
-    width: Number = 0.1,
-) -> Scene:
-    """The paper's vertical rotor with two balls in a torus.
-
-    **Arguments**: `gap` (R_1 - r)/e, above 0 and below 15; `damping` n = b/(M w); `stiffness` p = c/(M w^2); `friction` k m;
-    `mass` M kg of everything, balls included, which is not printed: 7.0 kg fits the tables; `width` m/s of `RollingFriction`.
-
-    **Returns** `Scene`, with this package's own equations; `printed_torus` gives the paper's for it.
-    **Raises** `InputError` for a gap, or a mass, that leaves no ball or no rotor.
-
-    >>> scene = published_torus(2.5)
-    >>> round(float(scene.loads.own_radius), 6), round(float(scene.machine.mass), 4)
-    (0.0125, 6.8722)
-
-    Source: Strautmanis et al. 2018, sections 2 and 3.
-    """
-    own = _TUBE - gap * _ECCENTRICITY
-    if not 0.0 < own < _TUBE:
-        raise InputError("gap", f"is {gap:g}; it must be between 0 and {_TUBE / _ECCENTRICITY:g}, where a ball has room")
-    ball = _DENSITY * 4.0 / 3.0 * math.pi * own**3
-    whole = number(mass, "kg", "mass", low=2.0 * ball, open_low=True)
-    return published_scene(gap, damping, stiffness, friction, whole, width)
-
-
-def published_scene(
-    gap: float | Array,
-    damping: float | Array,
-    stiffness: float | Array,
-    friction: float | Array,
-    whole: float | Array = 7.0,
-    width: Number = 0.1,
-) -> Scene:
-    """`published_torus` of numbers that nobody checks, so that JAX may transform them."""
-    own = _TUBE - gap * _ECCENTRICITY
-    ball = _DENSITY * 4.0 / 3.0 * math.pi * own**3
-    body = whole - 2.0 * ball
-    return Scene(
-        planar_rotor(mass=body, stiffness=stiffness * whole * _SPEED**2, damping=damping * whole * _SPEED),
-        torus_balls(count=2, mass=ball, radius=_RADIUS, tube=_TUBE, own_radius=own),
-        ConstantSpeed(_SPEED),
-        (
-            Gravity(0.5005 * _ECCENTRICITY * _SPEED**2, along="axis"),
-            StaticImbalance(body * _ECCENTRICITY),
-            RollingFriction(friction, width=width),
-        ),
-    )
-
-
 class PrintedTorus(eqx.Module):
     """The paper's equations (1)-(10), as far as they can be read, for a scene of `published_torus`.
 
@@ -155,7 +86,7 @@ class PrintedTorus(eqx.Module):
     equation with the sine of psi in place of its cosine, N (per mass) lacks the acceleration of the rotor, a ball's rolling
     adds inertia to second derivatives alone, and each coordinate has a friction of its own. The lever L of the friction up the
     tube is printed as R_1, although the contact force has the lever rho. R_1 is an error of physics, but no mere misprint: the
-    paper's tables come out nearer with it than with rho (`jaxvib.study.capture.tables`). For comparison with the paper only.
+    paper's tables come out nearer with it than with rho (`papers.torus_tables`). For comparison with the paper only.
 
     With R_1 the smoothed friction of the smallest ball is stiff, up to 116 w: steps that do not resolve it hide every capture
     (`jaxvib.study.capture.refinement`).
@@ -183,7 +114,7 @@ class PrintedTorus(eqx.Module):
         whole = self.machine.mass + loads.count * m
         pressed = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0) * self.friction / loads.own_radius
         slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / (_TURN_WIDTH * w))
-        stop = pressed * self.lever / gap**2 * jnp.tanh(gap * climb / (_CLIMB_WIDTH * _ECCENTRICITY * w))
+        stop = pressed * self.lever / gap**2 * jnp.tanh(gap * climb / (_CLIMB_WIDTH * ECCENTRICITY * w))
         lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin
         wrong = self.sine * self.imbalance * w**2 / whole * across * (lead_sin - lead_cos) / gap
         free_turn = (-2.0 * gap * across * climb * turn / arm - slow) / kappa

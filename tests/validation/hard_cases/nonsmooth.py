@@ -6,6 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hard_cases.case import Case, Reference
+from hard_cases.reference_integration import Event, by_events, natural_sizes
+from hard_cases.reference_model import number_of, reference_model
+from hard_cases.shared import away, compared_state, final_state
 from jaxvib.machine.drive import ConstantSpeed, Drive, RunUp
 from jaxvib.machine.effects.base import Effect, Gravity
 from jaxvib.machine.effects.contact import LoadContact
@@ -15,10 +19,6 @@ from jaxvib.machine.loads import balls, pendulums
 from jaxvib.machine.platforms import one_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.steps import Tolerance
-from jaxvib.study.stress.asked import away, compared_state, final_state
-from jaxvib.study.stress.case import Case, Reference
-from jaxvib.study.stress.motions import Event, by_events, natural_sizes
-from jaxvib.study.stress.plain import figure, plain
 
 __all__ = ["CASES", "stop_law"]
 
@@ -29,8 +29,8 @@ def stop_law(until: float, start: Start) -> Callable[[Scene], Reference]:
     """A stop above the only platform: it presses where the platform is beyond the gap and k x + c x' does not pull."""
 
     def reference(scene: Scene) -> Reference:
-        p, stop = plain(scene), next(e for e in scene.effects if e.kind == "stop")
-        k, c, gap = (figure(stop, name) for name in ("stiffness", "damping", "gap"))
+        p, stop = reference_model(scene), next(e for e in scene.effects if e.kind == "stop")
+        k, c, gap = (number_of(stop, name) for name in ("stiffness", "damping", "gap"))
 
         def beyond(t: float, y: np.ndarray) -> float:
             return y[0] - gap
@@ -61,9 +61,9 @@ def _contact(until: float, start: Start) -> Callable[[Scene], Reference]:
     """Two balls on one track: they press where their centres are nearer than 2 r and k d - c s' does not pull."""
 
     def reference(scene: Scene) -> Reference:
-        p, effect = plain(scene), next(e for e in scene.effects if e.kind == "load_contact")
-        own, radius = (figure(scene.loads, name) for name in ("own_radius", "radius"))
-        k, c = figure(effect, "stiffness"), figure(effect, "damping")
+        p, effect = reference_model(scene), next(e for e in scene.effects if e.kind == "load_contact")
+        own, radius = (number_of(scene.loads, name) for name in ("own_radius", "radius"))
+        k, c = number_of(effect, "stiffness"), number_of(effect, "damping")
 
         def gap(y: np.ndarray, pair: int) -> tuple[float, float, float]:
             """Distance beyond 2 r, its rate, and its slope by the angle between the two."""
@@ -110,9 +110,9 @@ def _dry(until: float, start: Start) -> Callable[[Scene], Reference]:
     """
 
     def reference(scene: Scene) -> Reference:
-        p, effect = plain(scene), next(e for e in scene.effects if e.kind == "dry_friction")
-        lever = 0.5 * figure(effect, "coefficient") * figure(effect, "diameter")
-        g = figure(p.effects["gravity"], "g") if "gravity" in p.effects else 0.0
+        p, effect = reference_model(scene), next(e for e in scene.effects if e.kind == "dry_friction")
+        lever = 0.5 * number_of(effect, "coefficient") * number_of(effect, "diameter")
+        g = number_of(p.effects["gravity"], "g") if "gravity" in p.effects else 0.0
         m, radius = float(p.m[0]), float(p.radius[0])
 
         def load(y: np.ndarray, a: float) -> float:
@@ -217,7 +217,7 @@ def _bent(
         name,
         hard=hard,
         quantity="state at the end of a run",
-        against="the sharp law from event to event, SciPy's DOP853 on the plain equations between them",
+        against="the sharp law from event to event, SciPy's DOP853 on the reference model between them",
         scene=scene,
         # the error that a run claims is its own, that of its smoothed friction is not in it
         answer=final_state(until, start, steps=_FINE, claims=law is not _dry)[0],

@@ -9,16 +9,16 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from hard_cases.case import Answer, Case, Reference
+from hard_cases.reference_integration import run_out
+from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
+from hard_cases.shared import away, compared_state, final_state, jam_case, published, run_case
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import pendulums
 from jaxvib.machine.platforms import two_mass
 from jaxvib.machine.scene import Scene
 from jaxvib.results.status import status_name
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.stress.asked import away, compared_state, final_state, jam_case, published, run_case
-from jaxvib.study.stress.case import Answer, Case, Reference
-from jaxvib.study.stress.motions import run_out
-from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = ["CASES", "begun"]
 
@@ -44,7 +44,7 @@ def _orbit(scene: Scene) -> Answer:
     """Load speed, and amplitudes in natural units, of the exact jam 3."""
     orbit = jam_orbit(scene, mode=3, throw=False)
     name = status_name(orbit.status)
-    p = plain(scene)
+    p = reference_model(scene)
     unit = np.sum(p.m * p.radius) / float(platforms(scene).mass[1])
     values = np.concatenate([[orbit.omega], orbit.amplitude / unit])
     return Answer(values, None, "" if name == "found" else name)  # its error is that of harmonics, rounding is not in it
@@ -52,17 +52,17 @@ def _orbit(scene: Scene) -> Answer:
 
 def _light_again(scene: Scene) -> Reference:
     """The same of light loads: it differs by the loads' share of the mass times the magnification, here some 1e-8."""
-    p, speed = plain(scene), float(scene.drive.speed)
+    p, speed = reference_model(scene), float(scene.drive.speed)
     omega = light_modes(p, speed)[0]
     _, moved, _ = light_speed(p, omega)
-    p = plain(scene)
+    p = reference_model(scene)
     unit = np.sum(p.m * p.radius) / p.mass[1, 1]
     return Reference(np.concatenate([[omega], np.abs(moved) / unit]), unknown=1e-7)
 
 
 def _many_once(scene: Scene) -> Reference:
     """Equal loads that start together are one: the run of a load of the same mass and drag in all."""
-    p = plain(scene)
+    p = reference_model(scene)
     alone = dataclasses.replace(
         p, m=np.array([np.sum(p.m)]), radius=p.radius[:1], drag=np.array([np.sum(p.drag)]), kappa=p.kappa[:1]
     )
@@ -75,7 +75,7 @@ def _many_once(scene: Scene) -> Reference:
 
 def _together(scene: Scene) -> np.ndarray:
     y = begun(scene)
-    nd, n = plain(scene).mass.shape[0], scene.loads.count
+    nd, n = reference_model(scene).mass.shape[0], scene.loads.count
     y[2 * nd : 2 * nd + n] = y[2 * nd]
     return y
 
@@ -89,7 +89,7 @@ def _following(scene: Scene) -> Answer:
 
 def _following_again(scene: Scene) -> Reference:
     """A rotor with a fixed imbalance: |D(n)^-1 S n^2|; the loads lag by 1e-9 of a radian."""
-    p, speed = plain(scene), float(scene.drive.speed)
+    p, speed = reference_model(scene), float(scene.drive.speed)
     _, moved, _ = light_speed(p, speed)
     return Reference([speed, *(np.abs(moved) * 1e3)], unknown=1e-8)
 
@@ -151,7 +151,7 @@ CASES = (
         "1000 loads",
         hard="2004 numbers in a state, a thousand small forces in a sum",
         quantity="state at the end of a run",
-        against="SciPy's DOP853 on the plain equations of one load of their mass",
+        against="SciPy's DOP853 on the reference model of one load of their mass",
         scene=lambda: published(eps=0.05 / 1000, beta=1.0, count=1000),
         answer=final_state(_UNTIL, _together)[0],
         reference=_many_once,

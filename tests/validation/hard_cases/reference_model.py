@@ -19,10 +19,10 @@ from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
 
-__all__ = ["Plain", "figure", "light_modes", "light_speed", "plain", "platforms", "root"]
+__all__ = ["ReferenceModel", "light_modes", "light_speed", "number_of", "platforms", "reference_model", "root"]
 
 
-def figure(part: object, name: str) -> float:
+def number_of(part: object, name: str) -> float:
     """A number of a load, an effect or a drive by its name: references know parts by what they are called, not by class."""
     return float(getattr(part, name))
 
@@ -34,14 +34,14 @@ def platforms(scene: Scene) -> Platforms:
 
 
 @dataclass(frozen=True)
-class Plain:
+class ReferenceModel:
     """The numbers of a scene of platforms: matrices (nd, nd), `at` the exciter's row, of the loads (N,) each, and effects."""
 
     mass: np.ndarray
     damping: np.ndarray
     stiffness: np.ndarray
-    bed_stiffness: np.ndarray
-    bed_damping: np.ndarray
+    foundation_stiffness: np.ndarray
+    foundation_damping: np.ndarray
     at: int
     m: np.ndarray
     radius: np.ndarray
@@ -60,11 +60,11 @@ class Plain:
     def rotor(self, t: float, y: np.ndarray) -> tuple[float, float, float]:
         """The rotor's angle, speed and acceleration (0 where a motor's is an unknown)."""
         drive = self.drive
-        kind, speed = drive.kind, figure(drive, "speed")
+        kind, speed = drive.kind, number_of(drive, "speed")
         if kind == "constant_speed":
             return speed * t, speed, 0.0
         if kind == "run_up":
-            rate = figure(drive, "acceleration")
+            rate = number_of(drive, "acceleration")
             end = speed / rate
             return (0.5 * rate * t**2, rate * t, rate) if t < end else (speed * (t - 0.5 * end), speed, 0.0)
         return float(y[-2]), float(y[-1]), 0.0
@@ -90,21 +90,21 @@ class Plain:
         torque = self.drag * self.radius**2 * (speed - rate)
         right[nd : nd + n] = torque
         if "gravity" in self.effects:
-            right[nd : nd + n] -= own * figure(self.effects["gravity"], "g") * np.cos(phi)
+            right[nd : nd + n] -= own * number_of(self.effects["gravity"], "g") * np.cos(phi)
         if "cubic_support" in self.effects:
-            right[0] -= figure(self.effects["cubic_support"], "stiffness") * q[0] ** 3
+            right[0] -= number_of(self.effects["cubic_support"], "stiffness") * q[0] ** 3
         thrown = self.effects.get("static_imbalance")
         if thrown is not None:
-            where = angle + figure(thrown, "angle")
-            moment = figure(thrown, "moment")
+            where = angle + number_of(thrown, "angle")
+            moment = number_of(thrown, "moment")
             right[self.at] += moment * (np.sin(where) * speed**2 - np.cos(where) * change)
             if motor:
                 matrix[self.at, -1] = matrix[-1, self.at] = moment * np.cos(where)
         if motor:
             drive = self.drive
-            matrix[-1, -1] = figure(drive, "inertia")
-            stall = figure(drive, "stall_torque")
-            right[-1] = stall * (1.0 - speed / figure(drive, "speed")) - np.sum(torque)
+            matrix[-1, -1] = number_of(drive, "inertia")
+            stall = number_of(drive, "stall_torque")
+            right[-1] = stall * (1.0 - speed / number_of(drive, "speed")) - np.sum(torque)
         return matrix, right
 
     def field(self, t: float, y: np.ndarray, press: float = 0.0) -> np.ndarray:
@@ -135,7 +135,7 @@ class Plain:
         return found
 
 
-def plain(scene: Scene) -> Plain:
+def reference_model(scene: Scene) -> ReferenceModel:
     """The scene's numbers in float64, as they are in its dtype."""
     machine, loads = platforms(scene), scene.loads
     assert isinstance(loads, CircularLoads)
@@ -154,10 +154,12 @@ def plain(scene: Scene) -> Plain:
     if loads.inertia is not None:
         kappa = 1.0 + get(loads.inertia) / (m * radius**2)
     effects = {effect.kind: effect for effect in scene.effects}
-    return Plain(np.diag(mass), damping, stiffness, k, c, machine.exciter - 1, m, radius, drag, kappa, scene.drive, effects)
+    return ReferenceModel(
+        np.diag(mass), damping, stiffness, k, c, machine.exciter - 1, m, radius, drag, kappa, scene.drive, effects
+    )
 
 
-def light_speed(p: Plain, omega: float) -> tuple[float, NDArray[np.complex128], float]:
+def light_speed(p: ReferenceModel, omega: float) -> tuple[float, NDArray[np.complex128], float]:
     """Of light loads together that turn at `omega`: the rotor speed n, the complex displacements (nd,), the force on the bed.
 
     n = w - w^4 S^2 Im A / (2 sum b R^2),    A the receptance at the exciter, S = sum m R
@@ -167,10 +169,10 @@ def light_speed(p: Plain, omega: float) -> tuple[float, NDArray[np.complex128], 
     answer = np.linalg.solve(p.stiffness - omega**2 * p.whole_mass + 1j * omega * p.damping, column)
     speed = omega - omega**4 * s**2 * answer[p.at].imag / (2.0 * np.sum(p.drag * p.radius**2))
     moved = s * omega**2 * answer
-    return speed, moved, abs(np.sum((p.bed_stiffness + 1j * omega * p.bed_damping) * moved))
+    return speed, moved, abs(np.sum((p.foundation_stiffness + 1j * omega * p.foundation_damping) * moved))
 
 
-def _excess(p: Plain, omega: float, speed: float) -> float:
+def _excess(p: ReferenceModel, omega: float, speed: float) -> float:
     """n(omega) - speed; infinite at a resonance that nothing damps."""
     try:
         return light_speed(p, omega)[0] - speed
@@ -178,7 +180,7 @@ def _excess(p: Plain, omega: float, speed: float) -> float:
         return np.inf
 
 
-def _excesses(p: Plain, omega: np.ndarray, speed: float) -> np.ndarray:
+def _excesses(p: ReferenceModel, omega: np.ndarray, speed: float) -> np.ndarray:
     """The same at many load speeds, in one call of LAPACK where no matrix is singular."""
     w = omega[:, None, None]
     column = np.zeros((p.mass.shape[0], 1))
@@ -191,7 +193,7 @@ def _excesses(p: Plain, omega: np.ndarray, speed: float) -> np.ndarray:
     return omega + torque / np.sum(p.drag * p.radius**2) - speed
 
 
-def light_modes(p: Plain, speed: float) -> np.ndarray:
+def light_modes(p: ReferenceModel, speed: float) -> np.ndarray:
     """All load speeds at which light loads jam at the rotor speed, ascending, rad/s: roots between points that crowd at the
     resonances down to their rounding, and folds."""
     squares = np.linalg.eigvals(np.linalg.solve(p.whole_mass, p.stiffness)).real

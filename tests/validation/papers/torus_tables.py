@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,30 +13,16 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.dynamics import State, vector_field
-from jaxvib.errors import require_one_of
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
 from jaxvib.motion.ensemble import Equations, ensemble
 from jaxvib.motion.steps import EqualSteps
-from jaxvib.results.fields import in_unit
-from jaxvib.results.result import Result
-from jaxvib.results.status import Computed
 from jaxvib.study.capture.capture import CAUGHT, thrown_state
-from jaxvib.study.capture.published_torus import (
-    TABLES,
-    PublishedRow,
-    cosine_torus,
-    gap_torus,
-    printed_torus,
-    published_scene,
-)
 from jaxvib.study.capture.refinement import DOUBLINGS, refine, steps_per_second
-from jaxvib.units import count, random_numbers
-
-if TYPE_CHECKING:
-    from jaxvib.draw.style import Drawn, Onto
+from papers.machines import TORUS_SPEED, published_torus
+from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, printed_torus
 
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
@@ -63,7 +49,7 @@ class _Runs(NamedTuple):
 
 
 def _alone(run: _Runs) -> tuple[Scene, State]:
-    scene = published_scene(run.gap, run.damping, run.stiffness, run.friction)
+    scene = published_torus(run.gap, damping=run.damping, stiffness=run.stiffness, friction=run.friction)
     return scene, thrown_state(scene, run.speed, run.shift)
 
 
@@ -103,7 +89,7 @@ TABLE_TOLERANCE = 0.011
 """Largest move of a border at a doubling of steps that counts as converged: 0.01 and half of the resolution."""
 
 
-class TorusTables(Result):
+class TorusTables(NamedTuple):
     """Points of the paper's tables 1 and 2 beside computed ones.
 
     **Attributes** (P points, M models):
@@ -124,24 +110,22 @@ class TorusTables(Result):
     narrower than the distance of the speeds `tried` stay unseen.
     """
 
-    status = Computed.done
-
-    damping: np.ndarray = eqx.field(metadata=in_unit("", "point"))
-    stiffness: np.ndarray = eqx.field(metadata=in_unit("", "point"))
-    friction: np.ndarray = eqx.field(metadata=in_unit("m", "point"))
-    gap: np.ndarray = eqx.field(metadata=in_unit("", "point"))
-    paper: np.ndarray = eqx.field(metadata=in_unit("", "point"))
-    models: tuple[str, ...] = eqx.field(metadata=in_unit("", "model"))
-    least: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    threshold: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    fraction: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    tried: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
-    captured: np.ndarray = eqx.field(metadata=in_unit("", "model", "point", "speed"))
-    steps_per_turn: np.ndarray = eqx.field(metadata=in_unit("", "model", "point"))
-    moved: np.ndarray = eqx.field(metadata=in_unit("", "model", "point", "border"))
-    resolution: Array = eqx.field(metadata=in_unit(""))
-    starts: Array = eqx.field(metadata=in_unit(""))
-    turns: Array = eqx.field(metadata=in_unit(""))
+    damping: np.ndarray
+    stiffness: np.ndarray
+    friction: np.ndarray
+    gap: np.ndarray
+    paper: np.ndarray
+    models: tuple[str, ...]
+    least: np.ndarray
+    threshold: np.ndarray
+    fraction: np.ndarray
+    tried: np.ndarray
+    captured: np.ndarray
+    steps_per_turn: np.ndarray
+    moved: np.ndarray
+    resolution: float
+    starts: int
+    turns: int
 
     def rows(self) -> list[np.ndarray]:
         """The points of each row of the tables, as indices."""
@@ -169,8 +153,8 @@ class TorusTables(Result):
         """For each row of the tables a line for each gap and model, for a person to read; "#" are captures, "." failures."""
         low, high, n = self.tried[0], self.tried[-1], self.tried.size
         lines = [
-            f"initial speeds captured in {int(self.turns)} turns: the least, all from; {n} speeds {low:g} .. {high:g};",
-            f"difference of the nearer one from the paper; share of {int(self.starts)} starts perturbed at the paper's speed;",
+            f"initial speeds captured in {self.turns} turns: the least, all from; {n} speeds {low:g} .. {high:g};",
+            f"difference of the nearer one from the paper; share of {self.starts} starts perturbed at the paper's speed;",
             "steps for a turn, and by how much their last doubling moved the two borders",
         ]
         for row in self.rows():
@@ -185,26 +169,6 @@ class TorusTables(Result):
                     steps = f"{self.steps_per_turn[m, i]:5.0f} " + " ".join(f"{x:6.3f}" for x in self.moved[m, i])
                     lines.append(f"{point}  {name:9s}{numbers}  {self.fraction[m, i]:5.2f}  {steps}  {pattern}")
         return "\n".join(lines)
-
-    def plot(self, *, ax: Onto = None) -> Drawn:
-        """The speeds nearest to the paper's over the gap, a panel for each row; onto as many axes `ax` where they are given.
-
-        **Returns** a matplotlib figure, or the given `ax`.
-        """
-        from jaxvib.draw.capture import tables_chart  # slow to import: only who draws pays
-
-        panels = [
-            (
-                f"n = {self.damping[row[0]]:g}, p = {self.stiffness[row[0]]:g}, k = {1e5 * self.friction[row[0]]:.0f}e-5 m",
-                self.gap[row],
-                {
-                    "paper": self.paper[row],
-                    **{name: (self.paper + self.difference[m])[row] for m, name in enumerate(self.models)},
-                },
-            )
-            for row in self.rows()
-        ]
-        return tables_chart(panels, ax=ax)
 
 
 def published_tables(
@@ -227,15 +191,6 @@ def published_tables(
     **Arguments**: `models` names of `MODELS`; `rows` of `TABLES`; `turns` of the rotor that each run takes; `starts`, all but
     the first moved along the ring, each ball by itself, by up to `spread` rad, by `seed`; `doublings` of the steps at most.
 
-    **Returns** `TorusTables`. **Raises** `InputError` for an unknown model.
-
-    >>> import jax; jax.config.update("jax_enable_x64", True)
-    >>> from jaxvib.study.capture.published_torus import TABLES
-    >>> row = TABLES[-1]._replace(gap=(5.1,), speed=(-0.868,))
-    >>> found = published_tables(["printed"], [row], turns=5, starts=1)
-    >>> found.paper.tolist(), found.threshold.shape, bool(found.converged[0, 0])
-    ([-0.868], (1, 1), True)
-
     By "printed" 35 of the 47 speeds come out within 0.05 of the paper, by "gap lever" 28 (`doublings=1`): the lever R_1 is
     wrong, but the tables come out nearer with it. The three smallest gaps that are far off, with the lesser friction, are slow:
     with n = 0.1 the gap of 0.5 is captured from -0.757 in 2000 turns and from -0.865 in 4000 (paper -0.857). At p = 0.010 and a
@@ -249,29 +204,26 @@ def published_tables(
 
     Source: Strautmanis et al. 2018, tables 1 and 2, where each speed has one start.
     """
-    for name in models:
-        require_one_of(name, MODELS, "models", "has")
     points = np.asarray(
         [(row.damping, row.stiffness, row.friction, *pair) for row in rows for pair in zip(row.gap, row.speed, strict=True)]
     )
     damping, stiffness, friction, gap, paper = points.T
-    shifts = random_numbers(seed).uniform(-spread, spread, (count(starts, "starts"), 2))
+    shifts = np.random.default_rng(seed).uniform(-spread, spread, (starts, 2))
     shifts[0] = 0.0
-    most, length = count(doublings, "doublings", low=0), count(turns, "turns")
 
     def column(model: _Model) -> list[np.ndarray]:
         """Borders (P, 2), outcomes of the first speeds (P, S), shares, steps for a turn, moves (P,)."""
         needed = np.array([_steps_per_second(model, *point[:4]) for point in points])
         found = refine(
-            lambda which, multiple: _scanned(model, points[which], multiple * needed[which], length),
+            lambda which, multiple: _scanned(model, points[which], multiple * needed[which], turns),
             lambda answer: answer[0],
             gap.size,
             TABLE_TOLERANCE,
-            most,
+            doublings,
         )
         steps = needed * found.multiple
-        fraction = np.mean(_tried(model, points, steps, np.tile(paper[:, None], (1, starts)), shifts, length), axis=1)
-        per_turn = steps * 2.0 * np.pi / _rotor_speed()
+        fraction = np.mean(_tried(model, points, steps, np.tile(paper[:, None], (1, starts)), shifts, turns), axis=1)
+        per_turn = steps * 2.0 * np.pi / TORUS_SPEED
         return [*map(np.stack, zip(*found.answers, strict=True)), fraction, per_turn, found.moved]
 
     borders, captured, fraction, per_turn, moved = map(np.stack, zip(*(column(MODELS[m]) for m in models), strict=True))
@@ -289,9 +241,9 @@ def published_tables(
         captured=captured,
         steps_per_turn=per_turn,
         moved=moved,
-        resolution=jnp.asarray((_GRID[1] - _GRID[0]) * _SHARES[0] ** _ROUNDS),
-        starts=jnp.asarray(starts),
-        turns=jnp.asarray(turns),
+        resolution=float((_GRID[1] - _GRID[0]) * _SHARES[0] ** _ROUNDS),
+        starts=starts,
+        turns=turns,
     )
 
 
@@ -346,11 +298,10 @@ def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.
     Runs go in blocks of one size, sorted by the steps they need, so that one program answers them all. Each block has a further
     run with numbers of its own: otherwise a number that all runs share would ask for another program.
     """
-    speed = _rotor_speed()
     order, size = np.argsort(-needed, kind="stable"), _LANES * len(jax.devices()) - 1
     gap, damping, stiffness, friction, still = (jnp.asarray([x]) for x in (7.5, 0.2, 0.02, 1e-5, 0.0))
     other = _Runs(gap, damping, stiffness, friction, still, jnp.asarray([[1e-3, 2e-3]]))
-    end, captured = 2.0 * np.pi * turns / speed, np.zeros(runs.gap.size, dtype=bool)
+    end, captured = 2.0 * np.pi * turns / TORUS_SPEED, np.zeros(runs.gap.size, dtype=bool)
     for begin in range(0, order.size, size):
         block = order[begin : begin + size]
         filled = np.concatenate([block, np.full(size - block.size, block[-1])])
@@ -359,7 +310,7 @@ def _outcomes(model: _Model, runs: _Runs, needed: np.ndarray, turns: int) -> np.
         ran = ensemble(
             model.make, values, end, stepsize_controller=steps, estimate=False, batch=_LANES, equations=model.equations
         )
-        slip = np.abs(np.asarray(ran.load_speed) / speed - 1.0)
+        slip = np.abs(np.asarray(ran.load_speed) / TORUS_SPEED - 1.0)
         captured[block] = (np.all(slip < CAUGHT, axis=1) & np.asarray(ran.finite))[: block.size]
     return captured
 
@@ -368,7 +319,3 @@ def _steps_per_second(model: _Model, damping: float, stiffness: float, friction:
     numbers = [jnp.asarray(x) for x in (gap, damping, stiffness, friction)]
     scene, _ = model.make(_Runs(*numbers, speed=jnp.zeros(()), shift=jnp.zeros(2)))
     return steps_per_second(scene, model.equations)
-
-
-def _rotor_speed() -> float:
-    return float(published_scene(1.0, 0.1, 0.01, 0.0).drive.speed)

@@ -8,6 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from hard_cases.case import Answer, Case, Reference
+from hard_cases.reference_integration import orbit_speed
+from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
+from hard_cases.shared import away, final_state, jam_case, light_force_slope, published, run_case
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.loads import balls
@@ -16,10 +20,6 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.study.stress.asked import away, final_state, jam_case, light_force_slope, published, run_case
-from jaxvib.study.stress.case import Answer, Case, Reference
-from jaxvib.study.stress.motions import orbit_speed
-from jaxvib.study.stress.plain import light_modes, light_speed, plain, platforms
 
 __all__ = ["CASES"]
 
@@ -39,7 +39,7 @@ def _exact(modes: tuple[int, ...]) -> tuple[Callable[[Scene], Answer], Callable[
         return Answer(speeds, max(float(orbit.error) for orbit in orbits), other[0] if other else "")
 
     def reference(scene: Scene) -> Reference:
-        p = plain(scene)
+        p = reference_model(scene)
         speed, moved, _ = light_speed(p, 1.0022684)
         start = np.concatenate([moved.imag, 1.0022684 * moved.real, [0.0, 1.0022684]])
         # slopes are 30 to 30,000 times as steep as the accuracy of shooting, 1e-13, is good for
@@ -61,11 +61,11 @@ def _force_slopes(scene: Scene) -> Answer:
 
 
 def _force_slopes_again(scene: Scene) -> Reference:
-    slowest = light_modes(plain(scene), float(scene.drive.speed))[0]
+    slowest = light_modes(reference_model(scene), float(scene.drive.speed))[0]
     return Reference(light_force_slope(scene, slowest), unknown=1e-8)
 
 
-def _bed_only(speed: float = 3.0) -> Scene:
+def _foundation_only(speed: float = 3.0) -> Scene:
     """The published machine with a link that is not there: only the exciter's platform can move."""
     return published(speed, link_natural=0.0, link_damping=0.0)
 
@@ -96,7 +96,7 @@ def _frequencies(scene: Scene) -> Answer:
 
 def _frequencies_again(scene: Scene) -> Reference:
     """By a symmetric eigenproblem; the sum of squares is the trace of M^-1 K, whose derivatives are inverse masses."""
-    p = plain(scene)
+    p = reference_model(scene)
     mass = np.diag(p.whole_mass)
     root = np.sqrt(mass)
     found = np.sqrt(np.linalg.eigvalsh(p.stiffness / root[:, None] / root))
@@ -133,24 +133,24 @@ CASES = (
     jam_case(
         "no damping at all",
         hard="the vibration has no bound at a resonance, and no torque away from it",
-        scene=lambda: published(damping=(0.0, 0.0), link_damping=0.0),
+        scene=lambda: published(damping=0.0),
         named=(("unbounded",), ("unbounded",)),
     ),
     jam_case(
         "damping 1e-8 of critical",
         hard="peaks 1e-8 wide and 1e8 high, which no even grid sees",
         against="roots of n(Omega) between points that crowd to 1e-15 of the resonances",
-        scene=lambda: published(damping=(1e-8, 1e-8), link_damping=1e-8),
+        scene=lambda: published(damping=1e-8),
     ),
     jam_case(
         "overdamped, modes",
         hard="no resonance is left: folds vanish, and one mode remains",
-        scene=lambda: published(damping=(5.0, 5.0), link_damping=5.0),
+        scene=lambda: published(damping=5.0),
     ),
     run_case(
         "overdamped, run",
         hard="decay rates 2e4 apart make the equations stiff",
-        scene=lambda: published(damping=(50.0, 50.0), link_damping=50.0, eps=0.05),
+        scene=lambda: published(damping=50.0, eps=0.05),
         answer=_RUN,
         reference=_RUN_AGAIN,
         within=(1e-6, 1e-2),
@@ -168,7 +168,7 @@ CASES = (
     jam_case(
         "link of stiffness 0",
         hard="a platform that nothing shakes: a resonance that no load feels",
-        scene=_bed_only,
+        scene=_foundation_only,
     ),
     Case(
         "link of 1e-9, gradient",

@@ -1,1 +1,0 @@
-"""Every number that the source papers print, beside the one that this package computes."""
