@@ -6,7 +6,7 @@ OUT ?= out/demo
 JAXVIB = $(BIN)/jaxvib
 EXAMPLE = examples/antiphase
 
-.PHONY: demo test test-slow test-versions check docs bench-guard clean
+.PHONY: demo test test-slow validate test-versions check docs bench-guard clean
 
 demo: $(VENV)/installed-demo
 	@echo "--- how the first drawing can jam"
@@ -22,7 +22,12 @@ test: $(VENV)/installed
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(VENV)/installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow --ignore=tests/validation
+
+# All hard cases and all numbers of the papers, and the tables of both in the documentation; errors and times go into a file.
+validate: $(VENV)/installed
+	PYTHONPATH=tests/helpers $(BIN)/python tests/validation/docs_tables.py
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow" --junitxml=out/validation.xml tests/validation
 
 # The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
 LOWEST_PYTHON ?= python3.11

@@ -23,8 +23,8 @@ import jax.numpy as jnp  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
+from machines import published_rotor, published_torus  # noqa: E402
 from parts.common import machine_line  # noqa: E402
-from parts.machines import published_rotor, published_torus  # noqa: E402
 
 from jaxvib.cli.study.audit import audit_text  # noqa: E402
 from jaxvib.study.audit.numbers import gravity_share  # noqa: E402

@@ -25,8 +25,8 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
+from machines import published_rotor  # noqa: E402
 from parts.common import machine_line, published  # noqa: E402
-from parts.machines import published_rotor  # noqa: E402
 
 from jaxvib.cli.study.cost import cost_document, cost_table  # noqa: E402
 from jaxvib.study.accuracy.cost import WANTED  # noqa: E402

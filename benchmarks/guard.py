@@ -33,9 +33,9 @@ jax.config.update("jax_enable_compilation_cache", False)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from machines import published_rotor  # noqa: E402
 from parts import native  # noqa: E402
 from parts.common import best, first, flat, machine_line, published, thrown  # noqa: E402
-from parts.machines import published_rotor  # noqa: E402
 
 RECORD = Path(__file__).with_suffix(".json")
 

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
-from parts.machines import published_rotor
+from machines import published_rotor
 
 import jaxvib as jv
 

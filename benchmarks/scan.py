@@ -26,8 +26,8 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
 from jax.extend import core  # noqa: E402
+from machines import published_rotor  # noqa: E402
 from parts.common import busy, machine_line  # noqa: E402
-from parts.machines import published_rotor  # noqa: E402
 
 from jaxvib.errors import InputError  # noqa: E402
 from jaxvib.motion.analysis.measure import measure  # noqa: E402

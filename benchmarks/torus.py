@@ -27,9 +27,9 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from machines import CONTACT, MODELS, published_tables, published_torus  # noqa: E402
 from parts import native_torus  # noqa: E402
 from parts.common import machine_line  # noqa: E402
-from parts.machines import CONTACT, MODELS, published_tables, published_torus  # noqa: E402
 
 from jaxvib.study.capture.capture import thrown_state  # noqa: E402
 from jaxvib.study.capture.refinement import DOUBLINGS  # noqa: E402

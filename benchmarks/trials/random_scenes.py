@@ -39,8 +39,7 @@ import jaxvib as jv
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.results.status import status_name
 
-TESTS = pathlib.Path(__file__).parents[2] / "tests"
-sys.path[:0] = [str(TESTS / "helpers"), str(TESTS / "validation")]
+sys.path[:0] = [str(pathlib.Path(__file__).parents[2] / "tests" / name) for name in ("helpers", "validation")]
 
 from hard_cases.reference_integration import multipliers, run_out  # noqa: E402
 from hard_cases.reference_model import ReferenceModel, light_modes, light_speed, number_of, reference_model  # noqa: E402
@@ -52,13 +51,7 @@ PATIENCE = 60.0
 """Seconds that no answer may take, of the processor: others who use it do not count."""
 
 WORDS = (
-    "nan",
-    "inf",
-    "1e400",
-    "-1",
-    "0",
-    "1e-320",
-    "true",
+    *("nan", "inf", "1e400", "-1", "0", "1e-320", "true"),
     '""',
     "[]",
     "{}",

@@ -22,7 +22,7 @@ def forced(cubic, stiffness):
 
 
 def test_a_strange_attractor_is_named():
-    """Ueda's; `jaxvib stress` compares its exponent with SciPy's, over more turns."""
+    """Ueda's; the validation compares its exponent with SciPy's, over more turns."""
     scene, start = forced(1.0, 1e-6)
     found = jv.growth(scene, 4800.0, start=start, stretches=160)
     assert found.status_name == "chaotic" and 0.05 < found.exponent < 0.2

@@ -225,7 +225,7 @@ CASES = (
     ),
     Case(
         "energy over 1e4 turns",
-        hard="nothing is lost and nothing forgotten: what steps add or take stays",
+        hard="no losses: the errors of all steps add up",
         quantity="energy at the end",
         against="energy at the start",
         scene=_lossless,
@@ -243,7 +243,7 @@ CASES = (
     ),
     run_case(
         "run-up through the resonance, slow",
-        hard="the load is caught at the resonance, or not: a passage decides over what comes after",
+        hard="the load is caught at the resonance or not: the passage decides about the later motion",
         scene=lambda: _passing(RunUp(60.0, acceleration=3.0)),
         answer=_SLOW[0],
         reference=_SLOW[1],
@@ -251,7 +251,7 @@ CASES = (
     ),
     run_case(
         "motor caught by the resonance",
-        hard="the rotor itself gets stuck: its speed is an unknown that the vibration acts on",
+        hard="the rotor itself is caught: its speed is an unknown on which the vibration acts",
         scene=lambda: _passing(DCMotor(60.0, stall_torque=3.0, inertia=0.2)),
         answer=_STALLED[0],
         reference=_STALLED[1],
@@ -269,7 +269,7 @@ CASES = (
     ),
     Case(
         "gradient of a long run",
-        hard="a derivative is carried through 1500 units of time; in a jam that attracts it settles as the motion does",
+        hard="the derivative runs through 1500 units of time; in a stable jam it converges as the motion does",
         quantity="derivatives of the load speed at the end by each support's stiffness",
         against="shooting: -(dn/dk)/(dn/dOmega)",
         scene=lambda: published(eps=0.05),
@@ -279,7 +279,7 @@ CASES = (
     ),
     Case(
         "chaos, growth of derivatives",
-        hard="no derivative of a long run means anything, however exactly it is computed: this has to be said",
+        hard="derivatives of a long run are meaningless, however exactly they are computed: a status has to say so",
         quantity="largest Lyapunov exponent of Ueda's attractor",
         against="SciPy's DOP853 on its variational equation",
         scene=_ueda,
@@ -289,9 +289,9 @@ CASES = (
     ),
     Case(
         "chaos, gradient of a run",
-        hard="forward mode gives 17 digits of a number that says nothing of any change larger than rounding",
+        hard="forward mode gives 17 digits of a number that describes no change larger than rounding",
         quantity="derivative of the displacement after 100 turns by the damping, checked",
-        against="nothing: there is no right answer but a name",
+        against="no right answer exists, only a status",
         scene=_ueda,
         answer=_meaningless,
         reference=lambda scene: Reference([0.0]),

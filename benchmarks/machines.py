@@ -3,7 +3,7 @@
 import pathlib
 import sys
 
-sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "tests" / "validation"))
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests" / "validation"))
 
 from papers.machines import published_rotor, published_torus
 from papers.torus_tables import CONTACT, MODELS, published_tables
