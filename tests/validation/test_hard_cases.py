@@ -30,14 +30,12 @@ FAST = {
 """Cases that compile little; the others are part of `make validate`."""
 
 
-def questions():
-    for case in CASES:
-        for precision in PRECISIONS:
-            marks = () if (case.name, precision) in FAST else pytest.mark.slow
-            yield pytest.param(case, precision, marks=marks, id=f"{case.name}-{precision}")
+def question(case, precision):
+    marks = () if (case.name, precision) in FAST else pytest.mark.slow
+    return pytest.param(case, precision, marks=marks, id=f"{case.name}-{precision}")
 
 
-@pytest.mark.parametrize(("case", "precision"), questions())
+@pytest.mark.parametrize(("case", "precision"), [question(case, precision) for case in CASES for precision in PRECISIONS])
 def test_hard_case(case, precision, record_property):
     found = outcome(case, precision)
     for name in ("status", "error", "claimed"):
