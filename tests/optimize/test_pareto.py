@@ -10,7 +10,7 @@ from scenes import scene
 
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, foundation_force, pareto, total_mass
-from optimize.pareto import not_dominated
+from optimize.pareto import Front, not_dominated
 
 SCENE = scene("two_mass", speed=120.0)
 TWO = {"machine.stiffness": (1e4, 9e4, "even")}
@@ -95,3 +95,23 @@ def test_not_dominated_rows_are_those_of_all_comparisons():
     near = np.array([[1.0, 5.0], [1.0 + 1e-8, 5.0 - 1e-8], [2.0, 1.0]])
     assert len(not_dominated(near)) == 2
     assert not_dominated(np.array([[3.0, -1.0]])) == [0] and not_dominated(np.array([[0.0, 2.0], [0.0, 1.0]])) == [1]
+
+
+def test_rows_alike_within_what_searches_keep_count_once():
+    """1e-7 of the largest value of a column that hardly changes, 1e-6 of the range of one that does."""
+    assert not_dominated(np.array([[1e6, 2.0], [1e6 + 0.05, 1.0]])) == [1]
+    assert not_dominated(np.array([[1e6, 2.0], [1e6 + 0.2, 1.0]])) == [0, 1]
+    assert not_dominated(np.array([[0.0, 2.0], [5e-7, 1.0], [1.0, 0.0]])) == [1, 2]
+    assert not_dominated(np.array([[0.0, 2.0], [2e-6, 1.0], [1.0, 0.0]])) == [0, 1, 2]
+
+
+def test_the_figure_of_a_front_has_the_first_quantity_upward():
+    values = np.array([[10.0, 3e-3], [20.0, 2e-3], [40.0, 1e-3]])
+    front = Front(values=values, names=("mass", "sag"), units=("kg", "m"), machines=("a", "b", "c"))
+    axis = front.plot().axes[0]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("sag, mm", "mass, kg")
+    shown = values[:, ::-1] * [1e3, 1.0]
+    np.testing.assert_allclose(axis.lines[0].get_xydata(), shown[::-1], rtol=1e-12)
+    assert [text.get_text() for text in axis.texts] == ["0", "1", "2"]
+    np.testing.assert_allclose([text.xy for text in axis.texts], shown, rtol=1e-12)
+    assert front.summary().splitlines()[:2] == ["mass, kg against sag, mm", "  10  3"]
