@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import Tables, called, closest, load_scene, out_of_place, read_toml
+from jaxvib.machine.files import Tables, build_part, load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.units import count, number
 from optimize.quantities import jams, machine, motion
 from optimize.quantities.cases import expected, worst
@@ -72,7 +72,7 @@ def load_design(path: str | Path) -> Design:
     tables = read_toml(path)
     for name in tables:
         if name not in _SECTIONS:
-            raise out_of_place(name, tables, "design", _SECTIONS)
+            raise misplaced_name(name, tables, "design", _SECTIONS)
     for name in ("scene", "free", "objective"):
         if name not in tables and not (name == "free" and "choices" in tables):
             raise InputError(name, "is missing; a design file needs scene, [free] and [objective]")
@@ -100,7 +100,7 @@ def load_design(path: str | Path) -> Design:
     allowed = ["starts", "seed", "iterations", "rate", "polishing", "searcher"]
     for name, value in search.items():
         if name not in allowed:
-            raise InputError(f"search.{name}", f"is no field here; {closest(name, allowed)}")
+            raise InputError(f"search.{name}", f"is no field here; {suggest_name(name, allowed)}")
         if name == "searcher":
             require_searcher(value)
             continue
@@ -131,7 +131,7 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
     name = table.get("quantity")
     if not isinstance(name, str) or name not in _QUANTITIES:
         problem = "is missing" if name is None else f"is {name!r}"
-        raise InputError(f"{section}.quantity", f"{problem}; {closest(str(name), list(_QUANTITIES))}")
+        raise InputError(f"{section}.quantity", f"{problem}; {suggest_name(str(name), list(_QUANTITIES))}")
     own = (*more, "tolerances", "statistic", "samples")
     values = {k: v for k, v in table.items() if k not in ("quantity", *own)}
     for key in ("of", "prices"):
@@ -139,11 +139,11 @@ def quantity_from_table(table: object, section: str, more: tuple[str, ...]) -> t
             values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in values[key])
     if "mode" in values:
         count(values["mode"], f"{section}.mode")
-    quantity = called(_QUANTITIES[name], values, section)
+    quantity = build_part(_QUANTITIES[name], values, section)
     if "tolerances" in table:
         how = table.get("statistic", "expected")
         if not isinstance(how, str) or how not in _STATISTICS:
-            raise InputError(f"{section}.statistic", f"is {quoted(how)}; {closest(str(how), list(_STATISTICS))}")
+            raise InputError(f"{section}.statistic", f"is {quoted(how)}; {suggest_name(str(how), list(_STATISTICS))}")
         quantity = _STATISTICS[how](quantity, table["tolerances"], samples=table.get("samples", 64))
     return quantity, {k: table[k] for k in more if k in table}
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import rebuilt
+from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene
 from optimize.space.numbers import Place, changed, names_of, places_of, shown_unit
 
@@ -101,7 +101,7 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
     if loads.count == scene.loads.count:
         return scene
     more = dataclasses.replace(scene.loads, count=loads.count)
-    return Scene(scene.machine, rebuilt(more, "loads"), scene.drive, scene.effects)
+    return Scene(scene.machine, rebuild_part(more, "loads"), scene.drive, scene.effects)
 
 
 def _has(scene: Scene, name: str) -> bool:

@@ -1,4 +1,4 @@
-"""Scene files: TOML in and out."""
+"""Scene files: reading and writing of TOML."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ __all__ = [
     "SECTIONS",
     "TEMPLATES",
     "Tables",
-    "called",
-    "closest",
+    "build_part",
     "load_scene",
-    "out_of_place",
+    "misplaced_name",
     "read_toml",
-    "rebuilt",
+    "rebuild_part",
     "save_scene",
     "scene_from_toml",
     "scene_to_toml",
+    "suggest_name",
 ]
 
 _MACHINES = {
@@ -64,19 +64,22 @@ SECTIONS: dict[str, Mapping[str, Callable[..., Any]]] = {"machine": _MACHINES, "
 T = TypeVar("T")
 
 Tables: TypeAlias = dict[str, Any]
-"""What a file holds, read and not yet looked at: tables, arrays, texts, numbers, by name."""
+"""Content of a file before its validation: tables, arrays, texts, numbers, by name."""
 
 
-def closest(name: str, allowed: list[str]) -> str:
-    """The end of an error message about a name: what was probably meant, and what is allowed."""
+def suggest_name(name: str, allowed: list[str]) -> str:
+    """Return the end of an error message about a name: the most similar allowed name, and all allowed names."""
     near = difflib.get_close_matches(name, allowed, n=1)
     meant = f"did you mean {near[0]!r}? " if near else ""
     return f"{meant}allowed: {', '.join(allowed)}"
 
 
 def read_toml(path: str | Path) -> Tables:
-    """The tables of a TOML file. **Raises** `InputError` for a file that is missing, no TOML, or not written by hand: larger
-    than 16 MB, nested too deep, with control characters or numbers of thousands of digits."""
+    """Return the tables of a TOML file.
+
+    **Raises** `InputError` for a file that is missing, is not TOML, is larger than 16 MB, is nested too deep, or has control
+    characters or numbers of thousands of digits.
+    """
     return _tables(read_text(path, "a TOML file, in UTF-8 as `jaxvib new ... --out DIR` writes it"), str(path))
 
 
@@ -89,13 +92,13 @@ def _tables(text: str, name: str) -> Tables:
         raise
     except RecursionError as error:
         raise InputError(name, "is nested too deep; the files of jaxvib need four levels") from error
-    except ValueError as error:  # no TOML, or a number of more digits than Python reads
+    except ValueError as error:  # not TOML, or a number with more digits than Python reads
         raise InputError(name, f"is no TOML file: {error}") from error
     return tables
 
 
 def _require_plain(value: object, name: str) -> None:
-    """**Raises** `InputError` for control characters in names and texts: they would steer the terminal that shows them."""
+    """**Raises** `InputError` for control characters in names and texts, which a terminal would obey."""
     if isinstance(value, Mapping):
         for key, entry in value.items():
             _require_plain(key, name)
@@ -113,18 +116,18 @@ _MARKS = {
     "study": ("axes", "measure"),
     "measurement": ("record", "pendulum", "identify"),
 }
-"""Names by which each kind of file is known."""
+"""Names that identify each kind of file."""
 
 
-def out_of_place(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
-    """What is said of a `name` that a file of that `kind` has no use for: what was meant, or that it is a file of another kind.
+def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> InputError:
+    """Return the error for an unknown `name` in a file of a `kind`: a similar name, or the kind of file that it is instead.
 
-    >>> str(out_of_place("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
+    >>> str(misplaced_name("machine", {"machine": {}}, "design", ["free"])).split(";")[0]
     'machine is no part of a design file: this is a scene file'
     """
     other = next((each for each, marks in _MARKS.items() if each != kind and any(mark in tables for mark in marks)), None)
     if other is None or any(mark in tables for mark in _MARKS[kind]):
-        return InputError(name, f"is no part of a {kind} file; {closest(name, allowed)}")
+        return InputError(name, f"is no part of a {kind} file; {suggest_name(name, allowed)}")
     if kind == "scene":
         return InputError(name, f"is no part of a scene file: this is a {other} file; give the scene file that it is about")
     new = "sweep" if kind == "study" else kind
@@ -133,12 +136,11 @@ def out_of_place(name: str, tables: Tables, kind: str, allowed: list[str]) -> In
 
 @validated
 def load_scene(path: str | Path) -> Scene:
-    """Reads a scene file, see `scene_from_toml`.
+    """Read a scene file, see `scene_from_toml`.
 
     **Arguments**: `path` of a TOML file.
 
-    **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for everything that is wrong in it, field
-    named.
+    **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for each error in it, naming the field.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> from jaxvib.machine.files import TEMPLATES
@@ -152,11 +154,11 @@ def load_scene(path: str | Path) -> Scene:
 
 @validated
 def save_scene(scene: Scene, path: str | Path) -> Path:
-    """Writes a scene file that `load_scene` reads back bit for bit.
+    """Write a scene file that `load_scene` reads back bit for bit.
 
     **Arguments**: `scene`; `path` of the file, which is overwritten.
 
-    **Returns** its path. **Raises** `InputError` where it cannot be written.
+    **Returns** its path. **Raises** `InputError` if it cannot be written.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -173,10 +175,10 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
 
 @validated
 def scene_from_toml(text: str) -> Scene:
-    """A scene from the text of a scene file.
+    """Return the scene of the text of a scene file.
 
     Tables `[machine]`, `[loads]`, `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit;
-    `[effects]` names only what the scene calls for, `gravity = true` or a table of the effect's arguments.
+    `[effects]` names only the effects of the scene, as `gravity = true` or as a table of the effect's arguments.
 
     **Returns** `Scene`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not
     allowed.
@@ -205,10 +207,10 @@ def scene_from_toml(text: str) -> Scene:
 
 
 def scene_from_tables(tables: Tables) -> Scene:
-    """A scene from the tables of a scene file, see `scene_from_toml`."""
+    """Return the scene of the tables of a scene file, see `scene_from_toml`."""
     for name in tables:
         if name not in (*SECTIONS, "effects"):
-            raise out_of_place(name, tables, "scene", [*SECTIONS, "effects"])
+            raise misplaced_name(name, tables, "scene", [*SECTIONS, "effects"])
     parts = {}
     for name, kinds in SECTIONS.items():
         if name not in tables:
@@ -220,13 +222,13 @@ def scene_from_tables(tables: Tables) -> Scene:
         raise InputError("effects", "is not a table; write [effects] and below it, for example, gravity = true")
     for name, value in chosen.items():
         if name not in EFFECTS:
-            raise InputError(f"effects.{name}", f"is no effect; {closest(name, list(EFFECTS))}")
+            raise InputError(f"effects.{name}", f"is no effect; {suggest_name(name, list(EFFECTS))}")
         if isinstance(value, Mapping):
-            effects.append(called(EFFECTS[name], value, f"effects.{name}"))
+            effects.append(build_part(EFFECTS[name], value, f"effects.{name}"))
         elif isinstance(value, list) and EFFECTS[name].repeatable and all(isinstance(each, Mapping) for each in value):
-            effects += [called(EFFECTS[name], each, f"effects.{name}[{index}]") for index, each in enumerate(value)]
+            effects += [build_part(EFFECTS[name], each, f"effects.{name}[{index}]") for index, each in enumerate(value)]
         elif value is True:
-            effects.append(called(EFFECTS[name], {}, f"effects.{name}"))
+            effects.append(build_part(EFFECTS[name], {}, f"effects.{name}"))
         elif value is not False:
             raise InputError(f"effects.{name}", f"is {quoted(value)}; write true, false or a table of its arguments")
     return Scene(**parts, effects=tuple(effects))
@@ -239,28 +241,28 @@ def _built(table: object, section: str, kinds: Mapping[str, Callable[..., T]]) -
         raise InputError(f"{section}.kind", f"is missing; allowed: {', '.join(kinds)}")
     kind = table["kind"]
     if not isinstance(kind, str) or kind not in kinds:
-        raise InputError(f"{section}.kind", f"is {quoted(kind)}; {closest(str(kind), list(kinds))}")
-    return called(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
+        raise InputError(f"{section}.kind", f"is {quoted(kind)}; {suggest_name(str(kind), list(kinds))}")
+    return build_part(kinds[kind], {k: v for k, v in table.items() if k != "kind"}, section)
 
 
-def called(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
-    """`build(**values)`, with every unknown or missing name said as a field of `section`. **Raises** `InputError`."""
+def build_part(build: Callable[..., T], values: Mapping[str, object], section: str) -> T:
+    """Return `build(**values)`. **Raises** `InputError` for unknown and missing names, as fields of `section`."""
     parameters = inspect.signature(build).parameters
     for name in values:
         if name not in parameters:
-            raise InputError(f"{section}.{name}", f"is no field here; {closest(name, list(parameters))}")
+            raise InputError(f"{section}.{name}", f"is no field here; {suggest_name(name, list(parameters))}")
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in values:
             raise InputError(f"{section}.{name}", f"is missing; needed here: {', '.join(_needed(parameters))}")
     return build(**values)
 
 
-def rebuilt(part: Any, section: str) -> Any:
-    """A part of a scene made anew from its numbers by its constructor, which checks them; itself where no file can hold it."""
+def rebuild_part(part: Any, section: str) -> Any:
+    """Build a part of a scene again from its numbers, which validates them. Parts from outside the package are returned."""
     build = {**_MACHINES, **_LOADS, **DRIVES, **EFFECTS}.get(part.kind)
     if build is None or not all(hasattr(part, name) for name in inspect.signature(build).parameters):
         return part
-    return called(build, _fields(part, build), section)
+    return build_part(build, _fields(part, build), section)
 
 
 def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
@@ -269,7 +271,7 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
 
 @validated
 def scene_to_toml(scene: Scene) -> str:
-    """The text of a scene file in SI numbers; `scene_from_toml` gives the same scene, bit for bit.
+    """Return the text of a scene file in SI numbers; `scene_from_toml` returns the same scene, bit for bit.
 
     **Returns** text.
 
@@ -279,7 +281,7 @@ def scene_to_toml(scene: Scene) -> str:
     >>> jv.scene_to_toml(scene).splitlines()[:3]
     ['[machine]', 'kind = "one_mass"', 'mass = 50.0']
     """
-    import tomli_w  # only where a file is written
+    import tomli_w  # slow import
 
     require_known(scene, "scene", "scene_to_toml", "write the scene outside")
     tables: dict[str, Tables] = {}
@@ -300,7 +302,7 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
     fields: Tables = {}
     for name in inspect.signature(build).parameters:
         value = getattr(part, name)
-        if value is None:  # an option that was not taken
+        if value is None:  # an option that is not set
             continue
         if isinstance(value, tuple):
             fields[name] = [list(pair) for pair in value]
@@ -309,7 +311,7 @@ def _fields(part: object, build: Callable[..., object]) -> Tables:
         else:
             # A machine's single value is written as a number; one load's own value stays a list, apart from a shared one.
             plain = when_known(partial(_plain, unwrap=isinstance(part, Machine)), value)
-            fields[name] = value if plain is None else plain  # a value that is not known is for the constructor, no file
+            fields[name] = value if plain is None else plain  # a traced value is for the constructor, not for a file
     return fields
 
 
@@ -325,14 +327,14 @@ count = 3
 mass = "800 g"              # of one load
 radius = "120 mm"           # of the circle of the loads' centres
 drag = "1.5 N s/m"          # viscous resistance of one load against the rotor, at that radius
-# own_radius = "20 mm"      # of a ball or roller: collected loads then lie side by side, else at one point
+# own_radius = "20 mm"      # of a ball or roller: gathered loads lie side by side, otherwise at one point
 # inertia = 0.0             # kg m^2 about the mass centre, pendulums only
 
 [drive]
 kind = "constant_speed"     # constant_speed, spin_up, run_up, dc_motor, induction_motor
 speed = "{speed}"
 
-[effects]                   # only what the scene calls for; an empty table is the usual case
+[effects]                   # only those of the scene; an empty table is the usual case
 # gravity = true            # gravity on the loads
 # static_imbalance = {{ moment = "5 g m" }}
 # cubic_support = [{{ stiffness = 1e9, platform = 1 }}]
@@ -388,4 +390,4 @@ exciter = 4                           # the platform with the auto-balancer
     **ROTORS,
     "torus": TORUS,
 }
-"""A commented scene file for every kind of machine, and for a rotor whose balls run in a torus."""
+"""Commented scene files for every kind of machine, and for a rotor with balls in a torus."""

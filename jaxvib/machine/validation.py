@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.boundary import call_user
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import rebuilt
+from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, require_comparable
 from jaxvib.runtime.compat import evaluating
 from jaxvib.units import bounds_of_unknowns, require_real
@@ -82,9 +82,9 @@ def allowed_unknowns(scene: Scene) -> Array | None:
 def _rebuild(scene: Scene) -> None:
     """Build each part of a scene once more. **Raises** `InputError` for a known number that is not allowed."""
     for section in ("machine", "loads", "drive"):
-        rebuilt(getattr(scene, section), section)
+        rebuild_part(getattr(scene, section), section)
     for effect in scene.effects:
-        rebuilt(effect, f"effects.{effect.kind}")
+        rebuild_part(effect, f"effects.{effect.kind}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import EFFECTS, SECTIONS, closest
+from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
 
 __all__ = ["GROUPS", "Argument", "arguments_of", "described", "units_of_fields"]
 
@@ -119,9 +119,9 @@ def _shown(value: object) -> str:
 def described(group: str, name: str) -> Callable[..., object]:
     """Class or function that builds the part of that name. **Raises** `InputError` for a group or a name that there is not."""
     if group not in GROUPS:
-        raise InputError("group", f"is {quoted(group)}; {closest(group, list(GROUPS))}")
+        raise InputError("group", f"is {quoted(group)}; {suggest_name(group, list(GROUPS))}")
     if name not in GROUPS[group]:
-        raise InputError("name", f"is {quoted(name)}; {closest(name, list(GROUPS[group]))}")
+        raise InputError("name", f"is {quoted(name)}; {suggest_name(name, list(GROUPS[group]))}")
     return GROUPS[group][name]
 
 

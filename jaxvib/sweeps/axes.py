@@ -13,7 +13,7 @@ from jax import Array
 
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import closest
+from jaxvib.machine.files import suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.units import Number, count, number
@@ -162,7 +162,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
         for key in spec:
             if key not in _KEYS:
                 hint = f'; write the whole name in quotes, "{name}.{key}"' if not {"from", "to"} & set(spec) else ""
-                raise InputError(f"axes.{name}.{key}", f"is no field of an axis{hint}; {closest(key, _KEYS)}")
+                raise InputError(f"axes.{name}.{key}", f"is no field of an axis{hint}; {suggest_name(key, _KEYS)}")
         for key in ("from", "to"):
             if key not in spec:
                 raise InputError(f"axes.{name}.{key}", "is missing; an axis is a list, or a table with from and to")
@@ -198,7 +198,7 @@ def _where(scene: Scene, name: str) -> tuple[Spot, str]:
         return Spot(place, "", None), place.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
-        raise InputError(f"axes.{name}", f"is no number of a start; {closest(str(name), [f'start.{f}' for f in _START])}")
+        raise InputError(f"axes.{name}", f"is no number of a start; {suggest_name(str(name), [f'start.{f}' for f in _START])}")
     size = scene.loads.count if match[1] in ("angle", "rate") else scene.machine.structure().mass.shape[0]
     entry = None if match[2] is None else int(match[2])
     if entry is not None and entry >= size:

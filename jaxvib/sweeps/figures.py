@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import ConstantSpeed
-from jaxvib.machine.files import closest, scene_from_toml
+from jaxvib.machine.files import scene_from_toml, suggest_name
 from jaxvib.steady.orbits.diagram import exact_branches
 from jaxvib.sweeps.axes import SAMPLE, axis_of, put
 from jaxvib.sweeps.store import Store
@@ -125,7 +125,7 @@ def plot_map(
     grid = [d for d in dims if d != SAMPLE]
     for name, given in (("x", x), ("y", y)):
         if given is not None and given not in grid:
-            raise InputError(name, f"is {quoted(given)}; {closest(given, grid)}")
+            raise InputError(name, f"is {quoted(given)}; {suggest_name(given, grid)}")
     rest = [d for d in grid if d not in (x, y)]
     across = x or (_SPEED if _SPEED in rest else rest[0] if rest else None)
     rest = [d for d in rest if d != across]
@@ -159,7 +159,7 @@ def plot_shares(store: str | Path, over: str | None = None, *, ax: Axes | None =
     grid = [d for d in dims if d != SAMPLE]
     over = over or (grid[0] if grid else None)
     if over not in grid:
-        raise InputError("over", f"is {quoted(over)}; {closest(str(over), grid)}")
+        raise InputError("over", f"is {quoted(over)}; {suggest_name(str(over), grid)}")
     if not _has_labels(opened):
         raise InputError("store", "has neither regime nor mode, whose shares could be shown; measure run.regime")
     place = dims.index(over)
@@ -260,7 +260,7 @@ def _measure(store: Store, name: str | None) -> str:
     plain = [n for n in store.names if not _is_label(store, n)]
     found = name or next(iter(plain or store.names))
     if found not in store.names:
-        raise InputError("measure", f"is {quoted(found)}; {closest(found, list(store.names))}")
+        raise InputError("measure", f"is {quoted(found)}; {suggest_name(found, list(store.names))}")
     return found
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import closest
+from jaxvib.machine.files import suggest_name
 from jaxvib.motion.analysis.regime import REGIMES
 from jaxvib.motion.batch import BatchRun
 from optimize.quantities.quantity import Quantity
@@ -112,7 +112,7 @@ def measure_of(given: Measure | str, field: str) -> Measure:
         return given
     if isinstance(given, str) and given in RUN_MEASURES:
         return RUN_MEASURES[given]
-    advice = closest(str(given), list(RUN_MEASURES))
+    advice = suggest_name(str(given), list(RUN_MEASURES))
     raise InputError(
         field, f"is {quoted(given)}; give a quantity of optimize, such as jam_frequency(mode=3), or a name; {advice}"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias, cast
 
 from jaxvib.errors import ComputationError, InputError, quoted, require_one_of
-from jaxvib.machine.files import closest, load_scene, out_of_place, read_toml
+from jaxvib.machine.files import load_scene, misplaced_name, read_toml, suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.start import Start, initial_state
@@ -168,7 +168,7 @@ def load_study(path: str | Path) -> Study:
     tables = read_toml(path)
     for name in tables:
         if name not in _FIELDS:
-            raise out_of_place(name, tables, "study", _FIELDS)
+            raise misplaced_name(name, tables, "study", _FIELDS)
     for name in ("scene", "axes", "measure"):
         if name not in tables:
             raise InputError(name, "is missing; a study file needs scene, [axes] and [[measure]]")
@@ -182,7 +182,7 @@ def load_study(path: str | Path) -> Study:
     run = dict(tables.get("run", {}))
     for name in run:
         if name not in ("until", "start", "mode", "steps"):
-            raise InputError(f"run.{name}", f"is no field here; {closest(name, ['until', 'start', 'mode', 'steps'])}")
+            raise InputError(f"run.{name}", f"is no field here; {suggest_name(name, ['until', 'start', 'mode', 'steps'])}")
     given = [_measure(table, f"measure[{k}]", Path(path)) for k, table in enumerate(tables["measure"])]
     measure: Measures = [m for _, m in given]
     if any(name for name, _ in given):
@@ -218,7 +218,7 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     """A quantity of the user's own: a function of a scene, in a module that Python finds."""
     for key in table:
         if key not in ("function", "unit"):
-            raise InputError(f"{field}.{key}", f"is no field here; {closest(key, ['function', 'unit', 'name'])}")
+            raise InputError(f"{field}.{key}", f"is no field here; {suggest_name(key, ['function', 'unit', 'name'])}")
     module, _, function = str(table["function"]).partition(":")
     try:
         found = getattr(importlib.import_module(module), function)

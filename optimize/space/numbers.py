@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError
-from jaxvib.machine.files import closest
+from jaxvib.machine.files import suggest_name
 from jaxvib.machine.scene import Scene
 from jaxvib.units import FIELD_UNITS, Number, number
 
@@ -115,7 +115,7 @@ def places_of(scene: Scene, name: str, field: str) -> Place:
     there = _all(scene)
     match = re.fullmatch(r"([a-z_.]+)(?:\[(\d+)\])?", name) if isinstance(name, str) else None
     if match is None or match[1] not in there:
-        raise InputError(f"{field}.{name}", f"is no number of this scene; {closest(str(name), list(there))}")
+        raise InputError(f"{field}.{name}", f"is no number of this scene; {suggest_name(str(name), list(there))}")
     path, unit, leaf = there[match[1]]
     index = None if match[2] is None else int(match[2])
     if index is not None and (leaf.ndim == 0 or index >= leaf.shape[0]):
@@ -128,7 +128,7 @@ def value_of(name: str, value: Number) -> float:
     last = re.sub(r"\[\d+\]$", "", str(name)).rpartition(".")[2]
     unit = FIELD_UNITS.get(last) or next((u for k, u in _EFFECT_UNITS.items() if str(name).endswith(k)), None)
     if unit is None:
-        raise InputError(str(name), f"is no number of a scene; {closest(str(name), list(FIELD_UNITS))}")
+        raise InputError(str(name), f"is no number of a scene; {suggest_name(str(name), list(FIELD_UNITS))}")
     return float(number(value, unit, str(name), low=0.0, open_low=last in _POSITIVE))
 
 

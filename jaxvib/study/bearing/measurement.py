@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.files import Tables, called, closest, out_of_place
+from jaxvib.machine.files import Tables, build_part, misplaced_name, suggest_name
 from jaxvib.study.bearing.record import Record, read_record
 from jaxvib.study.bearing.swing import BearingPendulum
 from jaxvib.units import Number, number
@@ -47,16 +47,16 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
     names = ["record", "pendulum", "identify"]
     for name, table in tables.items():
         if name not in names:
-            raise out_of_place(name, tables, "measurement", names)
+            raise misplaced_name(name, tables, "measurement", names)
         if not isinstance(table, Mapping):
             raise InputError(name, f"is {quoted(table)}; it must be a table, write [{name}]")
-    pendulum = called(BearingPendulum, tables.get("pendulum", {}), "pendulum")
-    asked = called(_asked, tables.get("identify", {}), "identify")
+    pendulum = build_part(BearingPendulum, tables.get("pendulum", {}), "pendulum")
+    asked = build_part(_asked, tables.get("identify", {}), "identify")
     part = tables.get("record", {})
     for name in part:
         if name not in _FIELDS:
-            raise InputError(f"record.{name}", f"is no field here; {closest(name, list(_FIELDS))}")
-    record = called(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
+            raise InputError(f"record.{name}", f"is no field here; {suggest_name(name, list(_FIELDS))}")
+    record = build_part(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
     return Measurement(pendulum, record, *asked)
 
 
