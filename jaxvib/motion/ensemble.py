@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
@@ -20,14 +19,13 @@ from jaxvib.equations.dynamics import State, vector_field
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.analysis.measure import STATE
 from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, natural_units, scaled_error
 from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
-from jaxvib.motion.integrate import frequency_bounds, is_finite, wrap_angles
-from jaxvib.motion.start import initial_state, require_start, with_spin
-from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former, require
-from jaxvib.motion.stiffness import fastest_decay, is_unresolved, steps_of
+from jaxvib.motion.integrate import is_finite, wrap_angles
+from jaxvib.motion.plan import ENSEMBLE_PARTS, plan_ensemble
+from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former
+from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
@@ -35,8 +33,8 @@ from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
-from jaxvib.steady.outcome import REFUSED, unknown_is_positive, without_numbers
-from jaxvib.units import Number, count, number, traced
+from jaxvib.steady.outcome import REFUSED, without_numbers
+from jaxvib.units import Number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,9 +45,6 @@ __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
 """What `_run` returns, of one run or of many."""
-
-_PARTS = 4
-"""Into so many parts a run is cut; over the last one mean speeds are taken."""
 
 Equations = Callable[[Scene], Callable[[Array, State], State]]
 
@@ -179,88 +174,28 @@ def ensemble(
     ((5, 1), True, True)
     """
     begun = time.perf_counter()
-    values = jax.tree.map(jnp.asarray, values)
-    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
-    if len(sizes) != 1 or sizes & {(), (0,)}:
-        raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
-    ((runs,),) = sizes
-    end = number(until, "s", "until", low=0.0, open_low=True)
-    batch = min(count(batch, "batch"), runs)
-    scenes, states, allowed = _made(make, values)
-    if (is_positive := unknown_is_positive(end)) is not None:
-        allowed = allowed & is_positive
-    made = scenes, states
-    require_start(made[0], made[1].angle)
-    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((made, end)))
-    # What all runs share stays one number: it is not read anew for each.
-    shared = [concrete and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in jax.tree.leaves(made)]
-    shared[0] = shared[0] and not all(shared)  # one number at least says how many runs there are
-    leaves, treedef = jax.tree.flatten(made)
-    form = Skeleton.of(leaves, treedef)
-    own = [leaf for leaf, same in zip(leaves, shared, strict=True) if not same]
-    common = [np.asarray(np.asarray(leaf)[0]) for leaf, same in zip(leaves, shared, strict=True) if same]
-    require(stepsize_controller, EqualSteps)
-    if stepsize_controller is None and not concrete:
-        raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
-    (fastest, decay), implicit = _rates(made[0]), False
-    steps = 0 if stepsize_controller is None else count(stepsize_controller.number, "steps")
-    if concrete:
-        # Runs that are refused do not decide the steps of the others.
-        most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
-        most = most if bool(np.any(allowed)) else [1.0, 0.0]
-        step, implicit = steps_of(most[0], most[1], 4.0, float(end) / steps if steps else None)
-        steps = steps or max(16, math.ceil(float(end) / step - 1e-9))
-    each = -(-steps // _PARTS)
-    coarse = -(-each // 2)
-    # A run of one step in each part has no coarser one beside it.
-    compared = estimate and coarse < each
-    counts = np.asarray([each, coarse] if compared else [each], end.dtype)
+    plan = plan_ensemble(make, values, until, steps=stepsize_controller, is_estimated=estimate, batch=batch)
 
     def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
-        return _together(own, common, end, counts, tuple(shared), form, equations, implicit)
+        return _together(own, common, end, counts, plan.is_shared, plan.form, equations, plan.implicit)
 
-    ends = in_chunks(batch, together, own, shared=(common, end, counts))
+    counts = np.asarray([plan.each, plan.coarse] if plan.is_compared else [plan.each], plan.end.dtype)
+    ends = in_chunks(plan.batch, together, plan.own, shared=(plan.common, plan.end, counts))
     last, load_speed, apart, finite, detached, taken = ends
-    # What a method of order 3 would leave of the difference; this one is of order 8.
-    share = (coarse / each) ** 3
-    unknown = np.inf if estimate else np.nan
-    error = np.full(runs, unknown, end.dtype)
-    if compared:
-        error = estimated_error(apart, share, made[0])
-    unknown = np.asarray(np.nan, end.dtype)
-    resolved = implicit | ~is_unresolved(decay, end / (_PARTS * each))
-    if traced(allowed) or not bool(np.all(allowed)):
+    error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
+    if plan.is_compared:
+        # The share that a method of order 3 would leave of the difference; this one is of order 8.
+        error = estimated_error(apart, (plan.coarse / plan.each) ** 3, plan.scenes)
+    unknown = np.asarray(np.nan, plan.end.dtype)
+    resolved = plan.implicit | ~is_unresolved(plan.decay, plan.end / (ENSEMBLE_PARTS * plan.each))
+    if not plan.is_allowed:
         numbers = last, load_speed, error, finite, resolved, detached
-        last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(allowed, numbers)
-    found = Ensemble(*on_device((last, load_speed, error, allowed, finite, resolved, detached, taken[0], unknown)))
-    if not concrete:
+        last, load_speed, error, finite, resolved, detached = jax.vmap(without_numbers)(plan.allowed, numbers)
+    found = Ensemble(*on_device((last, load_speed, error, plan.allowed, finite, resolved, detached, taken[0], unknown)))
+    if not plan.is_known:
         return found
     jax.block_until_ready(found)
-    return dataclasses.replace(found, seconds=on_device(np.asarray(time.perf_counter() - begun, end.dtype)))
-
-
-@eqx.filter_jit
-def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
-    """The scenes, the states they start from, and whether their numbers are allowed, with a leading axis over the runs."""
-
-    def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
-        given = call_user(make, "make", value)
-        if isinstance(given, Scene):
-            given = given, initial_state(given)
-        scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
-        if not isinstance(scene, Scene) or not isinstance(state, State):
-            raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
-        scene = validate_scene(scene)
-        allowed = allowed_unknowns(scene)
-        return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
-
-    return eqx.filter_vmap(one)(values)
-
-
-@cached
-def _rates(scenes: Scene) -> tuple[Array, Array]:
-    """The fastest of the motion, rad/s, and of the decay, 1/s, of each scene."""
-    return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)
+    return dataclasses.replace(found, seconds=on_device(np.asarray(time.perf_counter() - begun, plan.end.dtype)))
 
 
 @cached
@@ -296,14 +231,14 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     field = _FieldWithDetachment(field, scene) if watched else field
     state = _with_detachment(state, jnp.zeros_like(state.azimuth)) if watched else state
     motion = pack_batch(field, state, single, together, implicit=implicit)
-    length = end / _PARTS
+    length = end / ENSEMBLE_PARTS
 
     def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
         held, taken = advance(motion, held, *at, step, implicit=implicit)
         return held, (held, taken)
 
     def whole(steps: Array) -> tuple[Y, Array]:
-        held, begins, lengths = stretches(motion, motion.pack(state), length, length / steps, _PARTS, implicit=implicit)
+        held, begins, lengths = stretches(motion, motion.pack(state), length, length / steps, ENSEMBLE_PARTS, implicit=implicit)
         _, (helds, taken) = jax.lax.scan(lambda held, at: part(held, at, length / steps), held, (begins, lengths))
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 

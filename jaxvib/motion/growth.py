@@ -17,14 +17,16 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
 from jaxvib.motion.integrate import whole_turns, wrap_angles
+from jaxvib.motion.plan import start_state
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import last_state, simulate
-from jaxvib.motion.start import Start, initial_state, validate_state
-from jaxvib.motion.steps import Tolerance, require_known
+from jaxvib.motion.start import Start
+from jaxvib.motion.steps import Tolerance
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import failure, member, status_name
 from jaxvib.units import Number, count, number
+from jaxvib.units.known import require_known
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,7 +141,7 @@ def growth(
 
     Source: Benettin, Galgani, Giorgilli, Strelcyn 1980.
     """
-    require_known(scene, "growth", "jam_orbit or simulate")
+    require_known(scene, "scene", "growth", "transform jam_orbit or simulate instead")
     scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError(
@@ -148,8 +150,7 @@ def growth(
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
-    given = isinstance(start, State)
-    state = validate_state(scene, start, mode, apart) if given else initial_state(scene, start, mode=mode, apart=apart)
+    state = start_state(scene, start, mode, apart)
     stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
     separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))

@@ -7,27 +7,45 @@ numbers; under a JAX transformation sizes have fixed values.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
+from jaxvib.boundary import call_user
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import validate_scene
+from jaxvib.machine.validation import allowed_unknowns, validate_scene
 from jaxvib.motion.integrate import PER_TURN, IntegrationPlan, StepControl, frequency_bounds
-from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
+from jaxvib.motion.start import Start, initial_state, require_start, validate_state, with_spin, with_spin_up_drive
 from jaxvib.motion.steps import Accuracy, EqualSteps, StepChoice, Tolerance, require, small_number
-from jaxvib.motion.stiffness import stiff_solver
+from jaxvib.motion.stiffness import fastest_decay, steps_of, stiff_solver
 from jaxvib.ode.dopri8_loop import LoopDopri8
-from jaxvib.units import Number, count, known_number
+from jaxvib.runtime.programs import cached
+from jaxvib.runtime.structure import Skeleton
+from jaxvib.steady.outcome import unknown_is_positive
+from jaxvib.units import Number, count, known_number, number
 from jaxvib.units.known import is_known, when_known
 
-__all__ = ["MAX_STEPS", "Control", "RunPlan", "enough_steps", "plan_run", "start_state"]
+__all__ = [
+    "ENSEMBLE_PARTS",
+    "MAX_STEPS",
+    "Control",
+    "EnsemblePlan",
+    "RunPlan",
+    "enough_steps",
+    "plan_ensemble",
+    "plan_run",
+    "start_state",
+]
 
 Control = StepControl | diffrax.AbstractStepSizeController
 
@@ -186,3 +204,122 @@ def _step_control(end: Array, chosen: StepChoice | None, estimate: bool | None) 
     default = 1e-8 if precision < 1e-10 else 1e-5
     tolerance = default if chosen is None else small_number(chosen.tolerance, "tolerance", end, 10.0)
     return StepControl(tolerance=np.asarray(tolerance, end.dtype))
+
+
+ENSEMBLE_PARTS = 4
+"""Equal parts of a run of an ensemble; mean speeds are taken over the last one."""
+
+_EXPLICIT_PER_RADIAN, _LEAST_STEPS = 4.0, 16
+
+
+class EnsemblePlan(NamedTuple):
+    """Plan of many runs that advance together.
+
+    **Attributes**: `scenes` with a leading axis over the runs, and whether constructors would have taken the numbers of each,
+    `allowed`, and of all, `is_allowed`; numbers of scenes and states that each run has for itself, `own`, and those that all
+    have in `common`; for each number in their order `is_shared`, and the `form` of scene and state that they fill; `end` s;
+    steps in each of the `ENSEMBLE_PARTS` of a run, `each`, and of a second run with larger steps, `coarse`, if it
+    `is_compared` with it; `decay` of each scene, 1/s; `implicit` steps or not; runs in a `batch`; `is_known`: true if all
+    numbers have values.
+    """
+
+    scenes: Scene
+    allowed: Array
+    is_allowed: bool
+    own: list[Array]
+    common: list[np.ndarray]
+    is_shared: tuple[bool, ...]
+    form: Skeleton
+    end: Array
+    each: int
+    coarse: int
+    is_compared: bool
+    decay: Array
+    implicit: bool
+    batch: int
+    is_known: bool
+
+
+def plan_ensemble(
+    make: Callable[..., Scene | tuple[Scene, State]],
+    values: PyTree[Array],
+    until: Number,
+    *,
+    steps: EqualSteps | None,
+    is_estimated: bool,
+    batch: int,
+) -> EnsemblePlan:
+    """Validate the arguments of `ensemble`, make its scenes and choose method and steps. **Raises** `InputError`."""
+    values = jax.tree.map(jnp.asarray, values)
+    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(values)}
+    if len(sizes) != 1 or sizes & {(), (0,)}:
+        raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
+    ((runs,),) = sizes
+    end = number(until, "s", "until", low=0.0, open_low=True)
+    batch = min(count(batch, "batch"), runs)
+    scenes, states, allowed = _made(make, values)
+    if (is_positive := unknown_is_positive(end)) is not None:
+        allowed = allowed & is_positive
+    require_start(scenes, states.angle)
+    known = is_known(scenes, states, end)
+    require(steps, EqualSteps)
+    if steps is None and not known:
+        raise InputError("stepsize_controller", "is missing; under a JAX transformation give EqualSteps(...)")
+    fastest, decay = _rates(scenes)
+    number_of_steps, implicit = 0 if steps is None else count(steps.number, "steps"), False
+    if known:
+        # Runs that are refused do not decide the steps of the others.
+        most = [float(np.max(np.where(allowed, x, 0.0))) for x in (fastest, decay)]
+        most = most if bool(np.any(allowed)) else [1.0, 0.0]
+        step, implicit = steps_of(
+            most[0], most[1], _EXPLICIT_PER_RADIAN, float(end) / number_of_steps if number_of_steps else None
+        )
+        number_of_steps = number_of_steps or max(_LEAST_STEPS, math.ceil(float(end) / step - 1e-9))
+    each = -(-number_of_steps // ENSEMBLE_PARTS)
+    coarse = -(-each // 2)
+
+    leaves, structure = jax.tree.flatten((scenes, states))
+    # A number that all runs share stays one number: it is not read anew for each. One at least says how many runs there are.
+    is_shared = [known and bool(np.all(np.asarray(leaf) == np.asarray(leaf)[:1])) for leaf in leaves]
+    is_shared[0] = is_shared[0] and not all(is_shared)
+    return EnsemblePlan(
+        scenes=scenes,
+        allowed=allowed,
+        is_allowed=bool(when_known(np.all, allowed)),
+        own=[leaf for leaf, same in zip(leaves, is_shared, strict=True) if not same],
+        common=[np.asarray(np.asarray(leaf)[0]) for leaf, same in zip(leaves, is_shared, strict=True) if same],
+        is_shared=tuple(is_shared),
+        form=Skeleton.of(leaves, structure),
+        end=end,
+        each=each,
+        coarse=coarse,
+        is_compared=is_estimated and coarse < each,  # a run of one step in each part has no coarser one
+        decay=decay,
+        implicit=implicit,
+        batch=batch,
+        is_known=known,
+    )
+
+
+@eqx.filter_jit
+def _made(make: Callable[..., Scene | tuple[Scene, State]], values: PyTree[Array]) -> tuple[Scene, State, Array]:
+    """The scenes, the states at their start, and true for those with allowed numbers, with a leading axis over the runs."""
+
+    def one(value: PyTree[Array]) -> tuple[Scene, State, Array]:
+        given = call_user(make, "make", value)
+        if isinstance(given, Scene):
+            given = given, initial_state(given)
+        scene, state = given if isinstance(given, tuple) and len(given) == 2 else (None, None)
+        if not isinstance(scene, Scene) or not isinstance(state, State):
+            raise InputError("make", f"gives {quoted(given)}; it must give a Scene, or a Scene and a State")
+        scene = validate_scene(scene)
+        allowed = allowed_unknowns(scene)
+        return scene, with_spin(scene, state), jnp.asarray(True) if allowed is None else allowed
+
+    return eqx.filter_vmap(one)(values)
+
+
+@cached
+def _rates(scenes: Scene) -> tuple[Array, Array]:
+    """The fastest rates of the motion, rad/s, and of the decay, 1/s, of each scene."""
+    return jax.vmap(lambda scene: (frequency_bounds(scene)[0], fastest_decay(scene)))(scenes)

@@ -20,12 +20,13 @@ from jaxvib.motion.integrate import frequency_bounds, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, simulate
 from jaxvib.motion.start import APART, Start, initial_state, validate_state
-from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former, require_known
+from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, count, number
+from jaxvib.units.known import require_known
 
 __all__ = ["settle"]
 
@@ -106,7 +107,7 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
-    require_known(scene, "settle", "jam_orbit or simulate")
+    require_known(scene, "scene", "settle", "transform jam_orbit or simulate instead")
     scene = validate_scene(scene)
     if not scene.drive.constant:
         raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")

@@ -23,7 +23,8 @@ from jaxvib.machine.validation import validate_scene
 from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import jam_modes
-from jaxvib.units import Number, Numbers, known_number, numbers, traced
+from jaxvib.units import Number, Numbers, known_number, numbers
+from jaxvib.units.known import when_known
 
 __all__ = ["APART", "Start", "Turning", "initial_state", "require_start", "validate_state", "with_spin", "with_spin_up_drive"]
 
@@ -195,7 +196,7 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
 
 
 def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: Number | None) -> Scene:
-    """The scene; for the start "spin_up" with a drive that rises over the time `spin_up` (s), half of `end` unless said.
+    """Return the scene, for the start "spin_up" with a drive that rises over the time `spin_up` (s; default: half of `end`).
 
     **Raises** `InputError` for a time that goes with another start or is longer than the run, and for another drive.
     """
@@ -206,9 +207,13 @@ def with_spin_up_drive(scene: Scene, end: Array, start: Start | State, spin_up: 
     if not scene.drive.constant:
         raise InputError("start", f"is 'spin_up', but the drive is {quoted(scene.drive.kind)} already; start at 'rest'")
     drive = SpinUp(scene.drive.speed, end / 2.0 if spin_up is None else spin_up)
-    if not traced(end - drive.duration) and drive.duration > end:
-        raise InputError("spin_up", f"is {float(drive.duration):g} s, longer than the run of {float(end):g} s; run longer")
+    when_known(_require_shorter, drive.duration, end)
     return eqx.tree_at(lambda s: s.drive, scene, drive)
+
+
+def _require_shorter(duration: float, end: float) -> None:
+    if duration > end:
+        raise InputError("spin_up", f"is {duration:g} s, longer than the run of {end:g} s; run longer")
 
 
 def validate_state(scene: Scene, state: State, mode: int | None, apart: Number | None = None) -> State:
@@ -238,7 +243,6 @@ def validate_state(scene: Scene, state: State, mode: int | None, apart: Number |
 
 def require_start(scene: Scene, u: tuple[Array, ...]) -> None:
     """**Raises** `InputError` if loads that touch cannot start from the coordinates `u` (..., count), if these are known."""
-    if not any(map(traced, u)):
-        for term in terms_of(scene.effects, LoadInteraction):
-            if term.validate_start is not None:
-                term.validate_start(scene.loads, u)
+    for term in terms_of(scene.effects, LoadInteraction):
+        if term.validate_start is not None:
+            when_known(lambda *u, term=term: term.validate_start(scene.loads, u), *u)

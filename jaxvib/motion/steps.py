@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
 import diffrax
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.scene import Scene
-from jaxvib.units import require_real, traced
+from jaxvib.units import require_real
 
 __all__ = [
     "FORMER",
@@ -24,7 +22,6 @@ __all__ = [
     "Tolerance",
     "refuse_former",
     "require",
-    "require_known",
     "small_number",
 ]
 
@@ -108,16 +105,6 @@ def small_number(value: float, name: str, time: Array, least: float) -> float:
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )
     return value
-
-
-def require_known(scene: Scene, asking: str, instead: str) -> None:
-    """**Raises** `InputError` if JAX is transforming the scene: the function `asking` decides by its numbers in Python."""
-    if any(map(traced, jax.tree.leaves(scene))):
-        raise InputError(
-            "scene",
-            f"holds numbers that JAX is transforming (jit, grad, vmap, ...), and {asking} decides by their values in Python; "
-            f"transform {instead} instead",
-        )
 
 
 def refuse_former(**now: str) -> Callable[[Callable[P, T]], Callable[P, T]]:

@@ -9,16 +9,18 @@ import os
 import tempfile
 import threading
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxvib.runtime.compat import traced
 
-__all__ = ["arrays_on_device", "known", "on_device", "shared_devices", "take_a_device"]
+__all__ = ["arrays_on_device", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
 """What restricts a process to some of its machine's accelerators."""
@@ -39,6 +41,11 @@ def shared_devices() -> list[object]:
 def known(value: ArrayLike) -> Any:
     """A value as NumPy has it, if it has a number yet: arithmetic with it then needs no program compiled."""
     return value if traced(value) else np.asarray(value)
+
+
+def numpy_of(tree: PyTree) -> ModuleType:
+    """NumPy, or JAX's if JAX is transforming the computation that the tree is part of."""
+    return jnp if any(map(traced, jax.tree.leaves(tree))) else np
 
 
 def on_device(tree: PyTree) -> PyTree:

@@ -21,7 +21,7 @@ from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
 from jaxvib.steady.orbits.orbit import Orbit
-from jaxvib.units import traced
+from jaxvib.units.known import is_known
 
 __all__ = ["Case", "Evaluation", "Key", "Target", "TargetRecorder", "guesses"]
 
@@ -67,7 +67,8 @@ class TargetRecorder:
 class Evaluation:
     """Results of one scene. Questions are answered when they are first asked.
 
-    **Attributes**: `scene`; `known` load speeds (rad/s) near which jams and folds are followed, by `Key`; without them the
+    **Attributes**: `scene`; `is_known`: true if its numbers have values; `known` load speeds (rad/s) near which jams and folds
+    are followed, by `Key`; without them the
     whole branch is looked at; `found` the load speeds that came out.
     """
 
@@ -79,6 +80,7 @@ class Evaluation:
         modes: JamModes | None = None,
     ):
         self.scene = scene
+        self.is_known = is_known(scene)
         self.known = known
         self.path = path
         self.found: dict[Key, Array] = {}
@@ -133,7 +135,7 @@ class Evaluation:
         """The exact motion that continues a jam mode, NaN where there is none."""
         if mode not in self._orbits:
             jam = self.jam(mode)
-            if self.known is None and not any(traced(leaf) for leaf in jax.tree.leaves(self.scene)):
+            if self.known is None and self.is_known:
                 orbit = jam_orbit(self.scene, mode=mode, throw=False)
             else:
                 orbit = jam_orbit(self.scene, near=jax.lax.stop_gradient(jam.omega), throw=False)
@@ -164,8 +166,7 @@ class Evaluation:
         import diffrax
 
         if key not in self._runs:
-            known = not any(traced(leaf) for leaf in jax.tree.leaves(self.scene))
-            adjoint = None if known else diffrax.ForwardMode()
+            adjoint = None if self.is_known else diffrax.ForwardMode()
             self._runs[key] = ask(estimate=False, adjoint=adjoint, throw=False)
         return self._runs[key]
 

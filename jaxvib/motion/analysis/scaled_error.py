@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import functools
-from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import PyTree
 
 from jaxvib.equations.dynamics import Spin, State
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, RotorImbalance, SlipRelease
 from jaxvib.machine.scene import Scene
+from jaxvib.runtime.devices import numpy_of
 from jaxvib.runtime.programs import cached
-from jaxvib.units import traced
 
 __all__ = ["error_scale", "estimated_error", "natural_units", "scaled_error", "turned"]
 
@@ -55,7 +53,7 @@ def error_scale(state: State, unit: State) -> State:
 
     **Returns** `State` of numbers, NumPy's where numbers are known: nothing is compiled for them.
     """
-    xp = _library((state, unit))
+    xp = numpy_of((state, unit))
 
     def largest(x: Array, least: Array) -> Array:
         return xp.maximum(xp.max(xp.abs(xp.asarray(x))), xp.asarray(least))
@@ -90,7 +88,7 @@ def scaled_error(a: State, b: State, scale: State) -> Array:
     >>> float(scaled_error(a, b, error_scale(a, unit))), float(scaled_error(a, b, error_scale(b, unit)))
     (0.5, 1.0)
     """
-    xp = _library((a, b, scale))
+    xp = numpy_of((a, b, scale))
 
     def apart(x: Array, y: Array, unit: Array) -> Array:
         with np.errstate(invalid="ignore"):  # where a run did not finish there is nothing to compare
@@ -133,7 +131,7 @@ def turned(state: State, to: State) -> State:
     >>> round(float(turned(a, b).angle[0][0]), 4)
     -3.1832
     """
-    xp = _library((state, to))
+    xp = numpy_of((state, to))
 
     def near(x: Array, y: Array) -> Array:
         return x + 2.0 * np.pi * xp.round((y - x) / (2.0 * np.pi))
@@ -142,8 +140,3 @@ def turned(state: State, to: State) -> State:
     if state.rotor is not None and to.rotor is not None:
         rotor = (near(state.rotor[0], to.rotor[0]), state.rotor[1])
     return State(state.displacement, state.velocity, tuple(map(near, state.angle, to.angle)), state.rate, rotor, state.spin)
-
-
-def _library(tree: PyTree[Array]) -> ModuleType:
-    """NumPy, or JAX's where JAX is transforming the computation that a tree is part of."""
-    return jnp if any(traced(leaf) for leaf in jax.tree.leaves(tree)) else np

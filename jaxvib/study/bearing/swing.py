@@ -19,10 +19,11 @@ from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require
 from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
-from jaxvib.results.status import failure
 from jaxvib.runtime.compat import fast_diffrax_loop_end
 from jaxvib.runtime.programs import cached
-from jaxvib.units import Number, Numbers, count, number, numbers, traced
+from jaxvib.steady.outcome import outcome
+from jaxvib.units import Number, Numbers, count, number, numbers
+from jaxvib.units.known import when_known
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -176,8 +177,7 @@ def swing(
     require(chosen, Tolerance, diffrax.AbstractStepSizeController)
     if times.ndim != 1:
         raise InputError("time", "is one number; a list of times is needed")
-    if not traced(times) and np.any(np.diff(np.asarray(times)) <= 0.0):
-        raise InputError("time", "must ascend, each time later than the one before")
+    when_known(_require_ascending, times)
     friction = number(dry, "", "dry", low=0.0) if dry is not None else None
     if friction is not None:
         _diameter(pendulum)
@@ -194,9 +194,12 @@ def swing(
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         count(max_steps, "max_steps"),
     )
-    if throw and not traced(run.steps) and bool(run.status == SwingStatus.max_steps_reached):
-        raise failure(run.status, f" ({max_steps}); give a larger max_steps")
-    return run
+    return outcome(run, throw=throw, failures=("max_steps_reached",), hint=lambda _: f" ({max_steps}); give a larger max_steps")
+
+
+def _require_ascending(times: np.ndarray) -> None:
+    if np.any(np.diff(times) <= 0.0):
+        raise InputError("time", "must ascend, each time later than the one before")
 
 
 def _diameter(pendulum: BearingPendulum) -> Array:
