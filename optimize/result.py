@@ -23,7 +23,17 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["Influence", "Limit", "Machine", "Outcome", "Row", "Synthesis", "SynthesisStatus", "amplitude_names", "wanted"]
+__all__ = [
+    "Influence",
+    "Limit",
+    "Machine",
+    "Outcome",
+    "Row",
+    "Synthesis",
+    "SynthesisStatus",
+    "amplitude_names",
+    "objective_text",
+]
 
 _TELLING = 1000.0
 """Changes of more per cent are told in the objective's unit."""
@@ -63,8 +73,8 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Plain]:
         """The same for JSON: freed numbers beside the quantities, None where there is no number."""
-        told = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
-        return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in told}}.items()}
+        shown = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
+        return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in shown}}.items()}
 
 
 class Row(NamedTuple):
@@ -167,11 +177,11 @@ class Synthesis(Result):
     def summary(self) -> str:
         """Before, after and verified, what hinders, what matters, for a person to read."""
         counted = f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"
-        lines = [f"{wanted(self.objective)}: {self.message}", counted]
+        lines = [f"{objective_text(self.objective)}: {self.message}", counted]
         lines += [" ".join(line) for line in _aligned([["", "before", "after", "exact", "verified"], *self.rows()])]
         if self.unverified:
             lines.append(f"  not verified: {self.unverified}")
-        lines += self.said()
+        lines += self.findings()
         return "\n".join(line.rstrip() for line in lines)
 
     def rows(self) -> list[list[str]]:
@@ -184,7 +194,7 @@ class Synthesis(Result):
             out.append([f"{row.what}, {unit}".rstrip(", "), *values])
         return out
 
-    def said(self) -> list[str]:
+    def findings(self) -> list[str]:
         """Lines on demands, on what is held and bounds, on influences, and on the machines found."""
         lines = []
         best = self.machines[0].value if self.machines else math.nan
@@ -224,7 +234,7 @@ class Synthesis(Result):
         for row in self.table:
             unit, factor = shown_unit(row.unit, max(abs(row.before), abs(row.after)))
             shown.append((f"{row.what}, {unit}".rstrip(", "), row.before * factor, row.after * factor))
-        return before_after(shown, title=f"search for {wanted(self.objective)}", ax=ax)
+        return before_after(shown, title=f"search for {objective_text(self.objective)}", ax=ax)
 
     def plot_convergence(self, *, ax: Axes | None = None) -> Drawn:
         """The objective of every start over the iterations.
@@ -257,7 +267,7 @@ def _if_moved(gain: float) -> str:
     return f"moved by {share:g} %: about {gain * share:+.3g} % of the objective"
 
 
-def wanted(objective: str) -> str:
+def objective_text(objective: str) -> str:
     """The objective in words."""
     words = objective.replace("_", " ")
     return f"greatest {words.removeprefix('negative ')}" if words.startswith("negative ") else f"least {words}"

@@ -129,8 +129,8 @@ def synthesize(
     named = _named(space, scene, objective, demands, mode)
     sides = tuple(q for demand in demands for q in (demand.quantity, demand.limit))
     batch = jax.tree.map(lambda first, more: np.concatenate([np.asarray(first)[None], more]), space.scene, others)
-    told = reported((*(q for _, q in named), objective, *sides), batch, problem)
-    limits = limits_of(problem, demands, found, told[1, len(named) + 1 :].reshape(-1, 2))
+    reports = reported((*(q for _, q in named), objective, *sides), batch, problem)
+    limits = limits_of(problem, demands, found, reports[1, len(named) + 1 :].reshape(-1, 2))
     if throw and not kept[best]:
         broken = "; ".join(f"{x.what}: {x.shortfall()}" for x in limits if x.broken)
         raise failure(SynthesisStatus.contradictory, f" (nearest: {broken}); widen the bounds or relax a demand")
@@ -138,9 +138,9 @@ def synthesize(
     verify = verify and bool(kept[best])
     run, unverified = _run(scene, mode, verify) if kept[best] else (None, "the machine does not meet all demands")
     other = _other_tiers(scene, [q for _, q in named], verify, run, mode)
-    rows = _table(space, scene, named, told[:2, : len(named)], other)
+    rows = _table(space, scene, named, reports[:2, : len(named)], other)
     n = len(_standard(scene, mode, objective.of))
-    before, after = (_outcome(space, s, told[k, :n]) for k, s in enumerate((space.scene, scene)))
+    before, after = (_outcome(space, s, reports[k, :n]) for k, s in enumerate((space.scene, scene)))
     verified = None if run is None else _by_run(space, run, mode or 1, objective.of)
     tell("done", 1.0)
     return Synthesis(
@@ -164,7 +164,7 @@ def synthesize(
         kkt=float(found.optimality.kkt[best]),
         table=rows,
         limits=limits,
-        influences=influences_of(problem, told[1:, len(named)]),
+        influences=influences_of(problem, reports[1:, len(named)]),
         machines=machines_of(problem, found, _SAME),
     )
 
@@ -338,8 +338,8 @@ def _table(
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)
         table.append(Row("number of loads", "", *counts, math.nan, math.nan))
-    told = zip(named, *values, *other, strict=True)
-    return tuple(table + [Row(name, q.unit, float(b), float(a), e, t) for (name, q), b, a, e, t in told])
+    entries = zip(named, *values, *other, strict=True)
+    return tuple(table + [Row(name, q.unit, float(b), float(a), e, t) for (name, q), b, a, e, t in entries])
 
 
 def _other_tiers(

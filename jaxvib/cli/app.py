@@ -68,11 +68,11 @@ def table(title: str, columns: list[str], rows: list[list[str]]) -> str:
     from rich.table import Table
 
     drawn = Table(title=title, title_justify="left")
-    told = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
-    for k in told:
+    shown = [k for k in range(len(columns)) if not rows or any(row[k] for row in rows)]
+    for k in shown:
         drawn.add_column(columns[k], justify="left" if k == 0 else "right", no_wrap=k == 0)
     for row in rows:
-        drawn.add_row(*(row[k] for k in told))
+        drawn.add_row(*(row[k] for k in shown))
     console = Console(width=118)
     with console.capture() as capture:
         console.print(drawn)
@@ -204,8 +204,8 @@ def run(arguments: list[str]) -> int:
         hint = f" (see: {error.ctx.command_path} --help)" if error.ctx else ""
         message = " ".join(error.format_message().split())
         if isinstance(error, click.MissingParameter) and error.param is not None:
-            told = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
-            message = f"{message.rstrip('.')}: {told.rstrip('.')}" if told else message
+            description = getattr(error.param, "help", None) or _ARGUMENTS.get(error.param.name or "", "")
+            message = f"{message.rstrip('.')}: {description.rstrip('.')}" if description else message
         message += hint
         return _failed(wants_json, 2, {"kind": "input", "field": field, "message": message})
     except click.exceptions.Exit as stop:

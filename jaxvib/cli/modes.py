@@ -170,8 +170,8 @@ def _phases(scene: jv.Scene, unit: SpeedUnit, output: Output) -> None:
         if not rows:
             return f"no jam at {speed:.5g} rad/s"
         kept = ", ".join(f"{float(jam.omega):.5g} rad/s ({sentence(jam.pattern)})" for jam in jams if jam.stable)
-        said = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
-        return "\n".join([table(title, head, rows), said, *_left_out(scene)])
+        conclusion = f"loads can stay jammed at {kept}" if kept else "none of them is stable: no jam of light loads lasts"
+        return "\n".join([table(title, head, rows), conclusion, *_left_out(scene)])
 
     output.done(document, text, "modes", found)
 

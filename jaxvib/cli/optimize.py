@@ -90,14 +90,14 @@ def _document(best: Synthesis) -> dict:
 
 
 def _text(best: Synthesis) -> str:
-    from optimize.result import wanted
+    from optimize.result import objective_text
 
     counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
     rows = best.rows()
     columns = [k for k in range(len(rows[0])) if k < 3 or any(row[k] for row in rows)]
     heads = ["", "before", "after", "exact", "verified"]
-    drawn = table(wanted(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
+    drawn = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
     checked = "verified: measured on the full equations, integrated until they settled"
     if best.verified is None:
         checked = f"not verified: {best.unverified}"
-    return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.said()), checked])
+    return "\n".join([f"{best.message}\n{counted}", drawn, *(line.strip() for line in best.findings()), checked])

@@ -103,12 +103,12 @@ class Output:
         path = self.file(f"{name}.json")
         from jaxvib.results.fields import plain  # slow to import, and --help needs none of it
 
-        told = {key: plain(value) for key, value in document.items()}
-        body = json.dumps(told, indent=2, allow_nan=False)
+        values = {key: plain(value) for key, value in document.items()}
+        body = json.dumps(values, indent=2, allow_nan=False)
         if path is not None:
             path.write_text(body + "\n", encoding="utf-8")
         if self.report is not None:
-            self._reported(self.report, told, text, name, result)
+            self._reported(self.report, values, text, name, result)
         if self.as_json:
             click.echo(body)
             return
@@ -127,10 +127,10 @@ class Output:
         if not isinstance(scene, Scene):
             scene = None if self.scene is None else load_scene(self.scene)
         draws = getattr(jv, "sketch", None)
-        asked = click.get_current_context().find_root().obj or [name]
+        arguments = click.get_current_context().find_root().obj or [name]
         found = Report(
             title=f"jaxvib {name}",
-            command=" ".join(["jaxvib", *asked]),
+            command=" ".join(["jaxvib", *arguments]),
             document=document,
             units={} if result is None else units_of(result),
             text=text(),

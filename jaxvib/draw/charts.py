@@ -123,8 +123,8 @@ def branch_diagram(
         if at is not None:
             axis.axvline(scale * at, label="operating speed; numbers: jam modes", **OPERATING)
             heights = [float(np.interp(share, [0, 1], v[i : i + 2])) for _, v in group for i, share, _, _ in crossed]
-            told = [(number, filled) for _ in group for _, _, number, filled in crossed]
-            numbered(axis, scale * at, heights, [number for number, _ in told], [filled for _, filled in told])
+            markers = [(number, filled) for _ in group for _, _, number, filled in crossed]
+            numbered(axis, scale * at, heights, [number for number, _ in markers], [filled for _, filled in markers])
     if ax is None:
         legend_outside(figure, axes, 4 if columns > 1 else 2)
     else:

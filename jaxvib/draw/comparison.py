@@ -55,9 +55,9 @@ class CostPanel(NamedTuple):
     best: np.ndarray
 
 
-def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float], *, ax: Onto = None) -> Drawn:
+def cost_chart(panels_by_title: Mapping[str, CostPanel], error_levels: Sequence[float], *, ax: Onto = None) -> Drawn:
     """Relative error over seconds, a panel for each title, two in a row; a name has one look in all of them, told in one
-    legend. Dotted lines at the errors that are `wanted`.
+    legend. Dotted lines at the errors that are `error_levels`.
 
     >>> lines = {"exact": np.array([[1e-3, 1e-4], [2e-3, 1e-8]])}
     >>> figure = cost_chart({"": CostPanel(lines, 1e-9, "amplitude", lines["exact"][1:])}, [1e-6])
@@ -72,26 +72,26 @@ def cost_chart(panels_by_title: Mapping[str, CostPanel], wanted: Sequence[float]
     for spare in cells[len(panels_by_title) :]:
         spare.set_axis_off()
     for axes, (title, panel) in zip(cells, panels_by_title.items(), strict=False):
-        _cost_panel(axes, panel, wanted, looks)
+        _cost_panel(axes, panel, error_levels, looks)
         axes.set_title(title)
     handles = [
         *(Line2D([], [], ms=5, color=color, marker=marker) for color, marker in looks.values()),
         Line2D([], [], ls=":", lw=1.0, marker="o", ms=11, mfc="none", color="black"),
         Patch(color=_FLOOR),
     ]
-    told = ["cheapest within " + ", ".join(f"{error:.0e}" for error in wanted), "reference's own error"]
+    extra_labels = ["cheapest within " + ", ".join(f"{error:.0e}" for error in error_levels), "reference's own error"]
     if ax is None:
-        labels, place = [*names, *told], "outside upper left"
+        labels, place = [*names, *extra_labels], "outside upper left"
         figure.legend(handles, labels, loc=place, ncols=3 * columns, frameon=False, fontsize="small")
     else:
-        legend_above(cells[0], 2, handles=handles, labels=[*names, *told])
+        legend_above(cells[0], 2, handles=handles, labels=[*names, *extra_labels])
     return figure if ax is None else ax
 
 
 _FLOOR = "#e6e6e6"
 
 
-def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Mapping[str, tuple[str, str]]) -> None:
+def _cost_panel(axes: Axes, panel: CostPanel, error_levels: Sequence[float], looks: Mapping[str, tuple[str, str]]) -> None:
     for name, points in panel.lines.items():
         seconds, error = points[np.isfinite(points[:, 1])].T
         color, marker = looks[name]
@@ -103,7 +103,7 @@ def _cost_panel(axes: Axes, panel: CostPanel, wanted: Sequence[float], looks: Ma
     errors = np.concatenate([points[:, 1] for points in panel.lines.values()])
     errors = errors[np.isfinite(errors)]
     axes.set_ylim(0.3 * max(min([floor, *errors]), 1e-15), 3.0 * max([floor, *errors, 1e-2]))
-    for error in wanted:
+    for error in error_levels:
         axes.axhline(error, color="black", ls=":", lw=1.0, zorder=0.5)
     axes.set_xlabel("time, once compiled")
     low, high = axes.get_xlim()

@@ -43,7 +43,7 @@ def _(controls, html, mo, path):
 
 @app.cell
 def _(controls, pictures, scene, scene_at):
-    machine = pictures.tried(lambda: scene_at(scene, controls.value))
+    machine = pictures.scene_or_problem(lambda: scene_at(scene, controls.value))
     return (machine,)
 
 

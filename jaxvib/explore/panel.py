@@ -81,14 +81,14 @@ class Panel:
         return [*across, *up, below, Text(self.left - FIRST + 0.05, TALL + 0.22, self.title, small)]
 
     def _ticks_across(self) -> list[tuple[float, str]]:
-        return _told(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
+        return _ticks(MaxNLocator(_MAX_TICKS).tick_values(*self.x), self.x)
 
     def _ticks_up(self) -> list[tuple[float, str]]:
         locator = log_places(*self.y, most=_MAX_TICKS) if self.log else MaxNLocator(_MAX_TICKS)
-        return _told(locator.tick_values(*self.y), self.y)
+        return _ticks(locator.tick_values(*self.y), self.y)
 
 
-def _told(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, str]]:
+def _ticks(places: ArrayLike, limits: tuple[float, float]) -> list[tuple[float, str]]:
     """The ticks between the limits, with their numbers."""
     return [(x, f"{x:g}") for x in np.asarray(places, float).tolist() if limits[0] <= x <= limits[1]]
 

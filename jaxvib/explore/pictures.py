@@ -22,7 +22,7 @@ from jaxvib.steady.whirl import critical_speeds, whirl
 
 __all__ = [
     "ABOUT",
-    "Tried",
+    "SceneOrProblem",
     "diagram",
     "has_branches",
     "heading",
@@ -32,9 +32,9 @@ __all__ = [
     "prepare",
     "prepare_counts",
     "readings",
+    "scene_or_problem",
     "text",
     "toml",
-    "tried",
 ]
 
 ABOUT = """Springs and dampers, masses and drags of loads: a tenth to ten times the file's. Arrow keys move a slider by a
@@ -52,22 +52,22 @@ _PREPARED_COUNTS = 7
 """Number of other numbers of loads that are compiled while the page is open."""
 
 
-class Tried(NamedTuple):
+class SceneOrProblem(NamedTuple):
     """Requested scene, or a sentence that says why there is none."""
 
     value: Scene | None
     problem: str
 
 
-def tried(ask: Callable[[], Scene]) -> Tried:
+def scene_or_problem(ask: Callable[[], Scene]) -> SceneOrProblem:
     """The scene that `ask` gives, or what its `InputError` says: a slider may go where no machine is."""
     try:
-        return Tried(ask(), "")
+        return SceneOrProblem(ask(), "")
     except (InputError, ComputationError) as error:
-        return Tried(None, str(error))
+        return SceneOrProblem(None, str(error))
 
 
-def image(draw: Callable[[], str], scene: Tried) -> str:
+def image(draw: Callable[[], str], scene: SceneOrProblem) -> str:
     """The text of an SVG file as an HTML image that holds its own data, or the sentence that says why there is none."""
 
     def made() -> str:
@@ -77,12 +77,12 @@ def image(draw: Callable[[], str], scene: Tried) -> str:
     return _shown(made, scene)
 
 
-def text(read: Callable[[], str], scene: Tried) -> str:
+def text(read: Callable[[], str], scene: SceneOrProblem) -> str:
     """Text as HTML, as it stands, or the sentence that says why there is none."""
     return _shown(lambda: f'<pre style="white-space:pre-wrap;font-size:0.8rem">{html.escape(read())}</pre>', scene)
 
 
-def _shown(make: Callable[[], str], scene: Tried) -> str:
+def _shown(make: Callable[[], str], scene: SceneOrProblem) -> str:
     problem = scene.problem
     if not problem:
         try:
@@ -92,7 +92,7 @@ def _shown(make: Callable[[], str], scene: Tried) -> str:
     return f"<p><b>Nothing to show here:</b> {html.escape(problem)}</p>"
 
 
-def toml(scene: Tried) -> str:
+def toml(scene: SceneOrProblem) -> str:
     """The scene file of what the sliders say; empty where they say no machine."""
     return "" if scene.value is None else scene_to_toml(scene.value)
 
@@ -102,7 +102,7 @@ def prepare(scene: Scene) -> None:
     for slider in sliders_of(scene):
         if slider.place is not None:  # another number of loads is another program
             moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
-            tried(functools.partial(scene_at, scene, moved))
+            scene_or_problem(functools.partial(scene_at, scene, moved))
     for _ in range(2):
         _draw_all(scene)
     gc.collect()
@@ -117,14 +117,14 @@ def prepare_counts(scene: Scene) -> None:
         if slider.place is None:
             others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED_COUNTS]
             for count in others:
-                moved = tried(functools.partial(scene_at, scene, {slider.name: count})).value
+                moved = scene_or_problem(functools.partial(scene_at, scene, {slider.name: count})).value
                 if moved is not None:
                     _draw_all(moved)
 
 
 def _draw_all(scene: Scene) -> None:
     most = 4.0 / 3.0 * float(scene.drive.speed)
-    given = Tried(scene, "")
+    given = SceneOrProblem(scene, "")
     image(lambda: diagram(scene, most), given)
     text(lambda: readings(scene), given)
     image(lambda: machine(scene, next(iter(modes_of(scene)), None)), given)

@@ -54,11 +54,11 @@ def require_marimo() -> None:
 
 def require_free(port: int) -> None:
     """**Raises** `InputError` if another program listens at that port of this computer, or if the port may not be used."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tried:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
         # As the server does: a port that a page left a minute ago is free.
-        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(os.name == "posix"))
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, int(os.name == "posix"))
         try:
-            tried.bind((_HOST, port))
+            listener.bind((_HOST, port))
         except OSError as error:
             raise InputError(
                 "--port", f"is {port}, which cannot be used ({error.strerror}); name another, such as --port {port % 60000 + 1}"
@@ -97,10 +97,10 @@ def guarded(page: _Page, token: str, port: int) -> _Page:
     return application
 
 
-def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) -> None:
+def serve(scene: Path, port: int, browser: bool, announce: Callable[[str], None]) -> None:
     """Serve the page of a scene file until it is interrupted, and end the process.
 
-    **Arguments**: `scene` file; `port` of this computer; `browser`: True opens the page; `said` is called with its address.
+    **Arguments**: `scene` file; `port` of this computer; `browser`: True opens the page; `announce` is called with its address.
 
     **Raises** `InputError` if marimo is not installed or the port is taken.
     """
@@ -114,7 +114,7 @@ def serve(scene: Path, port: int, browser: bool, said: Callable[[str], None]) ->
     page = marimo.create_asgi_app(quiet=True)
     page = page.with_app(path=f"/{token}", root=str(Path(__file__).with_name("page.py"))).build()
     address = f"http://{_HOST}:{port}/{token}/"
-    said(address)
+    announce(address)
     if browser:
         opener = threading.Timer(1.0, webbrowser.open, [address])
         opener.daemon = True

@@ -137,15 +137,15 @@ def _figure(name: str, figure: Figure) -> str:
 
 
 def _versions() -> str:
-    said = []
+    versions = []
     for name in _LIBRARIES:
         try:
-            said.append(f"{name} {version(name)}")
+            versions.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
     when = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     where = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    return f"<p>{escaped(', '.join([*said, where]))}</p><p>{escaped(when)}</p>"
+    return f"<p>{escaped(', '.join([*versions, where]))}</p><p>{escaped(when)}</p>"
 
 
 _PAGE = """<!doctype html>

@@ -43,9 +43,9 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
         if axes[:1] != (axis,) or values.ndim != len(axes):
             continue
         for place in np.ndindex(values.shape[1:]):
-            said = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
+            places = [_label(labels, a, k, n) for a, k, n in zip(axes[1:], place, values.shape[1:], strict=True)]
             own = _own_unit(unit, axes[1:], place, units)
-            head, column = " ".join([name, *filter(None, said)]), values[(slice(None), *place)]
+            head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
                 heads.append(f"{part}{head} ({own})" if own else part + head)

@@ -80,8 +80,8 @@ def load(path: str | Path) -> Any:
     try:
         with open_regular(path) as file:
             arrays = _arrays(file)
-        layout, told = (str(arrays.pop(name, "")) for name in (_LAYOUT, _DIGEST))
-        if told != _digest(layout, arrays):
+        layout, digest = (str(arrays.pop(name, "")) for name in (_LAYOUT, _DIGEST))
+        if digest != _digest(layout, arrays):
             raise ValueError("changed since it was saved")
         found = _decoded(json.loads(layout), arrays)
         if not isinstance(found, eqx.Module):

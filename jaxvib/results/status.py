@@ -72,8 +72,8 @@ def sentence(status: eqx.Enumeration) -> str:
     enumeration = enumeration_of(status)
     if names.ndim == 0:  # by its name: a status that went through NumPy is no member any more
         return enumeration[getattr(enumeration, str(names))]
-    said = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
-    parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in said.items() if k]
+    counts = {name: int(np.sum(names == name)) for name in enumeration_names(enumeration)}
+    parts = [f"{enumeration[getattr(enumeration, name)]} ({k} of {names.size})" for name, k in counts.items() if k]
     return "; ".join(parts) or "there is none"
 
 

@@ -87,8 +87,8 @@ def animate(
     speed = _fastest(motion, owner)
     turns = speed * (last - first) / (2.0 * np.pi)
     lasts = None if seconds is None else float(number(seconds, "s", "seconds", low=0.0, open_low=True))
-    wanted = int(np.ceil(turns / _SMOOTH)) if lasts is None else lasts * fps
-    count = round(float(np.clip(wanted, 2, _MAX_PICTURES)))
+    pictures = int(np.ceil(turns / _SMOOTH)) if lasts is None else lasts * fps
+    count = round(float(np.clip(pictures, 2, _MAX_PICTURES)))
     if turns / count > _TURN:
         most = first + _TURN * 2.0 * np.pi * count / speed
         problem = f"makes the rotor go on by {turns / count:.3g} turns from one picture to the next, which deceives the eye"

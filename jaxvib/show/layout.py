@@ -50,12 +50,12 @@ def lanes(ties: list[Tie], levels: int) -> list[int]:
     best = cost(order)
     while True:
         swaps = [(i, j) for i in range(len(order)) for j in range(i)]
-        tried = []
+        candidates = []
         for i, j in swaps:
             other = order.copy()
             other[i], other[j] = other[j], other[i]
-            tried.append((cost(other), other))
-        least, other = min(tried, default=(best, order))
+            candidates.append((cost(other), other))
+        least, other = min(candidates, default=(best, order))
         if not least < best - 1e-12:
             return order
         best, order = least, other

@@ -37,7 +37,7 @@ def _tie(
     return found
 
 
-def _said(stiffness: float, damping: float) -> str:
+def _spring_text(stiffness: float, damping: float) -> str:
     """The numbers of a spring and a damper, a line each."""
     return "\n".join([shown(stiffness, "N/m")] * (stiffness > 0.0) + [shown(damping, "N s/m")] * (damping > 0.0))
 
@@ -146,7 +146,7 @@ class PlatformView(View):
             if not tie.exciter:
                 middle = 0.5 * self.pitch * (tie.low + tie.high if tie.high - tie.low == 1 else 2 * tie.high - 1)
                 place = (self.x[k] + 0.42, middle)
-                found.append(Text(*place, _said(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
+                found.append(Text(*place, _spring_text(tie.stiffness, tie.damping), {"va": "center", "fontsize": "small"}))
         for level, (left, right) in enumerate(self.spans, start=1):
             # On the longer piece of the platform beside the exciter.
             x = self.x[len(self.ties) - 1]
@@ -217,12 +217,12 @@ class FrontView(View):
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """The mass, and the support's numbers, which hold both ways."""
-        told = _said(float(np.max(self.bed_stiffness[1])), float(np.max(self.bed_damping[1])))
+        label = _spring_text(float(np.max(self.bed_stiffness[1])), float(np.max(self.bed_damping[1])))
         small: Look = {"fontsize": "small"}
         mass = f"M = {shown(float(self.mass[0, 0]), 'kg')}"
         found = [
-            Text(0.55, -1.75, told, {**small, "va": "center"}),
-            Text(-1.95, 0.62, told, {**small, "ha": "center", "va": "center"}),
+            Text(0.55, -1.75, label, {**small, "va": "center"}),
+            Text(-1.95, 0.62, label, {**small, "ha": "center", "va": "center"}),
             Text(1.05, 1.2, mass, small),
         ]
         return [*found, Text(3.2, -1.15, "section of the track,\naxis to the left", {**small, "ha": "center", "va": "top"})][
@@ -297,13 +297,13 @@ class ShaftView(View):
             inertia += f"\nC = {shown(float(np.max(np.abs(np.asarray(turning)))), 'kg m²')}"
         found = [Text(self._x(self.cg), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.stands:
-            text = f"{_said(k, c)}\nat {1e3 * (s - self.cg):+.4g} mm"
+            text = f"{_spring_text(k, c)}\nat {1e3 * (s - self.cg):+.4g} mm"
             right = self._x(s) >= self._x(self.cg)
             place = self._x(s) + (0.42 if right else -0.42)
             found.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
         shown_at = sorted({round(1e3 * (float(s) - self.cg), 6) for s in self.stations})
-        told = ", ".join(f"{s:+.4g}" for s in shown_at) + " mm"
-        found.append(Text(0.0, 1.3, f"loads at {told}", {**small, "ha": "center", "va": "bottom"}))
+        label = ", ".join(f"{s:+.4g}" for s in shown_at) + " mm"
+        found.append(Text(0.0, 1.3, f"loads at {label}", {**small, "ha": "center", "va": "bottom"}))
         found.append(Text(self.front, -1.2, "along the axis", {**small, "ha": "center", "va": "top"}))
         return found
 

@@ -88,12 +88,12 @@ def on_a_cluster(
             yield chunk, found
 
 
-def _remote(study: Study, chunk: int, key: str, wanted: dict[str, str], precise: bool) -> Chunk | str:
+def _remote(study: Study, chunk: int, key: str, expected_versions: dict[str, str], precise: bool) -> Chunk | str:
     """Cases of a chunk, computed on a worker, or the reason why it may not compute them: its versions are others than the
     store's."""
     for name, version in versions().items():
-        if wanted[name] != version:
-            return f"has {name} {version}, and the store was begun with {wanted[name]}: digits would differ"
+        if expected_versions[name] != version:
+            return f"has {name} {version}, and the store was begun with {expected_versions[name]}: digits would differ"
     jax.config.update("jax_enable_x64", precise)
     take_a_device()
     if key not in _STUDIES:  # the first copy that came here is kept, whose functions the program was compiled for

@@ -156,5 +156,5 @@ def _computed(
 def _sentence(error: Exception) -> str:
     """The line of an error that says what happened."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    said = [line for line in lines if line.split(":")[0].endswith(("Error", "Exception")) and ": " in line]
-    return (said or lines or [type(error).__name__])[-1]
+    messages = [line for line in lines if line.split(":")[0].endswith(("Error", "Exception")) and ": " in line]
+    return (messages or lines or [type(error).__name__])[-1]

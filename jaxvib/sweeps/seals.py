@@ -72,12 +72,12 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
         return True
     try:
         with open_regular(path) as file:
-            said = file.read(256)
+            stored_seal = file.read(256)
     except FileNotFoundError:
         return None
     except OSError:
         return False
-    if said != f"{chunk} {_digest(files)}\n".encode():
+    if stored_seal != f"{chunk} {_digest(files)}\n".encode():
         return False
     _intact[str(path)] = stamps
     return True
@@ -86,22 +86,22 @@ def is_sealed(store: Path, chunk: int, files: Mapping[str, Path]) -> bool | None
 def seal_layout(store: Path) -> None:
     """Write down all files of a store that has no chunks yet: metadata, values of axes."""
     files = {path.relative_to(store).as_posix(): path for path in sorted(store.rglob("*")) if path.is_file()}
-    told = {name: _digest({name: path}) for name, path in files.items()}
+    digests = {name: _digest({name: path}) for name, path in files.items()}
     (store / FOLDER).mkdir()
     (store / FOLDER / _LOCK).touch()
-    body = json.dumps(told, sort_keys=True)
-    (store / FOLDER / _LAYOUT).write_text(json.dumps({"files": told, "digest": hashlib.sha256(body.encode()).hexdigest()}))
+    body = json.dumps(digests, sort_keys=True)
+    (store / FOLDER / _LAYOUT).write_text(json.dumps({"files": digests, "digest": hashlib.sha256(body.encode()).hexdigest()}))
 
 
 def changed_layout(store: Path) -> str | None:
     """Description of the first file that is not as it was when the store was created; None if there is none."""
     try:
         layout = json.loads(read_text(store / FOLDER / _LAYOUT, "a store"))
-        told = layout["files"]
-        body = json.dumps(told, sort_keys=True)
+        digests = layout["files"]
+        body = json.dumps(digests, sort_keys=True)
         if layout["digest"] != hashlib.sha256(body.encode()).hexdigest():
             return f"{FOLDER}/{_LAYOUT} is not what was written"
-        for name, digest in told.items():
+        for name, digest in digests.items():
             if Path(name).is_absolute() or ".." in Path(name).parts or digest != _digest({name: store / name}):
                 return f"{name} is missing or not what was written"
     except (InputError, RecursionError, ValueError, KeyError, TypeError, AttributeError):

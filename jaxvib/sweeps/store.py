@@ -239,10 +239,10 @@ class Store:
             for name, leaf in cases.found.items():
                 self.arrays[name][region] = leaf.reshape(*shape, *leaf.shape[1:])
             if cases.errors:
-                said = np.full(int(np.prod(shape)), "", dtype=object)
+                sentences = np.full(int(np.prod(shape)), "", dtype=object)
                 for place, words in cases.errors.items():
-                    said[place] = words
-                self.group["error"][region] = said.reshape(shape)
+                    sentences[place] = words
+                self.group["error"][region] = sentences.reshape(shape)
             self.arrays["status"][region] = cases.status.reshape(shape)
             seals.seal(self.path, chunk, self._files(chunk))
         except OSError as error:
@@ -320,7 +320,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
     def add(
         name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...], kind: object, **more: Plain
     ) -> Any:
-        told = {key: value for key, value in more.items() if key != "fill" and value}
+        array_attributes = {key: value for key, value in more.items() if key != "fill" and value}
         return group.create_array(
             name,
             shape=shape,
@@ -328,7 +328,7 @@ def _fill(zarr: ModuleType, path: Path, study: Study) -> None:
             dtype=kind,
             dimension_names=dims,
             fill_value=more["fill"],
-            attributes=told,
+            attributes=array_attributes,
             compressors=ZstdCodec(level=1, checksum=True),
         )
 

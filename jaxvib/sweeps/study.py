@@ -107,9 +107,11 @@ def study(
         problem = f"cannot be computed ({type(error).__name__}: {error}); it gets a Scene and gives a number of JAX"
         raise InputError("measure", problem) from error
     for name, m, form in zip(names, measures, forms, strict=True):
-        wanted = 1 if isinstance(m, RunMeasure) and m.axis else 0
-        if len(form.shape) != wanted:
-            raise InputError(f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * wanted))
+        axes_count = 1 if isinstance(m, RunMeasure) and m.axis else 0
+        if len(form.shape) != axes_count:
+            raise InputError(
+                f"measure.{name}", f"has shape {form.shape}; a scalar is needed" + (", with one axis" * axes_count)
+            )
     return dataclasses.replace(made, forms=tuple(forms))
 
 
@@ -223,8 +225,8 @@ def _function(table: Mapping[str, object], name: str, field: str) -> Quantity:
     try:
         found = getattr(importlib.import_module(module), function)
     except Exception as error:  # whatever the module of the user raises
-        said = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
-        problem = f"is {quoted(table['function'])}, which cannot be imported ({said}); write 'module:function'"
+        reason = f"{error}" if isinstance(error, (ImportError, AttributeError)) else f"{type(error).__name__}: {error}"
+        problem = f"is {quoted(table['function'])}, which cannot be imported ({reason}); write 'module:function'"
         raise InputError(f"{field}.function", problem) from error
     return Quantity(name or function, str(table.get("unit", "")), found)
 

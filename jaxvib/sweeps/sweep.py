@@ -169,7 +169,7 @@ def sweep(
     >>> found.data.jam_frequency.sel({"drive.speed": 60.0}).round(1).values.tolist()
     [25.9, 27.0, 27.4]
     """
-    asked = study(
+    new_study = study(
         scene,
         axes,
         measure,
@@ -183,11 +183,11 @@ def sweep(
         seed=seed,
         chunk=chunk,
     )
-    return run_study(asked, store, workers=workers, scheduler=scheduler, timeout=timeout, report=report)
+    return run_study(new_study, store, workers=workers, scheduler=scheduler, timeout=timeout, report=report)
 
 
 def run_study(
-    asked: Study,
+    new_study: Study,
     store: str | Path,
     *,
     workers: int | None = None,
@@ -203,15 +203,15 @@ def run_study(
         if workers > (most := max(_MAX_WORKERS, 4 * (os.cpu_count() or 1))):
             raise InputError("workers", f"is {workers}, too many processes for this machine; give at most {most}")
     if not path.exists():
-        Store.create(path, asked)
+        Store.create(path, new_study)
     kept = Store(path, writable=True)
     with kept.locked():
-        return _computed(kept, asked, begun, workers, scheduler, timeout, report)
+        return _computed(kept, new_study, begun, workers, scheduler, timeout, report)
 
 
 def _computed(
     kept: Store,
-    asked: Study,
+    new_study: Study,
     begun: float,
     workers: int | None,
     scheduler: str | None,
@@ -219,35 +219,35 @@ def _computed(
     report: Report | None,
 ) -> Sweep:
     """Compute what is missing in a store that this process has locked, and again what is damaged."""
-    if (changed := asked.changed()) is not None:
+    if (changed := new_study.changed()) is not None:
         problem = "is a function of which a part, or a value that it refers to, has changed since the study was made"
         raise InputError(f"measure.{changed}", f"{problem}; make the study again")
-    kept.require_same(asked)
+    kept.require_same(new_study)
     states = kept.states(writing=True)
     damaged = np.flatnonzero(states == ChunkState.damaged)
     for chunk in damaged:
         kept.clear(int(chunk))
     finished = states == ChunkState.finished
-    sizes = np.asarray([_cases(asked, chunk) for chunk in range(finished.size)])
-    add = timed(asked.grid.cases, int(np.sum(sizes[finished])), report)
+    sizes = np.asarray([_cases(new_study, chunk) for chunk in range(finished.size)])
+    add = timed(new_study.grid.cases, int(np.sum(sizes[finished])), report)
     todo = np.flatnonzero(~finished).tolist()
     if todo:
         if workers is None and scheduler is None:
-            source = in_this_process(asked, todo)
+            source = in_this_process(new_study, todo)
         else:
             from jaxvib.sweeps.cluster import on_a_cluster  # asks for Dask
 
-            source = on_a_cluster(asked, todo, workers=workers, scheduler=scheduler, timeout=timeout)
+            source = on_a_cluster(new_study, todo, workers=workers, scheduler=scheduler, timeout=timeout)
         with contextlib.closing(source):
             for chunk, cases in source:
-                kept.write(asked, chunk, cases)
+                kept.write(new_study, chunk, cases)
                 add(int(sizes[chunk]))
     states[:] = ChunkState.finished
     return _found(kept, states, int(np.sum(sizes[~finished])), time.perf_counter() - begun, int(np.sum(sizes[damaged])))
 
 
-def _cases(asked: Study, chunk: int) -> int:
-    return int(np.prod([s.stop - s.start for s in asked.grid.region(chunk)], dtype=np.int64))
+def _cases(new_study: Study, chunk: int) -> int:
+    return int(np.prod([s.stop - s.start for s in new_study.grid.region(chunk)], dtype=np.int64))
 
 
 @validated

@@ -93,12 +93,12 @@ class Under(_OfPart):
     case: Changed = Changed("", ())
 
     def read(self, evaluation: Evaluation) -> Array:
-        return self._asked(evaluation, self.parts[0].read)
+        return self._value_of_cases(evaluation, self.parts[0].read)
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
-        return self._asked(evaluation, lambda inner: self.parts[0].pieces(inner, sign))
+        return self._value_of_cases(evaluation, lambda inner: self.parts[0].pieces(inner, sign))
 
-    def _asked(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
+    def _value_of_cases(self, evaluation: Evaluation, question: Callable[[Evaluation], Array]) -> Array:
         scene, path = evaluation.under(self.case)
         inner = Evaluation(scene, evaluation.known, path)
         value = question(inner)

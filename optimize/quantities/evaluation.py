@@ -175,9 +175,9 @@ class Evaluation:
         return case.scenes(self.scene), (*self.path, case)
 
 
-def guesses(modes: JamModes, asked: Target) -> Array:
+def guesses(modes: JamModes, target: Target) -> Array:
     """The load speed, rad/s, of what is asked of the jam modes of a scene; NaN where there is none."""
-    what, mode = asked
+    what, mode = target
     omega = modes.select(mode, throw=False).omega
     if what == "jam":
         return omega

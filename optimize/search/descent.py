@@ -98,8 +98,8 @@ def _step(problem: Problem, lane: _Lane, rate: Array) -> tuple[_Lane, Array]:
     move, adam = _ADAM.update(_along(slope, held, free), lane.adam)
     step = -rate * _along(jnp.asarray(move), held, free)
     if m:
-        wanted = -_least(held, off)
-        stopped = ((lane.z <= 0.0) & (wanted < 0.0)) | ((lane.z >= 1.0) & (wanted > 0.0))
+        correction = -_least(held, off)
+        stopped = ((lane.z <= 0.0) & (correction < 0.0)) | ((lane.z >= 1.0) & (correction > 0.0))
         step = step - _least(held * jnp.where(stopped, 0.0, 1.0)[None, :], off)
     z = jnp.clip(lane.z + lane.length * step, 0.0, 1.0)
     near = tuple(_ahead(w, r, z - lane.z) for w, r in zip(lane.known, lane.reach, strict=True))

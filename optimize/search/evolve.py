@@ -115,8 +115,8 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
             options = {"bounds": [0, 1], "seed": 1 + seed + run, "verbose": -9, "popsize": population << run}
             strategy = cma.CMAEvolutionStrategy(begin, 0.3, options)
             while not strategy.stop() and drawn < evaluations:
-                asked = np.clip(np.asarray(strategy.ask()), 0.0, 1.0)
-                z = asked[:, : problem.space.size]
+                samples = np.clip(np.asarray(strategy.ask()), 0.0, 1.0)
+                z = samples[:, : problem.space.size]
                 values = followed.of(z)
                 there = np.all(np.isfinite(values), axis=1)
                 drawn, existing = drawn + len(z), existing + int(np.sum(there))
@@ -124,7 +124,7 @@ def evolve(problem: Problem, evaluations: int, seed: int, tell: Callable[[float,
                     size = max(float(np.median(np.abs(values[there, 0]))), 1e-300)
                 broken = np.sum(np.abs(values[:, 1 : 1 + m]), axis=1) + np.sum(np.maximum(values[:, 1 + m :], 0.0), axis=1)
                 merit = np.where(there, np.nan_to_num(values[:, 0] / size + _PRICE * broken), _NOWHERE)
-                strategy.tell(list(asked), list(merit))
+                strategy.tell(list(samples), list(merit))
                 merits, designs = _best(np.concatenate([merits, merit]), np.concatenate([designs, z]))
                 history.append(float(values[np.argmin(merit), 0]))
                 tell(drawn / evaluations, merits[0] * size if len(merits) and merits[0] < _NOWHERE else np.nan)

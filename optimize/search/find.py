@@ -140,7 +140,7 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
     history.append(point.values[None, :, 0])
     begun = last = point
 
-    def said(what: str, low: float, high: float) -> Callable[[float, Point], None]:
+    def progress_of(what: str, low: float, high: float) -> Callable[[float, Point], None]:
         def tell_of(share: float, now: Point) -> None:
             nonlocal last
             last = now
@@ -151,10 +151,10 @@ def _find(problem: Problem, options: Options, tell: Tell) -> Found | None:
 
     try:
         if options.iterations:
-            descended = descend(problem, point, options.iterations, options.rate, said("descending", 0.1, 0.5))
+            descended = descend(problem, point, options.iterations, options.rate, progress_of("descending", 0.1, 0.5))
             history.append(descended.history)
             point = descended.point
-        ended = polish(problem, point, options.polishing, said("polishing", 0.5, 0.9))
+        ended = polish(problem, point, options.polishing, progress_of("polishing", 0.5, 0.9))
     except KeyboardInterrupt:
         interrupted = True
         ended = polish(problem, last, 0, lambda *_: None)

@@ -104,7 +104,7 @@ class Problem(eqx.Module):
 def _followed(space: DesignSpace, objective: Quantity, demands: Sequence[Demand]) -> tuple[tuple[Key, ...], int]:
     """Load speeds that a search follows, and the number of smooth pieces of which its objective is the largest."""
     sides = (q for demand in demands for q in (demand.quantity, demand.limit))
-    return _asked((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
+    return _targets((objective, *(h.quantity for h in space.held), *sides), _Shapes.of(space.scene))
 
 
 def _hard(quantity: Quantity) -> bool:
@@ -216,11 +216,11 @@ def _looked_up(keys: tuple[Key, ...], scenes: Scene) -> tuple[Array, ...]:
                     at, several = case.scenes(at), several or case.several
                 paths[path] = jax.lax.map(jam_modes, at) if several else jam_modes(at)
 
-        def guess(path: tuple, asked: tuple[str, int]) -> Array:
+        def guess(path: tuple, target: tuple[str, int]) -> Array:
             modes = paths[path]
-            return jax.vmap(lambda m: guesses(m, asked))(modes) if modes.omega.ndim > 1 else guesses(modes, asked)
+            return jax.vmap(lambda m: guesses(m, target))(modes) if modes.omega.ndim > 1 else guesses(modes, target)
 
-        return tuple(guess(path, asked) for path, asked in keys)
+        return tuple(guess(path, target) for path, target in keys)
 
     # One after the other: that compiles in two thirds of the time and takes no longer.
     return jax.lax.map(one, scenes)
@@ -270,7 +270,7 @@ class _Shapes(NamedTuple):
 
 
 @functools.lru_cache(maxsize=256)
-def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
+def _targets(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key, ...], int]:
     """Load speeds that these quantities of a scene follow, and the number of smooth pieces of which the first one is the
     largest."""
     recorder = TargetRecorder()
@@ -286,7 +286,7 @@ def _asked(quantities: tuple[Quantity, ...], shapes: _Shapes) -> tuple[tuple[Key
 
 def report_keys(quantities: Sequence[Quantity], scene: Scene) -> tuple[Key, ...]:
     """Load speeds that these quantities follow."""
-    return _asked(tuple(quantities), _Shapes.of(scene))[0]
+    return _targets(tuple(quantities), _Shapes.of(scene))[0]
 
 
 @cached

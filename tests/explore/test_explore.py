@@ -14,6 +14,7 @@ from scenes import TWO_MASS
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.explore import pictures, serve
+from jaxvib.explore.pictures import SceneOrProblem, scene_or_problem
 from jaxvib.explore.sliders import COUNT, scene_at, sliders_of
 from jaxvib.machine.files import TEMPLATES
 from jaxvib.show.moving import moving
@@ -104,9 +105,9 @@ def test_a_rotor_has_a_campbell_diagram_and_a_sentence_why():
 def test_what_cannot_be_shown_is_said(one_mass):
     stop = jv.Stop(platform=1, stiffness=1e6, gap=1e-3)
     bent = jv.Scene(one_mass.machine, one_mass.loads, one_mass.drive, (stop,))
-    said = pictures.image(lambda: pictures.diagram(bent, 100.0), pictures.Tried(bent, ""))
+    said = pictures.image(lambda: pictures.diagram(bent, 100.0), SceneOrProblem(bent, ""))
     assert "<b>Nothing to show here:</b> effects.stop" in said
-    no_room = pictures.tried(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
+    no_room = scene_or_problem(lambda: jv.Scene(one_mass.machine, jv.balls(count=0, mass=1, radius=1, drag=1), one_mass.drive))
     assert pictures.toml(no_room) == "" and "loads.count" in pictures.text(lambda: "", no_room)
 
 
@@ -148,10 +149,10 @@ def test_the_page_follows_its_sliders(one_mass, tmp_path, monkeypatch):
     moved = scene_at(one_mass, {**found["controls"].value, "machine.stiffness[0]": 200.0})
     before, after = jv.jam_modes(one_mass), jv.jam_modes(moved)
     assert float(after.resonances[0] / before.resonances[0]) == pytest.approx(2.0, rel=1e-12)
-    assert f"{float(after.resonances[0]):.6g}" in pictures.text(lambda: pictures.readings(moved), pictures.Tried(moved, ""))
+    assert f"{float(after.resonances[0]):.6g}" in pictures.text(lambda: pictures.readings(moved), SceneOrProblem(moved, ""))
     drawn = pictures.diagram(moved, 4.0 / 3.0 * float(one_mass.drive.speed))
     assert max(map(len, _drawn_lines(diagram))) > 40 and _drawn_lines(drawn) != _drawn_lines(diagram)
-    again = jv.scene_from_toml(pictures.toml(pictures.Tried(moved, "")))
+    again = jv.scene_from_toml(pictures.toml(SceneOrProblem(moved, "")))
     assert float(again.machine.stiffness[0]) == 2e5
 
 
@@ -252,7 +253,7 @@ def test_every_template_has_a_picture_and_modes_to_choose(kind):
     scene = jv.scene_from_toml(TEMPLATES[kind])
     modes = pictures.modes_of(scene)
     assert modes == [] if not pictures.has_branches(scene) else modes[0] in jv.jam_modes(scene).mode_numbers()
-    shown = pictures.image(lambda: pictures.machine(scene, next(iter(modes), None)), pictures.Tried(scene, ""))
+    shown = pictures.image(lambda: pictures.machine(scene, next(iter(modes), None)), SceneOrProblem(scene, ""))
     data = shown.split("base64,")[1].split('"')[0]
     assert ElementTree.fromstring(base64.b64decode(data)).tag.endswith("svg")
 

@@ -33,16 +33,16 @@ def test_results_are_given_in_the_units_of_designers(searched):
     )
     influences = (*(Influence(f"number {k}", float(k), -float(k) / 2.0) for k in range(7)), Influence("last", -1.5, 9.0))
     machines = (Machine(3, 2e4, (1.0,)), Machine(1, 3e4, (2.0,)))
-    said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).said()
+    said = dataclasses.replace(searched, limits=limits, influences=influences, machines=machines).findings()
     assert said[0] == "  at its limit: first at most 2 mm (2 mm); moved by 1 %: about -0.5 % of the objective"
     assert said[1] == "  not met: second at most 3 mm; at best 3.3 mm, 10 % off"
     assert said[2] == "  met: third at most 4 mm (1 mm)"
     assert said[3] == "  1 % less / more last: -1.5 % / +9 % of the objective"
     assert [line.split(":")[0][-8:] for line in said[4:8]] == [f"number {k}" for k in (6, 5, 4, 3)]
     assert said[8] == "  2 different machines: 3 x 2e+04, 1 x 3e+04 N"
-    one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).said()
+    one = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=machines[:1]).findings()
     assert one == ["  1 % less / more x: +400 kN / -0.2 kN"]  # 2000 % of 2e4 N: of almost nothing a share tells nothing
-    none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).said()
+    none = dataclasses.replace(searched, limits=(), influences=(Influence("x", 2000.0, -1.0),), machines=()).findings()
     assert none == ["  1 % less / more x: +2e+03 % / -1 % of the objective"]
 
 
@@ -98,7 +98,7 @@ def test_shortfalls_are_told_in_a_designers_units():
     ],
 )
 def test_slopes_tell_small_changes_only(searched, gain, says):
-    (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).said()
+    (line,) = dataclasses.replace(searched, limits=(limit("a", 1.0, 1.0, gain=gain),), influences=(), machines=()).findings()
     assert line == f"  at its limit: a (1 m); {says}"
 
 

@@ -84,9 +84,9 @@ def audit_text(found: jv.Audit) -> str:
     head = ["effect", "advice", "amplitude", "force", "load speed", "fold", "by", "operations", "run", "compile"]
     rows = [_effect(row, found) for row in found.effects]
     if rows:
-        asked = f"what effects change, %; asked for {100.0 * found.accuracy:g} %"
+        heading = f"what effects change, %; asked for {100.0 * found.accuracy:g} %"
         absent = any(not row.present for row in found.effects)
-        lines.append(table(f"{asked}; (in brackets) what the scene has not, put in" if absent else asked, head, rows))
+        lines.append(table(f"{heading}; (in brackets) what the scene has not, put in" if absent else heading, head, rows))
     lines += [f"{row.effect}: {row.says}" for row in found.effects if row.says]
     offs = [
         [t.tier, *map(_percent, (t.amplitude, t.foundation_force, t.omega)), _seconds(t.seconds), _seconds(t.compile)]

@@ -41,10 +41,10 @@ def sweep(
     path = store or study.with_suffix(".zarr")
     if not resume and path.exists():
         raise InputError("--no-resume", f"is given, and {quoted(str(path))} is there already; name another one with --store")
-    asked = load_study(study)
+    definition = load_study(study)
     show = _Lines()
     try:
-        found = run_study(asked, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
+        found = run_study(definition, path, workers=workers, scheduler=scheduler, timeout=timeout, report=show)
     except KeyboardInterrupt:
         show.end()
         click.echo(f"stopped: what is finished is kept in {path}; the same command goes on from there", err=True)

@@ -20,7 +20,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import member
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.study.accuracy.exact_reference import usual_mode
-from jaxvib.study.audit.compared import CHANGES, Asked, EffectRow, effect_row, field_operations
+from jaxvib.study.audit.compared import CHANGES, EffectRow, RepeatedQuestion, effect_row, field_operations
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers
 from jaxvib.study.audit.questions import LEAST, JamQuestion, RunQuestion, admitted
 from jaxvib.study.audit.tiers import TierRow, tier_rows
@@ -90,8 +90,8 @@ class Audit(Result):
         a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 
-        told = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
-        changes = {told[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
+        plain_names = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
+        changes = {plain_names[name]: np.array([abs(getattr(row, name)) for row in self.effects]) for name in CHANGES}
         labels = [f"{row.effect.replace('_', ' ')}{'' if row.present else ' (put in)'}: {row.advice}" for row in self.effects]
         uncertainty = np.array([row.uncertainty for row in self.effects])
         added = np.array([row.operations for row in self.effects], float) / self.operations
@@ -153,7 +153,7 @@ def audit(
     count(repeats, "repeats", low=0)
     end = None if until is None else float(number(until, "s", "until", low=0.0, open_low=True))
     question, words = _question(scene, mode, end, start)
-    ask = Asked(question, repeats)
+    ask = RepeatedQuestion(question, repeats)
     own = ask.values(scene, ask.tier(scene))
     until = question.until if isinstance(question, RunQuestion) else None
     # Of a machine that hardly moves, what its loads could do: their unbalance radius.

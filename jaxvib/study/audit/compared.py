@@ -24,7 +24,7 @@ from jaxvib.study.accuracy.cost import timed
 from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
 from jaxvib.study.audit.variants import Variant
 
-__all__ = ["CHANGES", "Asked", "EffectRow", "effect_row", "field_operations", "relative_changes"]
+__all__ = ["CHANGES", "EffectRow", "RepeatedQuestion", "effect_row", "field_operations", "relative_changes"]
 
 CHANGES = ("amplitude", "foundation_force", "omega", "fold")
 """The quantities whose changes an audit tells, by their names in `EffectRow`."""
@@ -66,7 +66,7 @@ class EffectRow(NamedTuple):
         return max(known, default=math.nan)
 
 
-class Asked:
+class RepeatedQuestion:
     """A question and its answers, each computed once.
 
     **Arguments**: `question` a `JamQuestion` or `RunQuestion`; `repeats` of timings, 0 for none.
@@ -102,7 +102,7 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
         start = initial_state(scene)  # there is no such jam: a run takes its time all the same
     end = jnp.asarray(_TURNS * 2.0 * math.pi / float(scene.drive.speed))
     control = StepControl(jnp.asarray(_TOLERANCE, end.dtype), None, jnp.asarray(_MOST_STEPS, jnp.int32))
-    asked = (scene, end, start, control, jnp.asarray(20.0, end.dtype))
+    arguments = (scene, end, start, control, jnp.asarray(20.0, end.dtype))
 
     @jax.jit
     def anew(scene: Scene, end: Array, start: State, control: StepControl, turns: Array) -> Run:
@@ -111,9 +111,9 @@ def _times(scene: Scene, start: State, repeats: int) -> tuple[float, float]:
 
     with compiled_anew():
         begun = time.process_time()  # which others that compute beside do not change
-        program = anew.lower(*asked).compile()
+        program = anew.lower(*arguments).compile()
         compiling = time.process_time() - begun
-    _, seconds, _ = timed(lambda: program(*asked).omega, repeats)
+    _, seconds, _ = timed(lambda: program(*arguments).omega, repeats)
     return seconds, compiling
 
 
@@ -150,7 +150,7 @@ def _size(values: Values) -> float:
     return size if size > 0.0 else math.nan
 
 
-def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
+def effect_row(ask: RepeatedQuestion, scene: Scene, variant: Variant, accuracy: float) -> EffectRow:
     """The row of what `variant` has more or less than `scene`, judged at the relative `accuracy`."""
     tier = ask.tier(scene, variant.scene)
     own, other = ask.values(scene, tier), ask.values(variant.scene, tier)
@@ -184,20 +184,20 @@ def effect_row(ask: Asked, scene: Scene, variant: Variant, accuracy: float) -> E
 
 def _advice(row: EffectRow, new: str, old: str, accuracy: float) -> dict[str, str]:
     """`advice` and `says` of a row, where the motion is `new` with the effect and `old` without it."""
-    wanted = "needed" if row.present or row.says == "as given" else "perhaps needed"
-    said = [row.says]
+    advice_if_needed = "needed" if row.present or row.says == "as given" else "perhaps needed"
+    sentences = [row.says]
     if new != old:
-        said.append(f"without it: {old}; with it: {new}")
+        sentences.append(f"without it: {old}; with it: {new}")
     if new != old and "unsettled" not in (new, old):
-        advice = wanted
+        advice = advice_if_needed
     elif math.isnan(row.change) or math.isnan(row.uncertainty):
         advice = "cannot tell"
-        said.append(f"no change is known: {new}")
+        sentences.append(f"no change is known: {new}")
     elif row.change - row.uncertainty > accuracy:
-        advice = wanted
+        advice = advice_if_needed
     elif row.change + row.uncertainty <= accuracy and new == old:
         advice = "negligible"
     else:
         advice = "cannot tell"
-        said.append(f"the motion repeats to {row.uncertainty:.1e} only")
-    return {"advice": advice, "says": "; ".join(filter(None, said))}
+        sentences.append(f"the motion repeats to {row.uncertainty:.1e} only")
+    return {"advice": advice, "says": "; ".join(filter(None, sentences))}

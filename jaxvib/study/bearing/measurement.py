@@ -51,13 +51,13 @@ def measurement_from_tables(tables: Tables, folder: Path) -> Measurement:
         if not isinstance(table, Mapping):
             raise InputError(name, f"is {quoted(table)}; it must be a table, write [{name}]")
     pendulum = build_part(BearingPendulum, tables.get("pendulum", {}), "pendulum")
-    asked = build_part(_asked, tables.get("identify", {}), "identify")
+    options = build_part(_options, tables.get("identify", {}), "identify")
     part = tables.get("record", {})
     for name in part:
         if name not in _FIELDS:
             raise InputError(f"record.{name}", f"is no field here; {suggest_name(name, list(_FIELDS))}")
     record = build_part(_record, {_FIELDS[name]: value for name, value in part.items()}, "record")(folder)
-    return Measurement(pendulum, record, *asked)
+    return Measurement(pendulum, record, *options)
 
 
 def _record(
@@ -84,7 +84,7 @@ def _record(
     return read
 
 
-def _asked(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float]:
+def _options(dry: object = False, instrument: Number = 0.0) -> tuple[bool, float]:
     if not isinstance(dry, bool):
         raise InputError("identify.dry", f"is {quoted(dry)}; write true or false")
     return dry, float(number(instrument, "", "identify.instrument", low=0.0))

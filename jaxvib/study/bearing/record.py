@@ -173,14 +173,14 @@ def _is_number(cell: str, mark: str | None) -> bool:
 
 
 def _columns(
-    heads: list[list[str]], width: int, wanted: Sequence[str] | None, angle_unit: str | None, path: Path
+    heads: list[list[str]], width: int, requested: Sequence[str] | None, angle_unit: str | None, path: Path
 ) -> tuple[list[int], list[float]]:
     """Return the columns of time and angle, and the factors that make them SI."""
     if width < 2:
         raise InputError(str(path), "has one column; two are needed, time and angle, separated by commas, semicolons or tabs")
     given = None if angle_unit is None else _factor(angle_unit, "angle", f"{path}: unit of angle")
     if not heads:
-        if wanted is not None or width > 2:
+        if requested is not None or width > 2:
             raise InputError(
                 str(path), f"has {width} columns and no line of names; write one, for example time (s), angle (deg)"
             )
@@ -191,12 +191,12 @@ def _columns(
     places, factors = [], []
     for k, (what, known) in enumerate(_NAMES.items()):
         parts = [_parted(head, what) for head in heads[0]]
-        choice = tuple(name.strip().lower() for name in ((wanted[k],) if wanted is not None else known))
+        choice = tuple(name.strip().lower() for name in ((requested[k],) if requested is not None else known))
         found = [i for i, (name, _) in enumerate(parts) if {name.lower(), heads[0][i].lower()} & set(choice)]
-        if not found and wanted is None and width == 2:
+        if not found and requested is None and width == 2:
             found = [k]
         if len(found) != 1:
-            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {(wanted[k] if wanted else choice[0])!r}"
+            problem = f"has {len(found) or 'no'} column{'s' if found else ''} {(requested[k] if requested else choice[0])!r}"
             names = ", ".join(heads[0])
             raise InputError(str(path), f"{problem} for the {what}; its columns are {names}: name those of time and angle")
         place = found[0]

@@ -75,12 +75,12 @@ class RunUps(Result):
         """A line for each drag: shares of the kinds of motion that its starts came to, where they jammed, and what failed."""
         lines = [f"of {len(self.angle)} starts at each drag"]
         for k, drag in enumerate(self.drag):
-            said = []
+            portions = []
             for kind in (kind for kind in (*REGIMES, _FAILED) if np.any(self.kind[k] == kind)):
                 speeds = self.omega[k][self.kind[k] == kind]
                 at = f" at {_span(speeds)} rad/s" if kind == "jammed" else ""
-                said.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
-            lines.append(f"drag {drag:.4g} N s/m: {', '.join(said)}")
+                portions.append(f"{100.0 * np.mean(self.kind[k] == kind):.3g} % {kind}{at}")
+            lines.append(f"drag {drag:.4g} N s/m: {', '.join(portions)}")
         return "\n".join(lines)
 
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:

@@ -143,13 +143,13 @@ def stability_onset(
     low, high = between
     if not 0.0 < low < high:
         raise InputError("between", f"is {quoted(between)}; it must be two positive values, the lower one first")
-    for x, is_wanted in ((low, False), (high, True)):
-        if there(x) != is_wanted:
-            found, wanted = ("no", "a") if is_wanted else ("a", "no")
+    for x, is_required in ((low, False), (high, True)):
+        if there(x) != is_required:
+            found, required = ("no", "a") if is_required else ("a", "no")
             raise InputError(
                 "between",
-                f"is {quoted(between)}; at {x:g} the diagram has {found} {kind} and must have {wanted}: "
-                f"{'raise' if is_wanted else 'lower'} this value (stability_map shows the special points)",
+                f"is {quoted(between)}; at {x:g} the diagram has {found} {kind} and must have {required}: "
+                f"{'raise' if is_required else 'lower'} this value (stability_map shows the special points)",
             )
     while high / low > 1.0 + accuracy:
         middle = (low * high) ** 0.5

@@ -41,7 +41,7 @@ def test_multipliers_are_those_computed_by_hand():
     # d objective / d limit = - multiplier; the whole limit is 9, or 4.5.
     np.testing.assert_allclose([budget.multiplier, first.multiplier], [-1e8 * 9.0, -2e8 * 4.5], rtol=1e-6)
     assert budget.active and first.active and budget.gain < 0.0
-    lines = "\n".join(best.said())
+    lines = "\n".join(best.findings())
     assert "at its limit: sum of all support stiffnesses at most 90 N/mm (90 N/mm)" in lines
     assert [row.what for row in best.table[:2]] == ["stiffness of support 1", "stiffness of support 2"]
     assert best.rows()[0] == ["stiffness of support 1, N/mm", "50", "45", "", ""]
@@ -60,7 +60,7 @@ def test_contradictory_demands_are_named_with_what_is_missing():
     broken = [limit for limit in best.limits if limit.broken > 0.0]
     total_off = sum(limit.broken * abs(limit.limit) for limit in broken)
     np.testing.assert_allclose(total_off, 1e4, rtol=1e-4)
-    assert "not met" in "\n".join(best.said())
+    assert "not met" in "\n".join(best.findings())
     assert best.unverified == "the machine does not meet all demands" and best.run is None
     with pytest.raises(jv.ComputationError, match=r"contradictory: .*nearest: .*% off.*relax a demand"):
         found(space, NEAREST, subject_to=demands)
@@ -227,7 +227,7 @@ def test_a_robust_design_is_better_on_machines_it_has_not_seen():
 def test_influences_on_almost_nothing_are_told_in_its_unit():
     """The objective nearly vanishes at the best machine, so that per cent of it mean nothing."""
     result = found(DesignSpace(SCENE, FREE), NEAREST + Quantity("rest", "N^2/m^2", lambda s: jnp.asarray(1e-3)))
-    lines = [line for line in result.said() if "1 % less / more" in line]
+    lines = [line for line in result.findings() if "1 % less / more" in line]
     assert len(lines) == 2
     assert "+3.6e+05 N^2/m^2 / +3.6e+05 N^2/m^2" in lines[0] and "%" not in lines[0].split(":")[1]
 

@@ -19,7 +19,7 @@ from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
 from jaxvib.results.status import member
 from jaxvib.study.audit.audit import _as_computed
-from jaxvib.study.audit.compared import Asked, EffectRow, effect_row
+from jaxvib.study.audit.compared import EffectRow, RepeatedQuestion, effect_row
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
 from jaxvib.study.audit.prices import prices
 from jaxvib.study.audit.questions import JamQuestion, RunQuestion, Values, admitted
@@ -229,13 +229,13 @@ def test_advice(without, present, advice):
         ask, scene, variant = Answers(with_=own, without=without), SCENE, Variant("gravity", True, BARE)
     else:
         ask, scene, variant = Answers(with_=without, without=own), BARE, Variant("gravity", False, SCENE)
-    assert effect_row(Asked(ask, 0), scene, variant, 0.01).advice == advice
+    assert effect_row(RepeatedQuestion(ask, 0), scene, variant, 0.01).advice == advice
 
 
 def test_a_balanced_machine_is_judged_by_what_its_loads_could_do():
     still = Values("balanced", 10.0, (1e-12,), 1e-10, math.nan, 1e-9, magnified=1e9)
     moved = still._replace(amplitude=(3e-12,), uncertainty=1e-7)
-    row = effect_row(Asked(Answers(with_=still, without=moved), 0), SCENE, Variant("gravity", True, BARE), 0.01)
+    row = effect_row(RepeatedQuestion(Answers(with_=still, without=moved), 0), SCENE, Variant("gravity", True, BARE), 0.01)
     np.testing.assert_allclose([row.amplitude, row.foundation_force, row.uncertainty], [-2e-9, 0.0, 3e-7 + 1e-9], rtol=1e-12)
     assert row.advice == "negligible"
 
