@@ -10,7 +10,7 @@ from scenes import scene
 import jaxvib as jv
 from optimize import DesignSpace, Quantity, pareto, synthesize, total
 from optimize.pareto import Front
-from optimize.result import Influence, Limit, Machine, Outcome, Row, wanted
+from optimize.result import Influence, Limit, Machine, Outcome, Row, objective_text
 
 SCENE = scene("two_mass")
 
@@ -61,7 +61,7 @@ def test_rows_are_in_units_of_the_largest_value(searched):
     assert "  not verified: not asked for" in summary
     columns = [line.index(word) + len(word) for line, word in zip(summary[2:5], ("before", "0.5", "-3"), strict=True)]
     assert len(set(columns)) == 1
-    assert wanted("negative foundation_force") == "greatest foundation force"
+    assert objective_text("negative foundation_force") == "greatest foundation force"
 
 
 def test_outcomes_are_plain_for_json():
