@@ -8,6 +8,7 @@ from jaxvib.runtime.cpu import prepare_cpu
 # Machines
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.dimensionless import Dimensionless
+from jaxvib.machine.mount import Mount
 from jaxvib.machine.platforms import network, one_mass, three_mass, two_mass
 from jaxvib.machine.rotor import planar_rotor, rotor
 
@@ -114,6 +115,7 @@ __all__ = [
     # Machines
     "Machine",
     "Carrier",
+    "Mount",
     "one_mass",
     "two_mass",
     "three_mass",

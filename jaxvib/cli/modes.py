@@ -54,8 +54,7 @@ def modes(
     if exact:
         _exact(loaded, unit, csv, output)
         return
-    structure = loaded.machine.structure()
-    if phases or structure.axes != (1,):
+    if phases or loaded.machine.mounting().axes != (1,):
         if csv is not None:
             raise InputError("--csv", "writes branches over the load speed; jams at any phases have none, see --json")
         _phases(loaded, unit, output)
@@ -98,7 +97,15 @@ def modes(
         ]
         speed = float(loaded.drive.speed)
         resonances = ", ".join(f"{float(w):.5g} rad/s ({_RPM * float(w):.4g} rpm)" for w in found.resonances)
-        head = ["mode", "rad/s", "rpm", "by slope", "loads free", *(f"{name}, mm" for name in structure.coordinates), "force"]
+        head = [
+            "mode",
+            "rad/s",
+            "rpm",
+            "by slope",
+            "loads free",
+            *(f"{name}, mm" for name in loaded.machine.structure().coordinates),
+            "force",
+        ]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
             table("jam modes of light loads; amplitudes zero to peak, force on the bed in N", head, rows)

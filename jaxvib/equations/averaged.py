@@ -187,13 +187,13 @@ def averaged_field(scene: Scene) -> Averaged:
 
 def averaged_model(model: LinearModel) -> Averaged:
     """`averaged_field` of a scene that is assembled and checked already."""
-    carrier, loads, drive = model.carrier, turning_loads(model.scene), model.scene.drive
-    port, levers = carrier.port[None], jnp.ones((1, loads.count), dtype=carrier.port.dtype)
-    if carrier.stations is not None and carrier.tilt is not None:
-        port, levers = jnp.stack([carrier.port, carrier.tilt]), jnp.stack([levers[0], carrier.stations])
+    carrier, mount, loads, drive = model.carrier, model.mount, turning_loads(model.scene), model.scene.drive
+    one = jnp.ones((1, loads.count), dtype=model.mass.dtype)
+    levers = jnp.concatenate([one if lever is None else lever[None] for lever in mount.levers])
+    port = jnp.concatenate([rows[None] for rows in mount.rows[: len(mount.levers)]])
     n = carrier.mass.shape[0]
     parts = [carrier.stiffness, carrier.damping, port.reshape(-1, n).T]
-    parts += [] if carrier.gyroscopic is None else [carrier.gyroscopic]
+    parts += [] if mount.gyroscopic is None else [mount.gyroscopic]
     solved = small_solve(model.mass, jnp.concatenate(parts, axis=1))
     p = port.shape[0] * port.shape[1]
 
@@ -203,7 +203,7 @@ def averaged_model(model: LinearModel) -> Averaged:
     return Averaged(
         stiffness=solved[:, :n],
         damping=solved[:, n : 2 * n],
-        gyroscopic=None if carrier.gyroscopic is None else solved[:, 2 * n + p :],
+        gyroscopic=None if mount.gyroscopic is None else solved[:, 2 * n + p :],
         push=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
         port=port,
         levers=levers,
@@ -211,7 +211,7 @@ def averaged_model(model: LinearModel) -> Averaged:
         inertia=each(loads.inertia_factor() * loads.mass * loads.radius**2),
         drag=each(loads.drag * loads.radius**2),
         drive=drive,
-        axes=carrier.axes,
+        axes=mount.axes,
     )
 
 

@@ -46,7 +46,7 @@ class CollectedModel(eqx.Module):
     def circle(self, phi: Points) -> tuple[Array, Array]:
         """e(phi) and de/dphi (np, ...): where a load on the unit circle is in the port's directions, and how it moves."""
         cos, sin = jnp.cos(phi), jnp.sin(phi)
-        axes = self.linear.carrier.axes
+        axes = self.linear.mount.axes
         return jnp.stack([(cos, sin)[axis] for axis in axes]), jnp.stack([(-sin, cos)[axis] for axis in axes])
 
     def each_load(self, phi: Points, rate: Array) -> tuple[Array, Array]:
@@ -59,7 +59,7 @@ class CollectedModel(eqx.Module):
         `a` (np, ...): the port's acceleration, m/s^2.
         """
         loads, u, rates = self.loads, (jnp.asarray(phi),), (rate,)
-        at = dict(zip(self.linear.carrier.axes, a, strict=True))
+        at = dict(zip(self.linear.mount.axes, a, strict=True))
         gravity = total_gravity(self.effects)
         found = (term.friction(loads, u, rates, speed, gravity) for term in terms_of(self.effects, ContactFriction))
         torque = loads.resistance(u, rates, speed)[0]

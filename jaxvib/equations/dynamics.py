@@ -28,6 +28,7 @@ from jaxvib.machine.effects.terms import (
     SupportForce,
 )
 from jaxvib.machine.loads import DrillingSpin, Loads
+from jaxvib.machine.mount import scaled
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, times
 
@@ -101,12 +102,12 @@ class _Eliminated(NamedTuple):
 class Dynamics(eqx.Module):
     """A scene made ready for time integration: all that does not change with time is computed once, here.
 
-    The carrier is solved for its accelerations, q'' = flow - with M's inverse already applied. P is the port B; where loads
-    run at stations of their own, or the rotor is out of balance elsewhere, the tilt T is below it:
+    The carrier is solved for its accelerations, q'' = flow - with M's inverse already applied. P are the rows of the mount that
+    move loads, one below the other, and if the rotor is out of balance those that move it too:
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G (or None), (nd, nd)
     - `push` M^-1 P^T (nd, nP): acceleration per force at the port; `mobility` P M^-1 P^T (nP, nP); `port` P (nP, nd)
-    - `stations` of the loads and `cg_offset` of the rotor, see `Carrier`; `supports`, a place for each `SupportForce`
+    - `levers` of the loads and `rotor_levers`, see `Mount`; `supports`, a place for each `SupportForce`
     """
 
     stiffness: Array
@@ -115,8 +116,8 @@ class Dynamics(eqx.Module):
     push: Array
     mobility: Array
     port: Array
-    stations: Array | None
-    cg_offset: Array | None
+    levers: tuple[Array | None, ...]
+    rotor_levers: tuple[Array | None, ...]
     supports: tuple[_Support, ...]
     loads: Loads
     drive: Drive
@@ -258,14 +259,17 @@ class Dynamics(eqx.Module):
         rows = {axis: [r - p[axis] if p else r for r, p in zip(row, pulls, strict=True)] for axis, row in rows.items()}
         answers = {axis: solve(tuple(row)) for axis, row in rows.items()}
         across = {axis: [column[axis] for column in columns] for axis in axes}
-        # The port's rows: its directions and, where loads have stations, the tilts, which act with the station as lever.
-        arms = self._arms()
-        onto = [(axis, arm) for arm in range(len(arms)) for axis in axes]
+        # Every row of the mount feels each load by the load's lever; rows that move no load feel none.
+        levers, onto = self.levers, [(row, i) for row in range(self.port.shape[0] // len(axes)) for i in axes]
         own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], answers[k]) for i in axes for k in axes}
-        moments = {(i, k, n): self._total(own[i, k], *arms[1:2] * n) for i, k in own for n in range(2 * len(arms) - 1)}
-        weight = [[moments[i, k, first + second] for k, second in onto] for i, first in onto]
+        pairs = [(low, high) for low in range(len(levers)) for high in range(low, len(levers))]
+        moments = {(i, k, *pair): self._total(own[i, k], *(levers[row] for row in pair)) for i, k in own for pair in pairs}
+        zero = jnp.zeros_like(moments[axes[0], axes[0], 0, 0])
+        weight = [
+            [moments.get((i, k, min(first, second), max(first, second)), zero) for second, k in onto] for first, i in onto
+        ]
         push = {i: m * (dot(across[i], free) + curvature[i]) for i in axes}
-        reaction = [self._total(push[i], *arms[1:2] * n) for i, n in onto]
+        reaction = [self._total(push[i], levers[row]) if row < len(levers) else zero for row, i in onto]
         return _Eliminated(free, answers, weight, reaction, drag, pulls[0] or None)
 
     def _with_rotor(
@@ -281,8 +285,8 @@ class Dynamics(eqx.Module):
         free = (torque - self._total(part.drag)) / inertia
         row = [jnp.zeros_like(free)] * len(part.reaction)
         if part.pull is not None:
-            arms = self._arms()
-            row = [self._total(part.pull[i], *arms[1:2] * n) / inertia for n in range(len(arms)) for i in self.axes]
+            row = [self._total(part.pull[i], lever) / inertia for lever in self.levers for i in self.axes]
+            row += [jnp.zeros_like(free)] * (len(part.reaction) - len(row))
         if throw is None:
             return part.weight, part.reaction, (free, row)
         along, bend = throw
@@ -301,11 +305,11 @@ class Dynamics(eqx.Module):
         def thrown(angle: Array) -> tuple[Array, ...]:
             found = [term.at(angle) for term in terms]
             static = tuple(total(imbalance.static[axis] for imbalance in found) for axis in self.axes)
-            if self.stations is None:
+            if self.port.shape[0] == len(static):
                 return static
             moment = tuple(total(imbalance.moment[axis] for imbalance in found) for axis in self.axes)
-            if self.cg_offset is not None:
-                moment = tuple(x + self.cg_offset * y for x, y in zip(moment, static, strict=True))
+            for lever in self.rotor_levers[1:]:
+                moment = tuple(x + scaled(lever, y) for x, y in zip(moment, static, strict=True))
             return (*static, *moment)
 
         def slope(angle: Array) -> tuple[Array, ...]:
@@ -334,17 +338,14 @@ class Dynamics(eqx.Module):
     def _at_loads(self, a: list[Array]) -> dict[int, Array]:
         """Accelerations of the points that carry the loads, by axis."""
         n = len(self.axes)
-        if self.stations is None:
-            return dict(zip(self.axes, a[:n], strict=True))
-        return {axis: a[k] + self.stations * a[n + k] for k, axis in enumerate(self.axes)}
+        moved = (a[k : k + n] for k in range(0, len(a), n))
+        terms = [[scaled(lever, x) for x in row] for lever, row in zip(self.levers, moved, strict=False)]
+        return {axis: total(row[k] for row in terms) for k, axis in enumerate(self.axes)}
 
-    def _arms(self) -> list[Array | float]:
-        """The levers of the port's rows: 1, and where loads have stations those, for the tilts."""
-        return [1.0] if self.stations is None else [1.0, self.stations]
-
-    def _total(self, values: Array, *arms: Array | float) -> Array:
-        for arm in arms:
-            values = values * arm
+    def _total(self, values: Array, *levers: Array | None) -> Array:
+        """The sum over all loads."""
+        for lever in levers:
+            values = scaled(lever, values)
         return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
 
 
@@ -370,29 +371,27 @@ def vector_field(scene: Scene) -> Dynamics:
     equation (1). A gyroscopic matrix acts with the rotor's speed alone: what its change would add, C theta'' psi / 2, is left
     out as in the paper.
     """
-    carrier, effects = scene.machine.carrier(), scene.effects
-    stations, port = carrier.stations, carrier.port
-    if carrier.tilt is not None and (stations is not None or has_term(effects, RotorImbalance)):
-        port = jnp.concatenate([port, carrier.tilt])
-        stations = jnp.zeros_like(carrier.mass[0, 0]) if stations is None else stations
-    places = [term.rows(carrier) for term in terms_of(effects, SupportForce)]
+    carrier, mount, effects = scene.machine.carrier(), scene.machine.mount(), scene.effects
+    moving = mount.rows if has_term(effects, RotorImbalance) else mount.rows[: len(mount.levers)]
+    port = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
+    places = [term.rows(scene.machine) for term in terms_of(effects, SupportForce)]
     parts = [carrier.stiffness, carrier.damping, port.T, *(rows.T for rows in places)]
-    if carrier.gyroscopic is not None:
-        parts.append(carrier.gyroscopic)
+    if mount.gyroscopic is not None:
+        parts.append(mount.gyroscopic)
     solved = small_solve(carrier.mass, jnp.concatenate(parts, axis=1))
     stiffness, damping, push, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
     return Dynamics(
         stiffness=stiffness,
         damping=damping,
-        gyroscopic=None if carrier.gyroscopic is None else rest[-1],
+        gyroscopic=None if mount.gyroscopic is None else rest[-1],
         push=push,
         mobility=port @ push,
         port=port,
-        stations=stations,
-        cg_offset=carrier.cg_offset,
+        levers=mount.levers,
+        rotor_levers=mount.rotor_levers,
         supports=tuple(map(_Support, places, rest)),
         loads=scene.loads,
         drive=scene.drive,
         effects=tuple(effect.prepare(scene.loads) for effect in effects),
-        axes=carrier.axes,
+        axes=mount.axes,
     )

@@ -45,7 +45,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
     carrier = scene.machine.carrier()
     force = carrier.bed_force(state.displacement, state.velocity)
     for term in terms_of(scene.effects, SupportForce):
-        rows = term.rows(carrier)
+        rows = term.rows(scene.machine)
         force = force + term.force(rows @ state.displacement, rows @ state.velocity)
     return force
 
@@ -73,10 +73,10 @@ def _at_time(t: Array | float, state: State) -> Any:
 
 @cached
 def _energy(scene: Scene, state: State, t: Array) -> Array:
-    carrier, loads = scene.machine.carrier(), scene.loads
+    carrier, mount, loads = scene.machine.carrier(), scene.machine.mount(), scene.loads
     q, v = state.displacement, state.velocity
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
-    at_load = carrier.point_rates(v)
+    at_load = mount.load_rates(v)
     total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
     own = loads.inertia_factor() - 1.0
     parts = [
@@ -85,7 +85,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
     ]
     for term in terms_of(scene.effects, LoadPotential, LoadInteraction):
         parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
-    parts += [term.energy(term.rows(carrier) @ q) for term in terms_of(scene.effects, SupportForce)]
+    parts += [term.energy(term.rows(scene.machine) @ q) for term in terms_of(scene.effects, SupportForce)]
     t = jnp.asarray(t, q.dtype)
     turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     if state.spin is not None and state.spin.slip is not None:
@@ -116,12 +116,12 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
 
 @cached
 def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
-    carrier, loads = scene.machine.carrier(), scene.loads
+    carrier, mount, loads = scene.machine.carrier(), scene.machine.mount(), scene.loads
     turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     field = vector_field(scene)
     change = field(t, state)
     acceleration = change.velocity
-    at_load = carrier.point_rates(acceleration)
+    at_load = mount.load_rates(acceleration)
     taken = loads.resistance(state.angle, state.rate, speed)
     g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
@@ -135,7 +135,7 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
             resistance = term.resistance(loads, state.angle, state.rate)
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
     for term in terms_of(scene.effects, SupportForce):
-        rows = term.rows(carrier)
+        rows = term.rows(scene.machine)
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
             lost.append(term.resistance(x, v) @ v)
@@ -201,17 +201,17 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
         problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
         raise InputError("loads.kind", problem)
     acceleration = vector_field(scene)(jnp.asarray(t, state.displacement.dtype), state).velocity
-    return normal_force.at(scene.machine.carrier().point_rates(acceleration))
+    return normal_force.at(scene.machine.mount().load_rates(acceleration))
 
 
 def _throw_rate(scene: Scene, turn: Array) -> Array:
     """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
-    carrier = scene.machine.carrier()
-    static, moment = carrier.port_at(0.0 if carrier.cg_offset is None else carrier.cg_offset), carrier.tilt
-    row = jnp.zeros_like(carrier.mass[0])
+    mount = scene.machine.mount()
+    static, moment = mount.rotor_rows(), mount.tilt
+    row = jnp.zeros_like(static[0])
     for term in terms_of(scene.effects, RotorImbalance):
         rate = jax.jvp(term.at, (turn,), (jnp.ones_like(turn),))[1]
-        row = row + jnp.stack([rate.static[axis] for axis in carrier.axes]) @ static
+        row = row + jnp.stack([rate.static[axis] for axis in mount.axes]) @ static
         if moment is not None:
-            row = row + jnp.stack([rate.moment[axis] for axis in carrier.axes]) @ moment
+            row = row + jnp.stack([rate.moment[axis] for axis in mount.axes]) @ moment
     return row

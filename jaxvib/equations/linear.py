@@ -24,6 +24,7 @@ from jaxvib.machine.effects.terms import (
     Term,
 )
 from jaxvib.machine.loads import CircularLoads
+from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, magnitude, relative_to, root_or_zero, small_solve
@@ -70,26 +71,27 @@ class FrequencyStatus(eqx.Enumeration):
 
 
 class AbstractLinearModel(eqx.Module):
-    """A scene, its carrier, and the carrier's mass with the loads on it: assembled once a question, and handed on.
+    """A scene, its carrier, its exciter's mount, and the mass with the loads: assembled once a question, and handed on.
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
-    **Attributes**: `scene`; `carrier`, see `Carrier`; `mass` M (nd, nd) kg, the loads' masses at the port or at their stations.
+    **Attributes**: `scene`; `carrier`, see `Carrier`; `mount`, see `Mount`; `mass` M (nd, nd) kg, each load's at its own place.
     """
 
     scene: eqx.AbstractVar[Scene]
     carrier: eqx.AbstractVar[Carrier]
+    mount: eqx.AbstractVar[Mount]
     mass: eqx.AbstractVar[Array]
 
     @property
     def direction(self) -> Array:
-        """B^T e (nd,) complex: the force on the coordinates of a unit force that turns at the port is Re(B^T e exp(i w t))."""
-        return self.carrier.port.T @ turning(self.carrier)
+        """B^T e (nd,) complex: the force on the coordinates of a unit force that turns at the mount is Re(B^T e exp(i w t))."""
+        return self.mount.rows[0].T @ turning(self.mount)
 
     def damping(self, speed: Array) -> Array:
         """C + n G (nd, nd) N s/m at the rotor's `speed` n, rad/s."""
-        carrier = self.carrier
-        return carrier.damping if carrier.gyroscopic is None else carrier.damping + speed * carrier.gyroscopic
+        damping, gyroscopic = self.carrier.damping, self.mount.gyroscopic
+        return damping if gyroscopic is None else damping + speed * gyroscopic
 
     def dynamic_stiffness(self, omega: Array, speed: Array | None = None) -> Array:
         """D(w) (nd, nd) complex, N/m: force per displacement at frequency `omega` (scalar, rad/s).
@@ -118,19 +120,20 @@ class LinearModel(AbstractLinearModel):
 
     scene: Scene
     carrier: Carrier
+    mount: Mount
     mass: Array
 
 
 def linear_model(scene: Scene) -> LinearModel:
     """The scene's carrier with the loads on it, see `LinearModel`."""
-    carrier = scene.machine.carrier()
+    carrier, mount = scene.machine.carrier(), scene.machine.mount()
     each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
-    if carrier.stations is None:
-        mass = carrier.mass + jnp.sum(each) * carrier.port.T @ carrier.port
+    if mount.at_one_point:
+        mass = carrier.mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
     else:
-        rows = jax.vmap(carrier.port_at)(carrier.stations)
+        rows = mount.load_rows(scene.loads.count)
         mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
-    return LinearModel(scene, carrier, mass)
+    return LinearModel(scene, carrier, mount, mass)
 
 
 class JammedModel(AbstractLinearModel):
@@ -142,6 +145,7 @@ class JammedModel(AbstractLinearModel):
 
     scene: Scene
     carrier: Carrier
+    mount: Mount
     mass: Array
     unbalance: Array
     drag: Array
@@ -154,7 +158,7 @@ class JammedModel(AbstractLinearModel):
 
     def displacement(self, omega: Array, speed: Array | None = None) -> Array:
         """`steady_displacement` at the load speed `omega` and the rotor's `speed`, (nd,) complex."""
-        if self.carrier.gyroscopic is not None and speed is None:
+        if self.mount.gyroscopic is not None and speed is None:
             problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
         return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.push)
@@ -163,7 +167,7 @@ class JammedModel(AbstractLinearModel):
 def jammed_model(scene: Scene) -> JammedModel:
     """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
-    return JammedModel(scene, model.carrier, model.mass, loads.unbalance(), loads.drag_sum(), model.direction)
+    return JammedModel(scene, model.carrier, model.mount, model.mass, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
 @validated
@@ -232,9 +236,9 @@ def steady_displacement(scene: Scene, omega: Array, speed: Array | None = None) 
     return jammed_model(scene).displacement(omega, speed)
 
 
-def turning(carrier: Carrier) -> Array:
-    """e (np,): a point that turns at a speed w with unit radius moves by Re(e exp(i w t)) at the port."""
-    return jnp.asarray([(1.0, -1.0j)[axis] for axis in carrier.axes])
+def turning(mount: Mount) -> Array:
+    """e (np,): a point that turns at a speed w with unit radius moves by Re(e exp(i w t)) in the mount's directions."""
+    return jnp.asarray([(1.0, -1.0j)[axis] for axis in mount.axes])
 
 
 def peak_force(force: Array) -> Array:
@@ -268,7 +272,7 @@ def require_drag(loads: CircularLoads, *, each: bool = False) -> None:
 
 def require_one_point(scene: Scene) -> None:
     """**Raises** `InputError` where loads have stations of their own along the machine's axis."""
-    if scene.machine.structure().stations is not None:
+    if not scene.machine.mounting().at_one_point:
         problem = (
             "differ; this holds for loads that run at one point of the machine: ask phase_jams for their jams, or simulate"
         )

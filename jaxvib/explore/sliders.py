@@ -114,7 +114,7 @@ def _has(scene: Scene, name: str) -> bool:
 
 def _shared(scene: Scene) -> bool:
     """True if an additional load is like the others: all share every number, and none has a station of its own."""
-    return scene.machine.structure().stations is None and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
+    return scene.machine.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
 def _entries(scene: Scene, place: Place) -> list[Place]:

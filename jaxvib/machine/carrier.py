@@ -1,10 +1,11 @@
-"""The linear structure that carries the loads."""
+"""Machines: the linear structure, and places on it."""
 
 from __future__ import annotations
 
 import abc
 import functools
 from collections.abc import Hashable
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -13,45 +14,35 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.mount import Mount, Place
+
 __all__ = ["Carrier", "Machine"]
 
 
 class Carrier(eqx.Module):
-    """A linear structure with a port through which the loads shake it.
+    """The linear structure of a machine.
 
-        M q'' + (C + speed G) q' + K q = Q + B^T f,        force on the bed = T_K q + T_C q'
+        M q'' + C q' + K q = forces,        force on the bed = T_K q + T_C q'
 
-    The mass of the loads is not part of `mass`: each load brings its own through the port.
+    The mass of the loads is not part of `mass`: each load brings its own at its place, see `Mount`.
 
-    **Attributes** (nd coordinates, np port directions, nb directions of the force on the bed)
+    **Attributes** (nd coordinates, nb directions of the force on the bed)
 
     - `mass` M (nd, nd), kg or kg m^2; `damping` C (nd, nd), N s/m; `stiffness` K (nd, nd), N/m
-    - `gyroscopic` G (nd, nd), kg m^2, times the rotor's speed; None where the structure has none
-    - `port` B (np, nd): the port's displacement is B q
-    - `axes`: which direction of a load's plane (0 across, 1 up) each row of B moves in
     - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): ties to the bed, N/m and N s/m
     - `coordinates`: a name for each coordinate; `coordinate_units`: the unit of each, "m" or "rad", None where all are "m"
-    - `tilt` T (np, nd), 1/m times the unit of a displacement: how the structure's axis turns with q; None where it cannot.
-      A point at the distance s along the axis from the port moves by (B + s T) q
-    - `stations` s_j (count,) m: where along the axis, counted from the port, each load runs; None where all run at the port
-    - `cg_offset` m: where along the axis, counted from the port, the rotor's own mass centre lies; None where it is the port
 
-    Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for stations
+    Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for rotors
     Artyunin 2013, equation (1).
     """
 
     mass: Array
     damping: Array
     stiffness: Array
-    gyroscopic: Array | None
-    port: Array
     bed_stiffness: Array
     bed_damping: Array
-    axes: tuple[int, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)
-    tilt: Array | None = None
-    stations: Array | None = None
-    cg_offset: Array | None = None
     coordinate_units: tuple[str, ...] | None = eqx.field(static=True, default=None)
 
     @property
@@ -69,41 +60,64 @@ class Carrier(eqx.Module):
         """A name for each direction of the force on the bed: "up", or "across" and "up"."""
         return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
 
-    def port_at(self, distance: Array | float) -> Array:
-        """B + s T (np, nd): how a point at the `distance` s (m, along the axis from the port) moves with q."""
-        return self.port if self.tilt is None else self.port + distance * self.tilt
-
-    def point_rates(self, rate: Array) -> dict[int, Array]:
-        """Velocities (accelerations) of the points that carry the loads where the coordinates' are `rate` (nd,), by axis;
-        (count,) each where loads have stations."""
-        port = self.port @ rate
-        if self.stations is not None and self.tilt is not None:
-            port = port[:, None] + (self.tilt @ rate)[:, None] * self.stations[None, :]
-        return dict(zip(self.axes, port, strict=True))
-
     def bed_force(self, displacement: Array, velocity: Array) -> Array:
         """Force on the bed (nb,) N, T_K q + T_C q', also of complex amplitudes; without supports that are effects."""
         return self.bed_stiffness @ displacement + self.bed_damping @ velocity
 
 
 class Machine(eqx.Module):
-    """A machine in the designer's own numbers. A new kind of machine is a new subclass with its matrices."""
+    """A machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
+
+    `places` says how places on it are named, for effects that have one and for drawings: "platform" by number, "shaft" by the
+    distance along a rotor's axis, "point" on a machine that only has its exciter's.
+    """
 
     kind: eqx.AbstractVar[str]
+    places: ClassVar[Literal["platform", "shaft", "point"]] = "point"
 
     @abc.abstractmethod
     def carrier(self) -> Carrier:
         """The machine as a linear structure, see `Carrier`."""
 
+    @abc.abstractmethod
+    def mount(self) -> Mount:
+        """The place of the exciter, see `Mount`."""
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """Rows (np, nd): the point at a `place` moves by rows q. Exciters, supports, stops and pictures all ask here.
+
+        **Arguments**: `place`, None for the usual one; its `name` in messages.
+
+        **Raises** `InputError` for a place that the machine does not have.
+
+        >>> import jaxvib as jv
+        >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
+        ...                       link_stiffness=2e5, link_damping=60.0)
+        >>> machine.rows_at(2).tolist()
+        [[0.0, 1.0]]
+        """
+        if place is not None:
+            problem = f"names a place on a machine of kind {quoted(self.kind)}, which moves alike everywhere; leave it out"
+            raise InputError(name, problem)
+        return self.mount().rows[0]
+
     def supports(self) -> list[tuple[float, float, float]] | None:
-        """Where along a rotor's axis supports stand, for a drawing: distance from the mass centre m, stiffness N/m, damping
-        N s/m; None where the matrices say all there is to draw."""
+        """Supports along a rotor's axis, for a drawing: distance from the mass centre m, stiffness N/m, damping N s/m; None if
+        the matrices say all there is to draw."""
         return None
 
     def structure(self) -> Carrier:
-        """The carrier's names, directions and shapes, without computing its numbers."""
-        leaves, rest = jax.tree.flatten(self)
-        return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float))
+        """Names, directions and shapes of the carrier, without its numbers."""
+        return _shapes(self)[0]
+
+    def mounting(self) -> Mount:
+        """Directions and shapes of the exciter's mount, without its numbers."""
+        return _shapes(self)[1]
+
+
+def _shapes(machine: Machine) -> tuple[Carrier, Mount]:
+    leaves, rest = jax.tree.flatten(machine)
+    return _structure(rest, tuple(map(_kind, leaves)), jnp.result_type(float))
 
 
 def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
@@ -113,7 +127,9 @@ def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 
 
 @functools.lru_cache(maxsize=128)
-def _structure(rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype) -> Carrier:
+def _structure(
+    rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype
+) -> tuple[Carrier, Mount]:
     """Traced once for all machines of a form, in the `precision` in force: a trace takes longer than many a run."""
     machine = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
-    return eqx.filter_eval_shape(lambda machine: machine.carrier(), machine)
+    return eqx.filter_eval_shape(lambda machine: (machine.carrier(), machine.mount()), machine)

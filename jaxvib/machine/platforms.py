@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.mount import Mount, Place
 from jaxvib.units import Number, Numbers, count, numbers
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
@@ -42,9 +43,10 @@ class Platforms(Machine):
     links: tuple[tuple[int, int], ...] = eqx.field(static=True)
     exciter: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
+    places = "platform"
 
     def carrier(self) -> Carrier:
-        """The linear structure of the platforms; one port, one direction (up)."""
+        """The matrices of the platforms."""
         n = self.mass.shape[0]
         # A row for each support, whose other end is the bed, and for each link.
         ends = np.concatenate([np.eye(n), np.zeros((len(self.links), n))]).astype(self.mass.dtype)
@@ -54,19 +56,27 @@ class Platforms(Machine):
         def assembled(support: Array, link: Array) -> Array:
             return (jnp.concatenate([support, link])[None] * ends.T) @ ends
 
-        port = np.zeros((1, n))
-        port[0, self.exciter - 1] = 1.0
         return Carrier(
             mass=self.mass[None] * np.eye(n, dtype=self.mass.dtype),
             damping=assembled(self.damping, self.link_damping),
             stiffness=assembled(self.stiffness, self.link_stiffness),
-            gyroscopic=None,
-            port=jnp.asarray(port, dtype=self.mass.dtype),
             bed_stiffness=self.stiffness[None, :],
             bed_damping=self.damping[None, :],
-            axes=(1,),
             coordinates=tuple(f"y{i + 1}" for i in range(n)),
         )
+
+    def mount(self) -> Mount:
+        """The exciter's platform, which moves up."""
+        return Mount(rows=(self.rows_at(self.exciter),), axes=(1,))
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """The coordinate of a platform; that of the first one for None."""
+        n, which = self.mass.shape[0], 1 if place is None else place
+        if not isinstance(which, int):
+            raise InputError(name, f"is a distance along a rotor's axis; name a platform instead, 1 to {n}")
+        if not 1 <= which <= n:
+            raise InputError(name, f"is {which}; the machine has platforms 1 to {n}")
+        return jnp.asarray(np.eye(n)[which - 1 : which], dtype=self.mass.dtype)
 
 
 def _platforms(

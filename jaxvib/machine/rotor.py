@@ -12,6 +12,7 @@ from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.mount import Mount, Place
 from jaxvib.units import Number, Numbers, number, numbers
 from jaxvib.units.known import when_known
 
@@ -50,9 +51,10 @@ class Rotor(Machine):
     stiffness_terms: Array | None
     damping_terms: Array | None
     kind: str = eqx.field(static=True)
+    places = "shaft"
 
     def carrier(self) -> Carrier:
-        """Four coordinates; the loads' port is the station all share, or the mass centre where each has its own."""
+        """The matrices of the four coordinates."""
 
         def terms(support: Array, given: Array | None) -> tuple[Array, Array, Array]:
             if given is not None:
@@ -66,27 +68,43 @@ class Rotor(Machine):
         stiffness = terms(self.stiffness, self.stiffness_terms)
         damping = terms(self.damping, self.damping_terms)
         zero = jnp.zeros_like(self.mass)
-        dtype = self.mass.dtype
-        across = jnp.eye(2, 4, dtype=dtype)
-        tilt = jnp.eye(2, 4, 2, dtype=dtype)
-        shared = self.stations.ndim == 0
-        skew = np.zeros((4, 4))
-        skew[2, 3], skew[3, 2] = 1.0, -1.0
+        across, tilt = self._directions()
         return Carrier(
             mass=matrix(self.mass, zero, self.transverse_inertia),
             damping=matrix(*damping),
             stiffness=matrix(*stiffness),
-            gyroscopic=self.polar_inertia * jnp.asarray(skew, dtype=dtype),
-            port=across + self.stations * tilt if shared else across,
             bed_stiffness=stiffness[0] * across + stiffness[1] * tilt,
             bed_damping=damping[0] * across + damping[1] * tilt,
-            axes=(0, 1),
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
-            tilt=tilt,
-            stations=None if shared else self.stations,
-            cg_offset=-self.stations if shared else None,
         )
+
+    def mount(self) -> Mount:
+        """The station that all loads share, or the mass centre with a lever for each load; and the axis's tilt."""
+        skew = np.zeros((4, 4))
+        skew[2, 3], skew[3, 2] = 1.0, -1.0
+        shared = self.stations.ndim == 0
+        return Mount(
+            rows=(self.rows_at(None), self._directions()[1]),
+            axes=(0, 1),
+            levers=(None,) if shared else (None, self.stations),
+            rotor_levers=(None, -self.stations) if shared else (None,),
+            gyroscopic=self.polar_inertia * jnp.asarray(skew, dtype=self.mass.dtype),
+        )
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """The point of the axis at a distance from the mass centre, m; for None the loads' common station, or the mass centre
+        if each load has its own."""
+        if isinstance(place, int):
+            raise InputError(name, f"is {place}, which numbers a platform; on a rotor give a position, m from the mass centre")
+        across, tilt = self._directions()
+        shared = self.stations if self.stations.ndim == 0 else None
+        distance = shared if place is None else place
+        return across if distance is None else across + distance * tilt
+
+    def _directions(self) -> tuple[Array, Array]:
+        """Rows (2, 4) of the mass centre, and of the axis's tilt."""
+        return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def supports(self) -> list[tuple[float, float, float]]:
         """The two supports."""
@@ -189,19 +207,20 @@ class PlanarRotor(Machine):
     kind: str = eqx.field(static=True)
 
     def carrier(self) -> Carrier:
-        """Two coordinates, which are the port's two directions."""
+        """The matrices of the two coordinates."""
         eye = jnp.eye(2, dtype=self.mass.dtype)
         return Carrier(
             mass=self.mass * eye,
             damping=self.damping * eye,
             stiffness=self.stiffness * eye,
-            gyroscopic=None,
-            port=eye,
             bed_stiffness=self.stiffness * eye,
             bed_damping=self.damping * eye,
-            axes=(0, 1),
             coordinates=("y", "z"),
         )
+
+    def mount(self) -> Mount:
+        """The rotor, which moves across and up."""
+        return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 
 def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
@@ -212,7 +231,7 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
     **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
 
     >>> import jaxvib as jv
-    >>> jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0).carrier().port.shape
+    >>> jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0).mount().rows[0].shape
     (2, 2)
 
     Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.

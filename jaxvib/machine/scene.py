@@ -63,11 +63,10 @@ class Scene(eqx.Module):
         for kind in kinds:
             if kinds.count(kind) > 1:
                 raise InputError("effects", f"names {kind} {kinds.count(kind)} times; once is allowed")
-        stations = machine.structure().stations
-        if stations is not None and stations.shape != (loads.count,):
-            raise InputError(
-                "machine.stations", f"has {stations.shape[0]} values; one for all loads or {loads.count} are needed"
-            )
+        for levers in machine.mounting().levers:
+            if levers is not None and levers.shape != (loads.count,):
+                problem = f"has {levers.shape[0]} values; one for all loads or {loads.count} are needed"
+                raise InputError("machine.stations", problem)
         for effect in effects:
             effect.validate(machine, loads)
             if not drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):

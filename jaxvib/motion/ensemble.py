@@ -274,7 +274,7 @@ class _FieldWithDetachment(eqx.Module):
         scene, change = self.scene, self.equations(t, _plain(state))
         normal_force = scene.loads.normal_force(state.angle, state.rate, total_gravity(scene.effects))
         assert normal_force is not None
-        force = normal_force.at(scene.machine.carrier().point_rates(change.velocity))
+        force = normal_force.at(scene.machine.mount().load_rates(change.velocity))
         return _with_detachment(change, jnp.maximum(-force, 0.0))
 
 

@@ -190,19 +190,18 @@ class Run(AbstractMeasured, Result):
         from jaxvib.draw.motion.histories import last_periods  # slow to import: only who draws pays
         from jaxvib.draw.motion.spectra import path_chart
 
-        carrier = self.scene.machine.carrier()
-        if carrier.axes != (0, 1):
-            kind = self.scene.machine.kind
+        machine = self.scene.machine
+        mount, kind = machine.mount(), machine.kind
+        if mount.axes != (0, 1):
             raise InputError(
                 "machine.kind", f"is {quoted(kind)}, which moves up and down only; a path needs a rotor such as rotor(...)"
             )
         moved = np.asarray(self.window.state.displacement)
         moved = moved[last_periods(np.asarray(self.window.time), moved)]
-        places = {0.0} if carrier.stations is None else {float(s) for s in np.asarray(carrier.stations)}
-        named = {
-            "axis of the loads" if len(places) == 1 else f"axis at {1e3 * s:+.4g} mm": carrier.port_at(s)
-            for s in sorted(places)
-        }
+        named = {"axis of the loads": mount.rows[0]}
+        if not mount.at_one_point:
+            stations = sorted({float(s) for s in mount.distances(self.scene.loads.count)})
+            named = {f"axis at {1e3 * s:+.4g} mm": machine.rows_at(jnp.asarray(s)) for s in stations}
         paths = {name: tuple((moved @ np.asarray(rows).T).T) for name, rows in named.items()}
         return path_chart({name: (path[0], path[1]) for name, path in paths.items()}, ax=ax)
 

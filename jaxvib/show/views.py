@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import functools
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class View(abc.ABC):
 
     def __init__(self, scene: Scene):
         carrier = scene.machine.carrier()
-        self.scene, self.carrier = scene, carrier
+        self.scene, self.mount = scene, scene.machine.mount()
         self.mass, self.stiffness, self.damping = (
             np.asarray(x, float) for x in (carrier.mass, carrier.stiffness, carrier.damping)
         )
@@ -102,8 +103,8 @@ class PlatformView(View):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         n = self.mass.shape[0]
-        port = np.asarray(self.carrier.port)[0]
-        self.exciter = int(np.argmax(np.abs(port))) + 1
+        self.rows = [np.asarray(scene.machine.rows_at(level))[0] for level in range(1, n + 1)]
+        self.exciter = int(np.argmax(self.rows @ np.asarray(self.mount.rows[0])[0])) + 1
         self.ties = [Tie(0, i + 1, float(self.bed_stiffness[0, i]), float(self.bed_damping[0, i])) for i in range(n)]
         self.ties += [
             Tie(i + 1, j + 1, float(-self.stiffness[i, j]), float(-self.damping[i, j])) for j in range(n) for i in range(j)
@@ -122,7 +123,7 @@ class PlatformView(View):
         self.limits = (-0.3, max(self.width + 1.3, 6.5), -0.9, (n + 0.55) * self.pitch + 0.2)
 
     def _height(self, level: int, pose: Pose, reach: float) -> float:
-        return level * self.pitch + (reach * float(pose.displacement[level - 1]) if level else 0.0)
+        return level * self.pitch + (reach * float(self.rows[level - 1] @ pose.displacement) if level else 0.0)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """The bed, the springs and dampers, the platforms, the exciter."""
@@ -178,7 +179,7 @@ class FrontView(View):
         self.limits = (-3.2, 5.5 if self.section else 3.6, -3.2, 1.8)
 
     def _centre(self, pose: Pose, reach: float) -> tuple[float, float]:
-        across, up = reach * (np.asarray(self.carrier.port) @ pose.displacement)
+        across, up = reach * (np.asarray(self.mount.rows[0]) @ pose.displacement)
         return float(across), float(up)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
@@ -240,17 +241,14 @@ class FrontView(View):
 
 
 class ShaftView(View):
-    """A rotor that tilts: its shaft from the side, and to the right along its axis."""
+    """A rotor that tilts: its shaft from the side, distances from its mass centre, and to the right along its axis."""
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        carrier = self.carrier
-        self.cg = 0.0 if carrier.cg_offset is None else float(carrier.cg_offset)
-        stands = scene.machine.supports()
-        self.stands = [] if stands is None else [(self.cg + s, k, c) for s, k, c in stands]
-        stations = np.zeros(1) if carrier.stations is None else np.asarray(carrier.stations, float)
-        self.stations = np.broadcast_to(stations, (scene.loads.count,))
-        all_places = [self.cg, *self.stations, *(s for s, _, _ in self.stands)]
+        self.stands = scene.machine.supports() or []
+        self._rows = functools.cache(lambda s: np.asarray(scene.machine.rows_at(s)))
+        self.stations = np.asarray(self.mount.distances(scene.loads.count), float)
+        all_places = [0.0, *self.stations, *(s for s, _, _ in self.stands)]
         low, high = min(all_places), max(all_places)
         half = 0.5 * (high - low) or 0.1
         self.middle, self.scale = 0.5 * (low + high), 2.6 / half
@@ -262,7 +260,7 @@ class ShaftView(View):
         return self.scale * (s - self.middle)
 
     def _y(self, s: float, pose: Pose, reach: float, axis: int = 1) -> float:
-        return reach * float(np.asarray(self.carrier.port_at(s))[axis] @ pose.displacement)
+        return reach * float(self._rows(float(s))[axis] @ pose.displacement)
 
     def parts(self, pose: Pose, reach: float) -> list[Part]:
         """The bed, supports, shaft and body, a disc at each station with its loads, and the rotor along its axis."""
@@ -272,7 +270,7 @@ class ShaftView(View):
         ends = [self.middle - 3.1 / self.scale, self.middle + 3.1 / self.scale]
         line = np.array([[self._x(s), self._y(s, pose, reach)] for s in ends])
         found.append(Part(line, {"color": "black", "lw": 3.5, "zorder": 2.6, "solid_capstyle": "round"}))
-        body = [self.cg - 0.9 / self.scale, self.cg + 0.9 / self.scale]
+        body = [-0.9 / self.scale, 0.9 / self.scale]
         corners = [(s, side) for s, side in ((body[0], -1), (body[1], -1), (body[1], 1), (body[0], 1))]
         points = np.array([[self._x(s), self._y(s, pose, reach) + 0.38 * side] for s, side in corners])
         found.append(Part(points, _BODY, True))
@@ -285,23 +283,23 @@ class ShaftView(View):
             place = (self._x(s), self._y(s, pose, reach) + float(up[j]))
             look = {"fc": COLORS[j % len(COLORS)], "ec": "black", "lw": 0.8, "zorder": 3.4 + 0.01 * j}
             found.append(Part(circle(place, self.wheel.size, 31), look, True))
-        centre = (self.front + self._y(self.cg, pose, reach, 0), self._y(self.cg, pose, reach))
+        centre = (self.front + self._y(0.0, pose, reach, 0), self._y(0.0, pose, reach))
         return found + self.wheel.parts(centre, pose)
 
     def texts(self, pose: Pose, reach: float) -> list[Text]:
         """Mass and inertias, supports and stations with their places from the mass centre."""
         small: Look = {"fontsize": "small"}
-        whole, turning = np.asarray(self.carrier.mass), self.carrier.gyroscopic
-        inertia = f"M = {shown(float(whole[0, 0]), 'kg')}\nA = {shown(float(whole[2, 2]), 'kg m²')}"
+        turning = self.mount.gyroscopic
+        inertia = f"M = {shown(float(self.mass[0, 0]), 'kg')}\nA = {shown(float(self.mass[2, 2]), 'kg m²')}"
         if turning is not None:
             inertia += f"\nC = {shown(float(np.max(np.abs(np.asarray(turning)))), 'kg m²')}"
-        found = [Text(self._x(self.cg), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
+        found = [Text(self._x(0.0), 0.45, inertia, {**small, "ha": "center", "va": "bottom"})]
         for s, k, c in self.stands:
-            text = f"{_spring_text(k, c)}\nat {1e3 * (s - self.cg):+.4g} mm"
-            right = self._x(s) >= self._x(self.cg)
+            text = f"{_spring_text(k, c)}\nat {1e3 * s:+.4g} mm"
+            right = s >= 0.0
             place = self._x(s) + (0.42 if right else -0.42)
             found.append(Text(place, -1.55, text, {**small, "va": "center", "ha": "left" if right else "right"}))
-        shown_at = sorted({round(1e3 * (float(s) - self.cg), 6) for s in self.stations})
+        shown_at = sorted({round(1e3 * float(s), 6) for s in self.stations})
         label = ", ".join(f"{s:+.4g}" for s in shown_at) + " mm"
         found.append(Text(0.0, 1.3, f"loads at {label}", {**small, "ha": "center", "va": "bottom"}))
         found.append(Text(self.front, -1.2, "along the axis", {**small, "ha": "center", "va": "top"}))
@@ -313,7 +311,7 @@ class ShaftView(View):
 
     def support_forces(self, pose: Pose) -> np.ndarray:
         """k x + c x' of each support, the part upward, which is what is seen from the side."""
-        rows = [np.asarray(self.carrier.port_at(s))[1] for s, _, _ in self.stands]
+        rows = [self._rows(s)[1] for s, _, _ in self.stands]
         return np.array(
             [
                 [0.0, k * row @ pose.displacement + c * row @ pose.velocity]
@@ -323,11 +321,9 @@ class ShaftView(View):
 
 
 def view_of(scene: Scene) -> View:
-    """The drawing of a scene: by the directions in which its machine moves and whether it tilts."""
-    carrier = scene.machine.structure()
-    if carrier.axes == (1,):
-        return PlatformView(scene)
-    if carrier.axes != (0, 1):
-        problem = f"is {scene.machine.kind!r}; machines are drawn that move up and down, or across and up"
+    """The drawing of a scene, chosen by the places that its machine has."""
+    machine = scene.machine
+    if machine.places == "point" and machine.mounting().axes != (0, 1):
+        problem = f"is {machine.kind!r}; machines are drawn that have platforms or a shaft, or that move across and up"
         raise InputError("machine.kind", problem)
-    return FrontView(scene) if carrier.tilt is None else ShaftView(scene)
+    return {"platform": PlatformView, "shaft": ShaftView, "point": FrontView}[machine.places](scene)

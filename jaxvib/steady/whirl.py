@@ -13,7 +13,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import LinearModel, linear_model
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.mount import Mount
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.linalg import TRUSTED, hermitian_error, hermitian_modes, relative_to
@@ -159,8 +159,8 @@ def _sense_word(speed: float, forward: bool) -> str:
 def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
     carrier, mass = model.carrier, _mass(model, loads)
     nd = mass.shape[0]
-    gyroscopic = jnp.zeros_like(mass) if carrier.gyroscopic is None else carrier.gyroscopic
-    part = _tie(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(carrier)
+    gyroscopic = jnp.zeros_like(mass) if model.mount.gyroscopic is None else model.mount.gyroscopic
+    part = _tie(mass.dtype) * jnp.sqrt(jnp.trace(carrier.stiffness) * jnp.trace(mass)) * _sense_matrix(model.mount)
 
     def first_order(resisting: Array) -> Array:
         flow = jnp.linalg.solve(mass, jnp.concatenate([-carrier.stiffness, -resisting], axis=1))
@@ -186,7 +186,7 @@ def _whirl(model: LinearModel, speeds: Array, loads: Weights) -> Whirl:
         nearest = jnp.argmin(jnp.abs(values[:, None] - apart[None, :]), axis=1)
         chosen, oscillates = one_of_each(values, stops[nearest])
         turns = oscillates[chosen]
-        forward = turns & (_sense(carrier, shapes[:, one_of_each(apart, stops)[0]]) > 0.0)
+        forward = turns & (_sense(model.mount, shapes[:, one_of_each(apart, stops)[0]]) > 0.0)
         return jnp.where(turns, values.imag[chosen], 0.0), -values.real[chosen], forward, error[nearest][chosen] > TRUSTED
 
     speed, decay, forward, lost = jax.vmap(at)(speeds)
@@ -246,9 +246,9 @@ def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds
 
 @cached
 def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
-    carrier, mass = model.carrier, _mass(model, loads)
-    inertia = mass if carrier.gyroscopic is None else mass - 1j * carrier.gyroscopic
-    part = 1j * _tie(mass.dtype) * jnp.trace(mass) * _sense_matrix(carrier)
+    carrier, mount, mass = model.carrier, model.mount, _mass(model, loads)
+    inertia = mass if mount.gyroscopic is None else mass - 1j * mount.gyroscopic
+    part = 1j * _tie(mass.dtype) * jnp.trace(mass) * _sense_matrix(model.mount)
     values, _ = hermitian_modes(relative_to(carrier.stiffness, inertia)[0])
     square, inverse = relative_to(carrier.stiffness, jax.lax.stop_gradient(inertia - part))
     shapes = inverse.T @ hermitian_modes(square)[1]
@@ -260,14 +260,14 @@ def _critical_speeds(model: LinearModel, loads: Weights) -> CriticalSpeeds:
     lost = ~decided & (error > 2.0 * TRUSTED)
     speed = jnp.where(there, 1.0 / jnp.sqrt(jnp.where(there, values, 1.0)), jnp.inf)
     status = WhirlStatus.where(jnp.any(lost), WhirlStatus.lost_digits, WhirlStatus.done)
-    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), _sense(carrier, shapes) > 0.0)
+    return CriticalSpeeds(status, jnp.where(lost, jnp.nan, speed), _sense(mount, shapes) > 0.0)
 
 
 def _two_directions(scene: Scene) -> LinearModel:
     scene = validate_scene(scene)
     model = linear_model(scene)
     carrier = model.carrier
-    if carrier.axes != (0, 1):
+    if model.mount.axes != (0, 1):
         raise InputError(
             "machine.kind",
             f"is {quoted(scene.machine.kind)}, which moves up and down only: `jam_modes` (`jaxvib modes`) has its resonances; "
@@ -299,19 +299,14 @@ def _mass(model: LinearModel, loads: Weights) -> Array:
     return model.mass if loads == "fixed" else model.carrier.mass
 
 
-def _planes(carrier: Carrier) -> Array:
-    """The two directions (p, 2, nd) in which a whirl moves the port and, where the carrier has tilts, tilts it."""
-    return jnp.stack([carrier.port] if carrier.tilt is None else [carrier.port, carrier.tilt])
-
-
-def _sense_matrix(carrier: Carrier) -> Array:
+def _sense_matrix(mount: Mount) -> Array:
     """A gyroscopic matrix (nd, nd) that tells whirls of one speed apart by their sense."""
-    planes = _planes(carrier)
+    planes = jnp.stack(mount.rows)
     turn = planes[:, 0].T @ planes[:, 1]
     return turn - turn.T
 
 
-def _sense(carrier: Carrier, shapes: Array) -> Array:
-    """Twice the area that shapes (nd, k) sweep in a turn at the port and of its tilts: positive with the rotor's sense."""
-    moved = _planes(carrier).astype(shapes.dtype) @ shapes
+def _sense(mount: Mount, shapes: Array) -> Array:
+    """Twice the area that shapes (nd, k) sweep in a turn at the rotor and of its tilts: positive with the rotor's sense."""
+    moved = jnp.stack(mount.rows).astype(shapes.dtype) @ shapes
     return jnp.sum(jnp.imag(moved[:, 0] * jnp.conj(moved[:, 1])), axis=0)

@@ -166,15 +166,15 @@ def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
 
 
 def test_vertical_machine_has_no_sideways_coordinate():
-    assert scene("two_mass").machine.carrier().port.shape == (1, 2)
-    assert scene("two_mass").machine.carrier().gyroscopic is None
+    assert scene("two_mass").machine.mount().rows[0].shape == (1, 2)
+    assert scene("two_mass").machine.mount().gyroscopic is None
 
 
 def test_structure_is_the_carriers_and_traced_once_for_a_form():
     for machine in machines().values():
         carrier, structure = machine.carrier(), machine.structure()
         assert [x.shape for x in jax.tree.leaves(structure)] == [x.shape for x in jax.tree.leaves(carrier)]
-        assert structure.coordinates == carrier.coordinates and structure.axes == carrier.axes
+        assert structure.coordinates == carrier.coordinates
         heavier = jax.tree.map(lambda leaf: 2.0 * leaf, machine)
         assert heavier.structure() is structure
     assert machines()["one_mass"].structure().mass.dtype == jnp.float64
@@ -204,20 +204,11 @@ class Planar(jv.Machine):
     kind: str = eqx.field(static=True)
 
     def carrier(self):
-        mass, damping, stiffness, gyroscopic, port = self.matrices
         none = jnp.zeros((1, 3))
-        return jv.Carrier(
-            mass,
-            damping,
-            stiffness,
-            gyroscopic,
-            port,
-            none,
-            none,
-            axes=(0, 1),
-            coordinates=("x", "y", "tilt"),
-            coordinate_units=("m", "m", "rad"),
-        )
+        return jv.Carrier(*self.matrices[:3], none, none, ("x", "y", "tilt"), ("m", "m", "rad"))
+
+    def mount(self):
+        return jv.Mount((self.matrices[4],), axes=(0, 1), gyroscopic=self.matrices[3])
 
 
 @pytest.mark.parametrize("load", loads())

@@ -1,4 +1,4 @@
-"""A carrier with a port of two directions and a gyroscopic matrix, made of matrices alone."""
+"""A machine that moves across and up and has a gyroscopic matrix, made of matrices alone."""
 
 import equinox as eqx
 import jax
@@ -16,18 +16,22 @@ class Rotor(jv.Machine):
 
     def carrier(self):
         plane = jnp.array([[1.0, 0.1], [0.1, 0.05]])
-        skew = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
         return jv.Carrier(
             mass=jnp.diag(jnp.array([37.0, 37.0, 0.479, 0.479])),
             damping=jnp.kron(plane, jnp.eye(2)) * 300.0,
             stiffness=jnp.kron(plane, jnp.diag(self.stiffness)),
-            gyroscopic=jnp.kron(jnp.diag(jnp.array([0.0, 1.0])), skew) * self.polar,
-            port=jnp.array([[1.0, 0.0, 0.2, 0.0], [0.0, 1.0, 0.0, 0.2]]),
             bed_stiffness=jnp.zeros((2, 4)),
             bed_damping=jnp.zeros((2, 4)),
-            axes=(0, 1),
             coordinates=("y", "z", "theta", "psi"),
             coordinate_units=("m", "m", "rad", "rad"),
+        )
+
+    def mount(self):
+        skew = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
+        return jv.Mount(
+            rows=(jnp.array([[1.0, 0.0, 0.2, 0.0], [0.0, 1.0, 0.0, 0.2]]),),
+            axes=(0, 1),
+            gyroscopic=jnp.kron(jnp.diag(jnp.array([0.0, 1.0])), skew) * self.polar,
         )
 
 

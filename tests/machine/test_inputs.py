@@ -185,7 +185,7 @@ WRONG_ROTORS = {
         lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, position=0.1),)),
         r"name a platform instead",
     ),
-    "platform of a rotor": (lambda: rotor_scene(effects=(jv.CubicSupport(1.0, platform=1),)), r"a rotor needs a position"),
+    "platform of a rotor": (lambda: rotor_scene(effects=(jv.CubicSupport(1.0, platform=1),)), r"on a rotor give a position"),
     "both places": (lambda: jv.CubicSupport(1.0, platform=1, position=0.1), r"names a platform and a position"),
     "side of a ring": (lambda: rotor_scene(effects=(jv.Stop(1.0, 0.0, side="above", position=0.1),)), r"it must be 'both'"),
     "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),

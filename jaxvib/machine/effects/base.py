@@ -238,14 +238,15 @@ class MomentImbalance(Effect):
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for a machine that cannot tilt."""
-        if machine.carrier().tilt is None:
+        if machine.mounting().tilt is None:
             raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {quoted(machine.kind)}")
 
 
 def _carried(machine: Machine) -> tuple[Array, Array | None]:
-    """The mass (kg) that a force at the port meets, and the inertia (kg m^2) that a moment meets; None where nothing tilts."""
-    carrier = machine.carrier()
-    mass = 1.0 / (carrier.port @ jnp.linalg.solve(carrier.mass, carrier.port.T))[0, 0]
-    if carrier.tilt is None:
-        return mass, None
-    return mass, 1.0 / (carrier.tilt @ jnp.linalg.solve(carrier.mass, carrier.tilt.T))[0, 0]
+    """The mass (kg) that a force on the exciter meets, and the inertia (kg m^2) that a moment meets; None without a tilt."""
+    mass, mount = machine.carrier().mass, machine.mount()
+
+    def met(rows: Array) -> Array:
+        return 1.0 / (rows @ jnp.linalg.solve(mass, rows.T))[0, 0]
+
+    return met(mount.rows[0]), None if mount.tilt is None else met(mount.tilt)

@@ -76,7 +76,7 @@ class LoadContact(Effect):
         own_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
-        if machine.structure().stations is not None:
+        if not machine.mounting().at_one_point:
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def validate_start(self, loads: Loads, u: Coordinates) -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted, require_one_of
-from jaxvib.machine.carrier import Carrier, Machine
+from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.loads import Loads
@@ -25,23 +25,13 @@ class _Support(Effect):
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for a place that the machine does not have."""
-        self.rows(machine.carrier())
+        self.rows(machine)
 
-    def rows(self, carrier: Carrier) -> Array:
+    def rows(self, machine: Machine) -> Array:
         """Return the row of the platform's coordinate, or the rows of the two directions of the axis."""
-        n = len(carrier.coordinates)
-        if self.position is not None:
-            if carrier.tilt is None:
-                raise InputError(f"effects.{self.kind}.position", "goes with a rotor that can tilt; name a platform instead")
-            return carrier.port_at(self.position if carrier.cg_offset is None else carrier.cg_offset + self.position)
-        if carrier.axes != (1,):
-            if self.platform is not None:
-                raise InputError(f"effects.{self.kind}.platform", "goes with machines of platforms; a rotor needs a position")
-            return carrier.port
-        which = 1 if self.platform is None else self.platform
-        if which > n:
-            raise InputError(f"effects.{self.kind}.platform", f"is {which}; the machine has platforms 1 to {n}")
-        return jnp.eye(n, dtype=carrier.mass.dtype)[which - 1 : which]
+        if self.position is None:
+            return machine.rows_at(self.platform, f"effects.{self.kind}.platform")
+        return machine.rows_at(self.position, f"effects.{self.kind}.position")
 
 
 def _where(kind: str, platform: int | None, position: Number | None) -> tuple[int | None, Array | None]:
@@ -86,8 +76,8 @@ class CubicSupport(_Support):
         a = moved[which]
         if not float(a) > 0.0:
             return None
-        platform = which + 1 if carrier.axes == (1,) else None
-        position = 0.0 if carrier.tilt is not None else None
+        platform = which + 1 if machine.places == "platform" else None
+        position = 0.0 if machine.places == "shaft" else None
         stiffness = jnp.max(jnp.abs(carrier.bed_stiffness[:, which])) * 0.04 / (3.0 * a**2)
         return Typical(cls(stiffness, platform, position), f"1 % stiffer in the mean at a swing of {1e3 * float(a):.3g} mm")
 
@@ -154,9 +144,9 @@ class Stop(_Support):
         """Return the force of spring and damper."""
         return (SupportForce(self.rows, self.energy, self.resistance),)
 
-    def rows(self, carrier: Carrier) -> Array:
+    def rows(self, machine: Machine) -> Array:
         """Return the rows of the place. **Raises** `InputError` for a side of a ring."""
-        rows = super().rows(carrier)
+        rows = super().rows(machine)
         if rows.shape[0] > 1 and self.side != "both":
             raise InputError("effects.stop.side", f"is {quoted(self.side)}; around a rotor's axis it must be 'both'")
         return rows

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.carrier import Machine
 from jaxvib.machine.loads import Loads, NormalForce
 
 __all__ = [
@@ -219,13 +219,13 @@ class SlipRelease:
 @final
 @dataclass(frozen=True)
 class SupportForce:
-    """Nonlinear support of the carrier.
+    """Nonlinear support of a machine.
 
-    **Attributes**: `rows` of a carrier, (k, nd), which give the displacements x of the supported point; `energy` of x, J;
-    `resistance` of x and its rate, the dissipative force on the foundation, (k,) N, or None; `is_smooth`.
+    **Attributes**: `rows` of a machine, (k, nd), which give the displacements x of the supported point, see `Machine.rows_at`;
+    `energy` of x, J; `resistance` of x and its rate, the dissipative force on the foundation, (k,) N, or None; `is_smooth`.
     """
 
-    rows: Callable[[Carrier], Array]
+    rows: Callable[[Machine], Array]
     energy: Callable[[Array], Array]
     resistance: Callable[[Array, Array], Array] | None = None
     is_smooth: bool = False

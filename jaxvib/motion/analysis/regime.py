@@ -14,6 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.equations.linear import estimated_frequencies
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
+from jaxvib.machine.mount import scaled
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory, mean_speeds
 from jaxvib.results.fields import in_unit
@@ -244,27 +245,27 @@ def _unbalance(scene: Scene, phase: Array, turn: Array) -> Array:
     Of a rotor that tilts also what tilts it, about the loads' point: relative to the loads' own levers, or where they have
     none to the rotor's radius of gyration.
     """
-    carrier, loads = scene.machine.carrier(), scene.loads
+    mount, loads = scene.machine.mount(), scene.loads
     each = jnp.broadcast_to(loads.mass * loads.arm(), (loads.count,)) * jnp.exp(1j * phase)
     origin = jnp.zeros_like(turn[0])
     thrown = [term.at(origin) for term in terms_of(scene.effects, RotorImbalance)]
     own = sum((imbalance.static[0] + 1j * imbalance.static[1] for imbalance in thrown), jnp.zeros_like(each[0]))
     size = jnp.sum(jnp.abs(each))
     left = jnp.abs(jnp.sum(each) + own) / size
-    if carrier.tilt is None:
+    if mount.tilt is None:
         return left
-    stations = jnp.zeros_like(phase) if carrier.stations is None else carrier.stations
-    moment = sum((imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in thrown), jnp.sum(stations * each))
-    moment = moment if carrier.cg_offset is None else moment + carrier.cg_offset * own
-    rows = [jnp.linalg.solve(carrier.mass, row[0]) @ row[0] for row in (carrier.port, carrier.tilt)]
-    whole = jnp.sum(jnp.abs(stations * each))
+    tilting = [scaled(lever, each) for lever in mount.levers[1:]]
+    moment = sum((imbalance.moment[0] + 1j * imbalance.moment[1] for imbalance in thrown), jnp.sum(sum(tilting, 0.0 * each)))
+    moment = sum((scaled(lever, own) for lever in mount.rotor_levers[1:]), moment)
+    mass = scene.machine.carrier().mass
+    rows = [jnp.linalg.solve(mass, row[0]) @ row[0] for row in mount.rows]
+    whole = jnp.sum(jnp.abs(sum(tilting, 0.0 * each)))
     return jnp.maximum(left, jnp.abs(moment) / jnp.where(whole > 0.0, whole, size * jnp.sqrt(rows[0] / rows[1])))
 
 
 def _resonances(scene: Scene, rotor_speed: Array) -> Array:
     """Natural frequencies that turning loads meet, ascending, rad/s; of a gyroscopic rotor the forward whirls at its speed."""
-    carrier = scene.machine.carrier()
-    if carrier.gyroscopic is None:
+    if scene.machine.mounting().gyroscopic is None:
         return estimated_frequencies(scene)
     found = whirl(jax.lax.stop_gradient(scene), jax.lax.stop_gradient(rotor_speed)[None])
     return jnp.sort(jnp.where(found.forward[0] & jnp.isfinite(found.speed[0]), found.speed[0], jnp.inf))

@@ -99,7 +99,7 @@ def _basis(scene: Scene, state: State) -> tuple[Callable[[Array], State], Callab
     """Tangents of the state from numbers x, the numbers of such a tangent, and how many there are."""
     touching = has_term(scene.effects, LoadInteraction)
     shared = all(leaf.ndim == 0 for leaf in jax.tree.leaves(scene.loads))
-    if touching or not shared or scene.machine.structure().stations is not None:
+    if touching or not shared or not scene.machine.mounting().at_one_point:
         flat, restored = ravel_pytree(state)
         return restored, lambda tangent: ravel_pytree(tangent)[0], flat.size
     zero = jax.tree.map(jnp.zeros_like, state)

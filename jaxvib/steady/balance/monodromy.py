@@ -34,7 +34,7 @@ _FEWEST, _MOST = 16, 2**17
 
 def balanced_motion(scene: Scene, angles: Array, turn: Array) -> State:
     """The balanced motion when the rotor has turned by `turn` rad."""
-    rest = jnp.zeros_like(scene.machine.carrier().mass[0])
+    rest = jnp.zeros(len(scene.machine.structure().coordinates), angles.dtype)
     return State(rest, rest, (turn + angles,), (jnp.full_like(angles, 1.0) * scene.drive.speed,))
 
 
@@ -47,9 +47,9 @@ def _steps_for(scene: Scene) -> Array:
     """Number of steps in which `monodromy` resolves a turn: the carrier's oscillation, and the turn itself."""
     linear, speed = linear_model(scene), scene.drive.speed
     fastest = jnp.max(linear.modes()[0])
-    if linear.carrier.gyroscopic is not None:
+    if linear.mount.gyroscopic is not None:
         half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
-        fastest = fastest + speed * jnp.linalg.norm(half @ linear.carrier.gyroscopic @ half.T)
+        fastest = fastest + speed * jnp.linalg.norm(half @ linear.mount.gyroscopic @ half.T)
     return jnp.clip(radau.steps_for(2.0 * jnp.pi * (fastest / speed + 2.0)), _FEWEST, _MOST)
 
 

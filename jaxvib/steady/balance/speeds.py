@@ -127,7 +127,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
     Source: Filimonikhin et al. 2022, equations (14), (30), (48), for any carrier.
     """
     model = linear_model(scene)
-    port = model.carrier.port
+    port = model.mount.rows[0]
     stiffness = model.dynamic_stiffness(jnp.asarray(omega, dtype=port.dtype))
     columns = [small_solve(stiffness, row.astype(stiffness.dtype)) for row in port]
     return port @ jnp.stack(columns, axis=1)
@@ -179,34 +179,34 @@ def _characteristic_speeds(scene: Scene) -> tuple[CharacteristicSpeeds, Array, A
     """The speeds, and the port, stiffness and mass of the carrier with its loads."""
     model = linear_model(scene)
     carrier, direction = model.carrier, _direction(model)
-    if carrier.gyroscopic is None:
+    gyroscopic = model.mount.gyroscopic
+    if gyroscopic is None:
         square, inverse = relative_to(model.mass, carrier.stiffness)
         values, vectors, held = _free_and_held_modes(square, inverse @ direction)
         resonances, additional = root_or_zero(values), root_or_zero(held)
         shapes = inverse.T @ vectors
     else:
         # K is the metric: with a large polar moment M_S - i G is not positive definite, and a resonance is missing.
-        square, inverse = relative_to(carrier.stiffness, model.mass - 1j * carrier.gyroscopic)
+        square, inverse = relative_to(carrier.stiffness, model.mass - 1j * gyroscopic)
         values, vectors, held = _free_and_held_modes(square, inverse @ direction)
         resonances, additional = _inverse_root(values)[::-1], _inverse_root(held)[::-1]
         shapes = inverse.T @ vectors[:, ::-1] * jnp.where(jnp.isnan(resonances), 0.0, resonances)[None, :]
     changes = _sign_changes(model, direction, resonances, additional, shapes)
     found = CharacteristicSpeeds(resonances, additional, shapes, changes[0::2], changes[1::2], carrier.coordinates)
-    return found, carrier.port, carrier.stiffness, model.mass
+    return found, model.mount.rows[0], carrier.stiffness, model.mass
 
 
 def _direction(model: LinearModel) -> Array:
     """b = B^T e (nd,); real for a port with one direction, whose phase does not matter."""
-    return model.carrier.port[0] if len(model.carrier.axes) == 1 else model.direction
+    return model.mount.rows[0][0] if len(model.mount.axes) == 1 else model.direction
 
 
 def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarray, mass: np.ndarray) -> None:
     """Input checks."""
-    carrier = scene.machine.structure()
     if not np.any(port):
         problem = "moves with none of the coordinates; put the exciter where it can move, or its loads cannot act"
         raise InputError("machine.port", problem)
-    if carrier.gyroscopic is not None:
+    if scene.machine.mounting().gyroscopic is not None:
         if not np.all(np.linalg.eigvalsh(stiffness) > 0.0):
             raise InputError("machine.stiffness", "leaves a motion of the rotor without a spring; give every motion one")
         return
@@ -218,7 +218,7 @@ def _require_port_that_moves(scene: Scene, port: np.ndarray, stiffness: np.ndarr
     free = np.sum(np.linalg.eigvalsh(stiffness / np.outer(size, size)) <= 100.0 * rounding)
     if np.sum(squares <= rounding * squares[-1]) > free:
         stiff = int(np.argmax(np.diag(stiffness) / np.diag(mass)))
-        name = carrier.coordinates[stiff]
+        name = scene.machine.structure().coordinates[stiff]
         cannot = "cannot move beside the others in this precision; soften its spring, or leave it out of the machine"
         if np.any(port[:, stiff]):
             raise InputError("machine.exciter", f"stands on {name}, which {cannot}")
@@ -262,7 +262,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
 
     width = jnp.einsum("ar,ab,br->r", forms.conj(), jax.lax.stop_gradient(carrier.damping), forms).real / 2.0 + trace
     poles = jnp.where(jnp.isnan(poles), last, poles)
-    if carrier.gyroscopic is not None:
+    if model.mount.gyroscopic is not None:
         # A rotor with a large polar moment can have its last sign change above the last resonance.
         end = 4.0 * jnp.maximum(last, jnp.max(jnp.where(jnp.isnan(zeros), 0.0, zeros), initial=0.0))
         poles, width = jnp.append(poles, end), jnp.append(width, last)

@@ -176,9 +176,8 @@ def _imbalance(scene: Scene) -> complex:
     thrown = [term.at(jnp.zeros_like(scene.drive.speed)) for term in terms_of(scene.effects, RotorImbalance)]
     static = [complex(*map(float, each.static)) for each in thrown]
     moment = [complex(*map(float, each.moment)) for each in thrown]
-    machine = scene.machine  # its form is known without computing its numbers
-    cg_offset = None if machine.structure().cg_offset is None else machine.carrier().cg_offset
-    moment += [] if cg_offset is None else [float(cg_offset) * each for each in static]
+    levers = scene.machine.mount().rotor_levers[1:] if static else ()
+    moment += [float(lever) * each for lever in levers if lever is not None for each in static]
     if abs(sum(moment)) > 1e-9 * max(map(abs, moment), default=0.0):
         problem = (
             "tilt the rotor: loads at one point cannot cancel a moment imbalance, nor a static one away from them "

@@ -75,7 +75,7 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
     If the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
     it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
     """
-    if model.carrier.gyroscopic is None:
+    if model.mount.gyroscopic is None:
         return rotor_speed_at(model, omega)
 
     def residual(n: Array) -> Array:

@@ -139,13 +139,11 @@ class Parts(eqx.Module):
 def parts_of(scene: Scene) -> Parts:
     """The scene's model, equations and directions, see `Parts`."""
     model, loads = linear_model(scene), turning_loads(scene)
-    carrier, averaged = model.carrier, averaged_model(model)
-    stations = jnp.zeros(loads.count, carrier.port.dtype) if carrier.stations is None else carrier.stations
-    rows = jax.vmap(carrier.port_at)(stations)
+    averaged, rows = averaged_model(model), model.mount.load_rows(loads.count)
     return Parts(
         model=model,
         averaged=eqx.tree_at(lambda field: field.drive, averaged, ConstantSpeed(scene.drive.speed)),
-        direction=jnp.einsum("jka,k->ja", rows, turning(carrier)),
+        direction=jnp.einsum("jka,k->ja", rows, turning(model.mount)),
     )
 
 

@@ -27,7 +27,7 @@ def receptance(model: CollectedModel, omega: Array, speed: Array, orders: np.nda
 
     D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
     """
-    port = model.linear.carrier.port.T.astype(complex)
+    port = model.linear.mount.rows[0].T.astype(complex)
 
     def at(k: Array) -> Array:
         w = k * omega
@@ -44,7 +44,7 @@ def _answer(model: CollectedModel, grid: Grid, omega: Array, speed: Array) -> Ar
 def _at_port(model: CollectedModel, grid: Grid, omega: Array, answer: Array) -> Array:
     """`_answer` from the receptance at the orders of the grid, and others after these."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
-    return -(w**2)[:, None, None] * (model.linear.carrier.port @ answer[: w.size])
+    return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ answer[: w.size])
 
 
 def _feedback(grid: Grid, answer: Array) -> Array:
@@ -178,7 +178,7 @@ def _newton(
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
     # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
-    fixed = given == "omega" and model.linear.carrier.gyroscopic is None
+    fixed = given == "omega" and model.linear.mount.gyroscopic is None
     known = _answer(model, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
@@ -331,6 +331,6 @@ def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution, an
     return Harmonics(
         analyzed(motion.deviation, deviation_analysis(grid)),
         displacement,
-        -(carrier.port @ displacement) * w[None] ** 2,
+        -(model.linear.mount.rows[0] @ displacement) * w[None] ** 2,
         carrier.bed_force(displacement, 1j * w[None] * displacement),
     )

@@ -61,20 +61,20 @@ def _rates(model: CollectedModel, omega: Array, speed: Array) -> _Rates:
 
         max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
     """
-    linear, carrier = model.linear, model.linear.carrier
+    linear, carrier, mount = model.linear, model.linear.carrier, model.linear.mount
     half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
     oscillation = jnp.max(linear.modes()[0])
     damping = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
-    if carrier.gyroscopic is not None:
-        oscillation = oscillation + speed * jnp.linalg.norm(half @ carrier.gyroscopic @ half.T)
-    still = jnp.zeros((carrier.port.shape[0], 1), linear.mass.dtype)
+    if mount.gyroscopic is not None:
+        oscillation = oscillation + speed * jnp.linalg.norm(half @ mount.gyroscopic @ half.T)
+    still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
 
     def fastest(omega: Array, speed: Array) -> Array:
         one = jnp.ones((model.inertia.shape[0], 1), linear.mass.dtype)
         by_rate = model.torque_slopes(0.0 * one, omega * one, speed, still)[1]
         return jnp.max(-by_rate[:, 0] / model.inertia)
 
-    mobility = jnp.max(jnp.linalg.eigvalsh(carrier.port @ half.T @ half @ carrier.port.T))
+    mobility = jnp.max(jnp.linalg.eigvalsh(mount.rows[0] @ half.T @ half @ mount.rows[0].T))
     left = 1.0 - mobility * jnp.sum(model.unbalance**2 / model.inertia)
     return _Rates(oscillation, damping, jnp.vectorize(fastest)(omega, speed) / left)
 
@@ -135,17 +135,17 @@ def floquet(
     **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
     derivatives exist) or a scalar array, see `steps_for`.
     """
-    carrier, mass = model.linear.carrier, model.linear.mass
+    carrier, mount, mass = model.linear.carrier, model.linear.mount, model.linear.mass
     nd, count = mass.shape[0], model.inertia.shape[0]
-    parts = [carrier.stiffness, carrier.damping, *([] if carrier.gyroscopic is None else [carrier.gyroscopic])]
-    solved = small_solve(mass, jnp.concatenate([*parts, carrier.port.T], axis=1))
+    parts = [carrier.stiffness, carrier.damping, *([] if mount.gyroscopic is None else [mount.gyroscopic])]
+    solved = small_solve(mass, jnp.concatenate([*parts, mount.rows[0].T], axis=1))
     stiffness, damping, *gyroscopic = (solved[:, k * nd : (k + 1) * nd] for k in range(len(parts)))
     total = jnp.sum(model.unbalance)
     share = model.unbalance / total
     shift = solved[:, len(parts) * nd :] * total
     length = jnp.max(jnp.abs(shift))
     shift = shift / length
-    port = carrier.port * length
+    port = mount.rows[0] * length
     mobility = port @ shift
     # What a body of loads gives way with, per share of the unbalance.
     lever = (total / model.inertia)[None, :, None, None]

@@ -117,7 +117,7 @@ def jam_orbit(
 
     exists, direction, start = on_device(np.asarray(True)), None, frozen.drive.speed
     if mode is not None:
-        if frozen.machine.structure().gyroscopic is not None:
+        if frozen.machine.mounting().gyroscopic is not None:
             raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
         jams = jams_of(frozen)
         light, speed = known(jams.omega)[jams.row(mode)], known(frozen.drive.speed)

@@ -134,11 +134,11 @@ def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
 
 
 def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
-    structure = scene.machine.structure()
-    if structure.tilt is not None:
+    if scene.machine.mounting().tilt is not None:
         return None
     model = linear_model(scene)
-    whole = float(1.0 / (model.carrier.port @ jnp.linalg.solve(model.mass, model.carrier.port.T))[0, 0])
+    (port,) = model.mount.rows
+    whole = float(1.0 / (port @ jnp.linalg.solve(model.mass, port.T))[0, 0])
     n = scene.loads.count
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.inertia_factor() * scene.loads.mass, (n,))))
     says = "the machine does not tilt in this model: where it may, loads that turn couple its tilts (a rotor's own inertia too)"
@@ -146,11 +146,11 @@ def _gyroscopic(scene: Scene, values: Values, accuracy: float) -> NumberRow | No
 
 
 def _lift(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
-    carrier = scene.machine.carrier()
-    if carrier.axes != (1,) or has_term(scene.effects, SupportForce):
+    machine = scene.machine
+    if machine.mounting().axes != (1,) or has_term(scene.effects, SupportForce):
         return None
     loads = float(jnp.sum(jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))))
-    weight = _G * (float(jnp.trace(carrier.mass)) + loads)
+    weight = _G * (float(jnp.trace(machine.carrier().mass)) + loads)
     says = "foundation force over weight: above 1 springs that the machine stands on would have to pull; stop, cubic_support"
     return _row("lift: R / (M g)", values.foundation_force / weight, 1.0, says)
 

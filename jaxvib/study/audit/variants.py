@@ -8,12 +8,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import Array
 
 from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.drive import ConstantSpeed, SpinUp
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.files import EFFECTS
+from jaxvib.machine.mount import Mount, Place
 from jaxvib.machine.scene import Scene
 
 __all__ = ["Variant", "possible_variants", "present_variants"]
@@ -42,8 +44,16 @@ class WithoutGyroscopic(Machine):
         self.machine, self.kind = machine, str(machine.kind)
 
     def carrier(self) -> Carrier:
-        """The machine's, without its gyroscopic matrix."""
-        return eqx.tree_at(lambda c: c.gyroscopic, self.machine.carrier(), None)
+        """The carrier of the machine."""
+        return self.machine.carrier()
+
+    def mount(self) -> Mount:
+        """The mount of the machine without its gyroscopic matrix."""
+        return eqx.tree_at(lambda mount: mount.gyroscopic, self.machine.mount(), None)
+
+    def rows_at(self, place: Place, name: str = "place") -> Array:
+        """The rows of the machine."""
+        return self.machine.rows_at(place, name)
 
 
 def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
@@ -54,7 +64,7 @@ def present_variants(scene: Scene, until: float | None) -> Iterator[Variant]:
         number = f" {kinds[: k + 1].count(effect.kind)}" if kinds.count(effect.kind) > 1 else ""
         rest = (*scene.effects[:k], *scene.effects[k + 1 :])
         yield Variant(effect.kind + number, True, Scene(scene.machine, scene.loads, scene.drive, rest))
-    if scene.machine.structure().gyroscopic is not None:
+    if scene.machine.mounting().gyroscopic is not None:
         machine = WithoutGyroscopic(scene.machine)
         yield Variant("gyroscopic coupling", True, eqx.tree_at(lambda s: s.machine, scene, machine))
     if not scene.drive.ideal and until is not None:

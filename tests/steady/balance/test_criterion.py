@@ -62,11 +62,11 @@ def network_of(count, seed=0, damping=1.0):
 
 def real_part_of(s):
     """w -> Re(e^H A e) by numpy from the matrices alone."""
-    carrier = s.machine.carrier()
-    mass, damping, stiffness, port = (np.asarray(x) for x in (carrier.mass, carrier.damping, carrier.stiffness, carrier.port))
+    carrier, mount = s.machine.carrier(), s.machine.mount()
+    mass, damping, stiffness, port = map(np.asarray, (carrier.mass, carrier.damping, carrier.stiffness, mount.rows[0]))
     mass = mass + float(jnp.sum(jnp.broadcast_to(s.loads.mass, (s.loads.count,)))) * port.T @ port
-    skew = 0.0 * damping if carrier.gyroscopic is None else np.asarray(carrier.gyroscopic)
-    b = port.T @ np.array([(1.0, -1.0j)[axis] for axis in carrier.axes])
+    skew = 0.0 * damping if mount.gyroscopic is None else np.asarray(mount.gyroscopic)
+    b = port.T @ np.array([(1.0, -1.0j)[axis] for axis in mount.axes])
     return lambda w: (b.conj() @ np.linalg.solve(stiffness - w**2 * mass + 1j * w * (damping + w * skew), b)).real
 
 
@@ -182,7 +182,8 @@ def test_port_of_two_directions_without_damping(s):
     """Poles by scipy from the quadratic pencil, zeros as roots of the functional."""
     carrier = s.machine.carrier()
     speeds = characteristic_speeds(s)
-    mass = carrier.mass + 0.4 * carrier.port.T @ carrier.port - 1j * carrier.gyroscopic
+    (port,), gyroscopic = s.machine.mount().rows, s.machine.mount().gyroscopic
+    mass = carrier.mass + 0.4 * port.T @ port - 1j * gyroscopic
     inverse = scipy.linalg.eigvals(mass, carrier.stiffness).real
     poles = np.sort(1.0 / np.sqrt(inverse[inverse > 1e-12 * inverse.max()]))
     there = ~np.isnan(np.asarray(speeds.resonances))
@@ -190,7 +191,7 @@ def test_port_of_two_directions_without_damping(s):
     bare = eqx.tree_at(lambda m: m.polar, s.machine, s.machine.polar)
     for w in np.asarray(speeds.additional):
         if np.isfinite(w) and np.min(np.abs(w / poles - 1.0)) > 1e-6:
-            b = np.asarray(carrier.port).T @ np.array([1.0, -1.0j])
+            b = np.asarray(port).T @ np.array([1.0, -1.0j])
             d = np.asarray(bare.carrier().stiffness) - w**2 * np.asarray(mass)
             size = np.abs(b.conj() @ np.linalg.solve(d + 1e-2 * np.asarray(carrier.stiffness), b))
             assert abs(b.conj() @ np.linalg.solve(d, b)) < 1e-9 * size
@@ -200,7 +201,8 @@ def test_twenty_platforms():
     s = network_of(20, damping=0.2)
     result = jv.criterion(s)
     carrier = s.machine.carrier()
-    mass = carrier.mass + 0.6 * carrier.port.T @ carrier.port
+    (port,) = s.machine.mount().rows
+    mass = carrier.mass + 0.6 * port.T @ port
     np.testing.assert_allclose(result.resonances**2, scipy.linalg.eigh(carrier.stiffness, mass, eigvals_only=True), rtol=1e-9)
     held = [k for k in range(20) if k != 2]
     inner = np.ix_(held, held)
@@ -307,7 +309,10 @@ def test_exciter_that_cannot_move_is_refused():
         kind: str = eqx.field(static=True)
 
         def carrier(self):
-            return eqx.tree_at(lambda c: c.port, machines()["two_mass"].carrier(), jnp.zeros((1, 2)))
+            return machines()["two_mass"].carrier()
+
+        def mount(self):
+            return jv.Mount((jnp.zeros((1, 2)),), axes=(1,))
 
     s = jv.Scene(Fixed(kind="fixed"), jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
     with pytest.raises(jv.InputError, match=r"machine\.port moves with none"):

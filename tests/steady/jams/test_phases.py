@@ -47,9 +47,9 @@ def test_torques_are_means_over_a_turn():
     """The carrier's motion under all loads in NumPy, and the mean of - m R p' . a over 64 angles."""
     scene, w, phase = rotor(1e-3, 13635.0), 240.0, np.array([0.3, -1.0, 2.0, 4.0])
     carrier = scene.machine.carrier()
-    rows = np.stack([np.asarray(carrier.port_at(s)) for s in STATIONS])
+    rows = np.stack([np.asarray(scene.machine.rows_at(s)) for s in STATIONS])
     mass = np.asarray(carrier.mass) + sum(0.05 * row.T @ row for row in rows)
-    damping = np.asarray(carrier.damping + 460.0 * carrier.gyroscopic)
+    damping = np.asarray(carrier.damping + 460.0 * scene.machine.mount().gyroscopic)
     force = sum(
         0.05 * 0.08 * w**2 * row.T @ (np.array([1.0, -1.0j]) * np.exp(1j * a)) for row, a in zip(rows, phase, strict=True)
     )

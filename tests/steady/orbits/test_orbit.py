@@ -31,7 +31,10 @@ class Shaker(jv.Machine):
     def carrier(self):
         k, zero = self.stiffness, jnp.zeros((2, 2))
         damping = jnp.diag(jnp.asarray([30.0, 20.0]))
-        return jv.Carrier(40.0 * jnp.eye(2), damping, k, None, jnp.eye(2), k, zero + damping, (0, 1), ("x", "y"))
+        return jv.Carrier(40.0 * jnp.eye(2), damping, k, k, zero + damping, ("x", "y"))
+
+    def mount(self):
+        return jv.Mount((jnp.eye(2),), axes=(0, 1))
 
 
 def shaker():

@@ -1,0 +1,89 @@
+"""Mount: how the points of an exciter move with the coordinates of the machine that carries it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+__all__ = ["Mount", "Place", "scaled"]
+
+Place = int | float | Array | None
+"""A place on a machine: the number of a platform, or the distance along a rotor's axis from its mass centre, m; None is the
+machine's usual one."""
+
+
+class Mount(eqx.Module):
+    """The place of an exciter on a machine with nd coordinates q; its points move in np directions.
+
+        load j moves by sum_l levers[l][j] rows[l] q,      the rotor's mass centre by sum_l rotor_levers[l] rows[l] q
+
+    **Attributes**
+
+    - `rows`: arrays (np, nd). The first is a point of the rotor's axis; the second, 1/m times the unit of a displacement, is
+      the tilt of the axis. Machines that do not tilt have the first only
+    - `axes`: the direction of a load's plane (0 across, 1 up) of each row
+    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an entry that is absent is 0. (None,) if all loads run at
+      the first point, (None, distances from it in m) if each has a station of its own
+    - `rotor_levers`: the same for the rotor's mass centre, scalars
+    - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one
+    """
+
+    rows: tuple[Array, ...]
+    axes: tuple[int, ...] = eqx.field(static=True)
+    levers: tuple[Array | None, ...] = (None,)
+    rotor_levers: tuple[Array | None, ...] = (None,)
+    gyroscopic: Array | None = None
+
+    @property
+    def tilt(self) -> Array | None:
+        """Rows (np, nd) by which the axis tilts; None if it cannot."""
+        return self.rows[1] if len(self.rows) > 1 else None
+
+    @property
+    def at_one_point(self) -> bool:
+        """True if all loads run at the first point.
+
+        >>> import jaxvib as jv
+        >>> jv.planar_rotor(mass=37.0, stiffness="1160 N/mm", damping=840.0).mount().at_one_point
+        True
+        """
+        return len(self.levers) == 1 and self.levers[0] is None
+
+    def load_rows(self, count: int) -> Array:
+        """Rows of each load's point, (count, np, nd)."""
+        if self.at_one_point:
+            return jnp.broadcast_to(self.rows[0], (count, *self.rows[0].shape))
+        return jax.vmap(lambda levers: _combined(levers, self.rows))(self.levers)
+
+    def load_rates(self, rate: Array) -> dict[int, Array]:
+        """Velocities (accelerations) of the loads' points by axis, from those of the coordinates `rate` (nd,): a number each if
+        all loads run at one point, otherwise (count,)."""
+        if self.at_one_point:
+            return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
+        levers = [None if lever is None else lever[None, :] for lever in self.levers]
+        moved = [(row @ rate)[:, None] for row in self.rows[: len(levers)]]
+        return dict(zip(self.axes, _combined(levers, moved), strict=True))
+
+    def rotor_rows(self) -> Array:
+        """Rows of the rotor's mass centre, (np, nd)."""
+        return _combined(self.rotor_levers, self.rows)
+
+    def distances(self, count: int) -> Array:
+        """Distance of each load from the rotor's mass centre along the axis, (count,) m; 0 on a machine that does not tilt."""
+        zero = jnp.zeros((), self.rows[0].dtype)
+        load, rotor = (levers[1] if len(levers) > 1 else zero for levers in (self.levers, self.rotor_levers))
+        return jnp.broadcast_to((zero if load is None else load) - (zero if rotor is None else rotor), (count,))
+
+
+def scaled(lever: Array | None, value: Array) -> Array:
+    """A value times a lever, where None is 1."""
+    return value if lever is None else lever * value
+
+
+def _combined(levers: Sequence[Array | None], values: Sequence[Array]) -> Array:
+    terms = [scaled(lever, value) for lever, value in zip(levers, values, strict=False)]
+    return sum(terms[1:], terms[0])
