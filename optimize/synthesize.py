@@ -39,7 +39,7 @@ __all__ = ["Outcome", "Synthesis", "synthesize"]
 _CONVERGED = 1e-6
 """Largest decrease of the objective, relative to its value, that a converged design may still allow nearby."""
 
-_SAME = 1e-3
+_SAME_DESIGN_DISTANCE = 1e-3
 """Largest distance of two designs that count as the same machine, relative to the ranges of the free numbers."""
 
 _SPREAD = 1e-3
@@ -154,7 +154,7 @@ def synthesize(
         starts=len(found.point.z),
         drawn=found.drawn,
         converged=int(np.sum(done)),
-        same=int(np.sum(kept & (np.max(np.abs(found.point.z - found.point.z[best]), axis=1) < _SAME))),
+        same=int(np.sum(kept & (np.max(np.abs(found.point.z - found.point.z[best]), axis=1) < _SAME_DESIGN_DISTANCE))),
         designs=found.point.z,
         values=values,
         done=done,
@@ -165,7 +165,7 @@ def synthesize(
         table=rows,
         limits=limits,
         influences=influences_of(problem, reports[1:, len(named)]),
-        machines=machines_of(problem, found, _SAME),
+        machines=machines_of(problem, found, _SAME_DESIGN_DISTANCE),
     )
 
 
@@ -278,7 +278,7 @@ def _run(scene: Scene, mode: int | None, verify: bool) -> tuple[Run | None, str]
         run = settle(scene, start=_beside(orbit))
     except ComputationError as error:
         return None, str(error)
-    if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME:
+    if not abs(float(run.omega / orbit.omega) - 1.0) < _SAME_DESIGN_DISTANCE:
         return None, f"the motion left mode {mode} and settled at {float(run.omega):.6g} rad/s"
     return run, ""
 

@@ -148,7 +148,8 @@ class Averaged(eqx.Module):
         )
 
     def ripple(self, state: Amplitudes) -> Array:
-        """By how much the dropped torque shakes each load's angle, (count,) rad: S |e^T B i Omega V| / (2 I (2 Omega)^2)."""
+        """Amplitude of the angle of each load under the dropped torque, (count,) rad: S |e^T B i Omega V| / (2 I (2
+        Omega)^2)."""
         backward = times(jnp.sum(self.port * self._circle(), axis=1), state.velocity)
         backward = jnp.sum(self.levers * backward[:, None], axis=0)
         size = magnitude(backward)

@@ -48,7 +48,7 @@ class Spin(eqx.Module):
 
 
 class State(eqx.Module):
-    """Where everything is and how fast; also the time derivative of such a state.
+    """Positions and velocities of all parts; also the time derivative of such a state.
 
     **Attributes**: `displacement` q (nd,) m and `velocity` q' (nd,) m/s of the carrier's coordinates; `angle` and `rate`, a
     tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s;

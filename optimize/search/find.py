@@ -24,7 +24,7 @@ __all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
 _NODES = 400
 """Bounds that are looked at before a catalogue is given up on."""
 
-_FEW = 8
+_STARTS_PER_BOUND = 8
 """Designs that each bound of a catalogue is searched from."""
 
 Tell = Callable[[str, float], None]
@@ -89,20 +89,20 @@ def find(problem: Problem, options: Options, tell: Tell) -> Found | None:
         return _find(problem, options, tell)
     if first.interrupted:
         options = replace(options, iterations=0, polishing=0)
-    random = np.random.default_rng(options.seed).uniform(size=(2 * _FEW, problem.space.size))
-    begin = np.concatenate([_few(first), random])[: 2 * _FEW if _spread(problem) else _FEW]
+    random = np.random.default_rng(options.seed).uniform(size=(2 * _STARTS_PER_BOUND, problem.space.size))
+    begin = np.concatenate([_few(first), random])[: 2 * _STARTS_PER_BOUND if _spread(problem) else _STARTS_PER_BOUND]
     if not _spread(problem):  # its best machines are near those to leading order
         begin, options = _few(first), replace(options, iterations=0, polishing=max(options.polishing, 20))
     narrow = _with_lanes(problem, problem.space)
     if len(begin) == 0:
-        begin = first.point.z[:_FEW]
+        begin = first.point.z[:_STARTS_PER_BOUND]
     found = _find(narrow, replace(options, begin=begin), lambda what, share: tell(what, 0.5 + 0.5 * share))
     return None if found is None else found._replace(drawn=first.drawn, existing=first.existing)
 
 
 def _with_lanes(problem: Problem, space: DesignSpace) -> Problem:
     """The search in another space, for few designs."""
-    return replace(problem, space=space, lanes=_FEW)
+    return replace(problem, space=space, lanes=_STARTS_PER_BOUND)
 
 
 def _spread(problem: Problem) -> bool:
@@ -218,7 +218,7 @@ def choose(problem: Problem, options: Options, tell: Tell) -> Found | None:
             nodes += 1
             low, high = (b.copy() for b in node.bounds)
             low[choice.start], high[choice.start] = part[0], part[-1]
-            child = _bounded(problem, low, high, np.concatenate([where[None], begun])[:_FEW], options)
+            child = _bounded(problem, low, high, np.concatenate([where[None], begun])[:_STARTS_PER_BOUND], options)
             if child is None or child.violation[child.best] > 10.0 * FEASIBLE:
                 continue
             value = float(child.point.values[child.best, 0])
@@ -244,7 +244,7 @@ def _few(found: Found) -> np.ndarray:
         z = found.point.z[k]
         if np.isfinite(found.point.values[k, 0]) and all(np.max(np.abs(z - other)) > 1e-2 for other in kept):
             kept.append(z)
-    return np.reshape(kept[: _FEW - 1], (-1, found.point.z.shape[1]))
+    return np.reshape(kept[: _STARTS_PER_BOUND - 1], (-1, found.point.z.shape[1]))
 
 
 def _bounded(problem: Problem, low: np.ndarray, high: np.ndarray, numbers: np.ndarray, options: Options) -> Found | None:

@@ -12,7 +12,7 @@ from jaxvib.ode import progress
 
 @pytest.fixture
 def bar(monkeypatch):
-    """What a bar is told: "start", the completed shares of its one task, "stop"."""
+    """Calls that a bar receives: "start", the completed shares of its one task, "stop"."""
 
     class Recorded:
         def __init__(self, *, console, transient):

@@ -40,7 +40,7 @@ def test_loads_move_with_the_exciters_platform(kind):
 
 
 def _pushed(scene):
-    """How much each platform is accelerated by loads that turn on a machine at rest."""
+    """Acceleration of each platform by loads that turn on a machine at rest."""
     state = jv.initial_state(scene)
     return np.abs(np.asarray(jv.vector_field(scene)(0.0, state).velocity))
 

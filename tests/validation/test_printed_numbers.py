@@ -35,7 +35,7 @@ def test_every_number_has_a_name_of_its_own():
 
 
 def test_corrections_are_not_what_they_are_checked_with():
-    """What proves a misprint is computed in another way: it agrees to rounding, not bit for bit, in most cases."""
+    """The proof of a misprint is computed in another way: it agrees to rounding, not bit for bit, in most cases."""
     misprints = [n for n in NUMBERS if n.paper == "criterion" and n.misprint is not None]
     differ = [n.computed() != n.misprint.corrected() for n in misprints]
     assert len(differ) == 5 and sum(differ) >= 3

@@ -142,7 +142,7 @@ class Gravity(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """In the rotor's plane, along the axis where loads move there."""
+        """Gravity in the rotor's plane, or along the axis if loads move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) > _AXES["axis"]:
             return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, where that is vertical")
         return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, where the axis lies level")

@@ -131,7 +131,7 @@ class Stop(_Support):
         self.platform, self.position = _where(self.kind, platform, position)
 
     def _beyond(self, displacement: Array) -> tuple[Array, Array]:
-        """How far the motion is beyond the gap (negative: free), and the direction (k,) in which it presses."""
+        """Distance of the motion beyond the gap (negative: free), and the direction (k,) in which it presses."""
         if displacement.shape[0] == 1:
             x = displacement[0]
             sign = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}.get(self.side, jnp.where(x < 0.0, -1.0, 1.0))

@@ -82,7 +82,7 @@ class AbstractMeasured(eqx.Module):
 
     @property
     def settled(self) -> Array:
-        """Whether the motion repeats itself, as far as amplitudes and speed tell."""
+        """True if the motion repeats itself according to amplitudes and speed."""
         return self.drift < 1e-3
 
     def extent(self, scene: Scene) -> str:
@@ -94,7 +94,7 @@ class AbstractMeasured(eqx.Module):
 
 
 class Measured(AbstractMeasured):
-    """What `measure` reads off a motion, see `AbstractMeasured`."""
+    """Result of `measure`, see `AbstractMeasured`."""
 
 
 def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:

@@ -133,7 +133,7 @@ class Regime(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Where the loads stand: on a circle, each at its mean angle relative to the first load or to the rotor.
+        """Plot the loads on a circle, each at its mean angle relative to the first load or to the rotor.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -226,7 +226,8 @@ def _mode(natural: Array, mean: Array, rotor: Array) -> Array:
 
 
 def _caught(scene: Scene, natural: Array, rotor: Array) -> Array:
-    """Whether a motor's rotor hangs at a resonance: less than 15 % below one, and more than 5 % below the motor's own speed."""
+    """True if the rotor of a motor is caught at a resonance: less than 15 % below one, and more than 5 % below the motor's own
+    speed."""
     if scene.drive.ideal:
         return jnp.zeros((), bool)
     return jnp.any((rotor > 0.85 * natural) & (rotor < 1.02 * natural)) & (rotor < 0.95 * scene.drive.speed)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["Spectrum", "spectrum_of"]
 
 _FINER = 4
-"""So many times as many frequencies as a piece tells apart are computed, so that peaks are read to 2 %."""
+"""Factor by which frequencies are computed more densely than a piece resolves them, so that peaks are read to 2 %."""
 
 _OVER = 1.5
 """Frequencies up to so many times the rotor's greatest speed are kept."""
@@ -74,8 +74,8 @@ class Spectrum(Result):
         unit: SpeedUnit = "rad/s",
         ax: Axes | None = None,
     ) -> Drawn:
-        """Of one piece amplitudes over frequency; of several a waterfall over time, darker where it is stronger. Resonances,
-        the rotor's speed and the loads' are marked.
+        """Plot amplitudes over frequency for one piece; for several pieces a waterfall over time, darker for larger amplitudes.
+        Resonances, the rotor's speed and the loads' are marked.
 
         **Arguments**: `show` displacements or the force on the bed; `coordinate` by name, in a waterfall the one that moves
         most unless said otherwise; `unit` of frequencies, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto.

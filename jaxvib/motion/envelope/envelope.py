@@ -50,7 +50,7 @@ __all__ = ["envelope"]
 _WINDOW = 512
 """Samples in the window at the end over which is measured: 25 in a beat of the slowest resonance."""
 
-_LONGEST = 256
+_MAX_WINDOW_TURNS = 256
 """Turns of the rotor that the window is long at most, as in `simulate`."""
 
 
@@ -241,7 +241,7 @@ def _run(
     units = _units(frozen)
     speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
-    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _LONGEST / speed)
+    window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
     saves = [diffrax.SubSaveAt(ts=jnp.linspace(end - jnp.minimum(window, end / 2.0), end, _WINDOW))]
     if samples:
         saves.append(diffrax.SubSaveAt(ts=jnp.linspace(0.0, end, samples)))
@@ -352,7 +352,7 @@ def _measure(scene: Scene, window: Envelopes) -> Measured:
 
 
 def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes) -> Array:
-    """Whether potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
+    """True if potentials leave every load turning: at the end it has the energy to pass the top, I w^2/2 > (max V - min V)/2,
     and where it did not have that at the start, the drag was able to lift it, D n > max |dV/dphi|."""
     loads, potentials = scene.loads, terms_of(scene.effects, LoadPotential)
     if not potentials:

@@ -1,4 +1,4 @@
-"""What an averaged run is: its motion, its quantities, how it ended."""
+"""Result of an averaged run: its motion, quantities and outcome."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
 
 
 class EnvelopeStatus(eqx.Enumeration):
-    """How an averaged run ended; the members are the sentences a user reads."""
+    """Outcomes of an averaged run; the members are the sentences a user reads."""
 
     done = "the averaged run reached its end"
     max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
@@ -80,7 +80,7 @@ class Envelope(AbstractMeasured, Result):
         return (self.drift < 1e-3) & (self.status != EnvelopeStatus.would_separate)
 
     def summary(self) -> str:
-        """What happened, for a person to read; amplitudes zero to peak."""
+        """Text of the run; amplitudes zero to peak."""
         unstable, first = bool(self.status == EnvelopeStatus.would_separate), []
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"

@@ -64,7 +64,7 @@ class Criterion(Result):
 
     @validated
     def balances(self, speed: Array) -> Array:
-        """Whether the criterion calls auto-balancing stable at a rotor speed (any shape, rad/s)."""
+        """True if the criterion predicts stable auto-balancing at a rotor speed (any shape, rad/s)."""
         w = jnp.asarray(speed)
         return jnp.any(jnp.stack([(start < w) & (w < end) for start, end in self.balancing]), axis=0)
 

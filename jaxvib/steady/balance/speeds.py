@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CharacteristicSpeeds", "CriterionStatus", "characteristic_speeds", "port_receptance"]
 
-_POINTS = 24
+_GRID_POINTS = 24
 """Grid points on each side of each resonance, where sign changes of the damped machine are looked for."""
 
 
@@ -246,7 +246,7 @@ def _free_and_held_modes(square: Array, c: Array) -> tuple[Array, Array, Array]:
 
 
 def _sign_changes(model: LinearModel, direction: Array, resonances: Array, additional: Array, shapes: Array) -> Array:
-    """Where Re(b^H D(w)^-1 b) changes sign, ascending (2 nd - 1,), the first from + to -; NaN where there is none."""
+    """Sign changes of Re(b^H D(w)^-1 b), ascending (2 nd - 1,), the first from + to -; NaN for missing ones."""
     frozen, b, poles, zeros, forms = jax.lax.stop_gradient((model, direction, resonances, additional, shapes))
     carrier = model.carrier
     last = jnp.max(jnp.where(jnp.isnan(poles), 0.0, poles))
@@ -266,7 +266,7 @@ def _sign_changes(model: LinearModel, direction: Array, resonances: Array, addit
         # A rotor with a large polar moment can have its last sign change above the last resonance.
         end = 4.0 * jnp.maximum(last, jnp.max(jnp.where(jnp.isnan(zeros), 0.0, zeros), initial=0.0))
         poles, width = jnp.append(poles, end), jnp.append(width, last)
-    s = (jnp.arange(_POINTS) + 0.5)[None, :] / _POINTS
+    s = (jnp.arange(_GRID_POINTS) + 0.5)[None, :] / _GRID_POINTS
     half = (poles[1:] - poles[:-1])[:, None] / 2.0
     left, right = width[:-1, None], width[1:, None]
     inside = jnp.concatenate(

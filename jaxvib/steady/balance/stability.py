@@ -1,4 +1,4 @@
-"""Whether a balanced motion is stable: the answer."""
+"""Stability of a balanced motion: the result."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["BalancedStability", "StabilityStatus"]
 
 
 class StabilityStatus(eqx.Enumeration):
-    """Whether a balanced motion is stable; the members are the sentences a user reads."""
+    """Stability of a balanced motion; the members are the sentences a user reads."""
 
     stable = "errors of the balanced motion die out"
     unstable = "errors of the balanced motion grow"
@@ -27,7 +27,7 @@ class StabilityStatus(eqx.Enumeration):
 
 
 class BalancedStability(Result):
-    """Whether a balanced motion is stable, by the Floquet multipliers of the full equations over one turn of the rotor.
+    """Stability of a balanced motion by the Floquet multipliers of the full equations over one turn of the rotor.
 
     **Attributes**: `stable`; `is_decided`, true if the growth over a turn is larger than its error; `growth` 1/s, the largest
     rate at which an error grows (negative: the slowest decay), neutral directions left out; `multipliers` (2 (nd + N),)
@@ -44,13 +44,13 @@ class BalancedStability(Result):
 
     @property
     def status(self) -> StabilityStatus:
-        """Whether it is stable, a `StabilityStatus`."""
+        """Outcome, a `StabilityStatus`."""
         if not self.is_decided:
             return StabilityStatus.undecided
         return StabilityStatus.stable if self.stable else StabilityStatus.unstable
 
     def summary(self) -> str:
-        """Whether it is stable and how fast errors change, for a person to read."""
+        """Text of the stability and of the growth of errors."""
         largest = ", ".join(f"{abs(m):.6g}" for m in self.multipliers[:3])
         return (
             f"{self.message} at {self.growth:.4g} 1/s; largest multipliers {largest}, {self.neutral} of them neutral, "

@@ -42,7 +42,7 @@ __all__ = ["BalanceStatus", "BalancedStates", "balanced_growth", "balanced_inter
 
 
 class BalanceStatus(eqx.Enumeration):
-    """Whether loads can cancel each other; the members are the sentences a user reads."""
+    """Outcomes of the balance of loads; the members are the sentences a user reads."""
 
     unique = "the loads cancel in one arrangement, up to a common turn and a mirror image"
     family = "the loads cancel in a family of arrangements, with neutral directions besides the common turn"
@@ -51,7 +51,7 @@ class BalanceStatus(eqx.Enumeration):
 
 
 class BalancedStates(Result):
-    """How a set of loads can cancel each other and the rotor's imbalance, in the frame of the rotor.
+    """Arrangements in which a set of loads cancels the rotor's imbalance, in the frame of the rotor.
 
     **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
     0 unless the rotor is out of balance (no rows where nothing cancels); `dimension` of the set of arrangements, the
@@ -71,7 +71,7 @@ class BalancedStates(Result):
 
     @validated
     def stability(self, arrangement: int = 0, *, steps: int | None = None) -> BalancedStability:
-        """Whether that arrangement, counted from 0, is stable at the scene's rotor speed, see `balanced_stability`."""
+        """Stability of that arrangement, counted from 0, at the scene's rotor speed, see `balanced_stability`."""
         return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
 
     @validated

@@ -24,12 +24,12 @@ from jaxvib.results.fields import in_unit
 
 __all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "light_rotor_speed", "rotor_speed_at"]
 
-_POINTS = 64
+_GRID_POINTS = 64
 """Grid points on each side of each pole, where folds are looked for."""
 
 
 class Folds(eqx.Module):
-    """Where two jam modes appear or merge: dn/dOmega = 0.
+    """Points with dn/dOmega = 0, where two jam modes appear or merge.
 
     **Attributes**, all (2 nd,), ascending in `omega`, padded at the end where `exists` is False: `omega` load speed rad/s;
     `rotor_speed` rad/s; `exists`.
@@ -129,7 +129,7 @@ class Pieces(NamedTuple):
 def branch_pieces(model: JammedModel) -> Pieces:
     """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(model)
-    grid, resonances = fold_points(model, _POINTS)
+    grid, resonances = fold_points(model, _GRID_POINTS)
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(jax.vmap(lambda w: branch_slope(frozen, w)), grid, 2 * nd)
     falling = slopes < 0.0

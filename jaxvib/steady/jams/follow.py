@@ -15,8 +15,8 @@ from jaxvib.steady.jams.jam import Jam, jam_at
 
 __all__ = ["follow_fold", "follow_jam"]
 
-_STEPS = 6
-"""Of Newton's method; it converges quadratically from a near machine, and what has not converged is NaN."""
+_NEWTON_STEPS = 6
+"""Number of steps of Newton's method, which converges quadratically from a near machine; NaN without convergence."""
 
 
 def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
@@ -83,4 +83,4 @@ def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
         new = w - jnp.clip(jnp.nan_to_num(value / slope), -reach, reach)
         return jnp.where(new < most, new, 0.5 * (w + most))
 
-    return jax.lax.stop_gradient(jax.lax.fori_loop(0, _STEPS, step, jax.lax.stop_gradient(start)))
+    return jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, step, jax.lax.stop_gradient(start)))

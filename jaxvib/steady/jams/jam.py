@@ -32,11 +32,11 @@ if TYPE_CHECKING:
 __all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
 
 JUDGED = "by slope, for light loads that stay together"
-"""How the stability of a jam mode is judged, and for whom that holds."""
+"""Criterion of the stability of a jam mode, and its condition."""
 
 
 class JamStatus(eqx.Enumeration):
-    """What is known of a jam mode; the members are the sentences a user reads."""
+    """Outcomes of a jam mode; the members are the sentences a user reads."""
 
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
@@ -111,7 +111,7 @@ class JamModes(AbstractJam):
 
     @property
     def exists(self) -> Array:
-        """Which modes there are, one Boolean a mode."""
+        """Existence of each mode, one Boolean a mode."""
         return self.status != JamStatus.absent
 
     def mode_numbers(self) -> list[int]:
@@ -120,7 +120,7 @@ class JamModes(AbstractJam):
 
     @validated
     def row(self, mode: int, *, throw: bool = False) -> int:
-        """Where the numbers of the jam mode of that number stand in the arrays, whether it exists or not.
+        """Row of the jam mode of that number in the arrays, also for a mode that does not exist.
 
         **Raises** `InputError` for a number there can never be; with `throw` also as `select`.
         """
@@ -242,7 +242,7 @@ def jams_of(scene: Scene) -> JamModes:
 
 
 def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> dict[str, Any]:
-    """Those of all jam modes, from the loads' speed in each, rad/s, whether it exists, and whether it lies at its fold."""
+    """Fields of `JamModes` from load speeds, rad/s, existence flags and fold flags."""
     n = model.scene.drive.speed
 
     def jam(number: Array, w: Array, is_there: Array, flat: Array) -> Jam:
@@ -293,8 +293,8 @@ def jam_at(
 
 
 def _held(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
-    """Whether the vibration, which is largest where loads are together, has the torque S w^2 |e^H B Y| / 2 >= b_W R^2 (n - w)
-    that each load needs at some phase; loads that are alike share what there is."""
+    """True if the vibration, which is largest for coincident loads, has the torque S w^2 |e^H B Y| / 2 >= b_W R^2 (n - w) that
+    each load needs at some phase; equal loads share the torque."""
     loads = model.loads
     if loads.alike:
         return True

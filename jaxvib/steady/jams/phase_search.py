@@ -44,13 +44,13 @@ if TYPE_CHECKING:
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
 _SHOWN = 30.0
-"""So many times the scene's drag, and the same part of it, a figure of all jams reaches."""
+"""Range of the drag in a figure of all jams: this factor, and its inverse, times the scene's."""
 
 _SAME_LINE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
 
 _STARTS, _JAMS = 256, 64
-"""So many starts a program takes, and so many jams: mostly some hundred of the one and some tens of the other are left."""
+"""Numbers of starts and of jams in one program: mostly some hundred starts and some tens of jams are left."""
 
 _SAME, _CLOSE = 1e-6, 1e-5
 """Jams whose speeds differ by less, relative, and whose phases by less, rad, are one."""
@@ -219,7 +219,7 @@ def _balanced_many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Arr
 
 
 def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
-    """Whether the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
+    """True if the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
 
@@ -289,7 +289,7 @@ def _equal_loads(parts: Parts) -> list[np.ndarray]:
 
 
 def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bool:
-    """Whether two sets of phases differ by a common turn, and by an exchange of equal loads, only."""
+    """True if two sets of phases differ only by a common turn and by an exchange of equal loads."""
 
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
         return np.exp(1j * phase[group])
@@ -305,7 +305,7 @@ def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bo
 
 
 def _match(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether two sets of points are the same in some order."""
+    """True if two sets of points are the same in some order."""
     left = list(second)
     for point in first:
         near = int(np.argmin([abs(point - other) for other in left]))

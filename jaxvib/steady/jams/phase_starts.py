@@ -1,4 +1,4 @@
-"""Where jams at unequal phases are solved from: load speeds, and phases there at which all loads need as much drag."""
+"""Starts of the search for jams at unequal phases: load speeds, and phases at which all loads need the same drag."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FEW, _ROUNDS = 7, 6
 """Steps of Newton's method before those that have found their phases are left out, and how often."""
 
 _SPEEDS, _CHUNK = 400, 2048
-"""So many load speeds a program takes, and so many sets of phases."""
+"""Numbers of load speeds and of sets of phases in one program."""
 
 _PARTS, _CUTS = 8, 2
 """Into so many parts the stretch between two load speeds that a jam lies in is cut, and how often, before Newton's method takes
@@ -89,7 +89,7 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class AtSpeed(eqx.Module):
-    """What phases are looked for with at a load speed `omega`, rad/s: the `influence` (count, count) of `influence_of`, and
+    """Data of the search for phases at a load speed `omega`, rad/s: the `influence` (count, count) of `influence_of`, and
     `most`, the multiple of the drag that a load could need at most. One, or a leading axis over many."""
 
     omega: Array

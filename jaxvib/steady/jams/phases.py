@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 __all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_apart", "phase_jam", "phase_torques"]
 
-_NEAR = 0.02
+_SAME_JAM_DISTANCE = 0.02
 """Relative distance of load speeds up to which two theories speak of the same jam."""
 
 
 class PhaseStatus(eqx.Enumeration):
-    """What is known of a jam; the members are the sentences a user reads."""
+    """Outcomes of a jam; the members are the sentences a user reads."""
 
     found = "the loads can jam in this way"
     with_rotor = "the loads turn with the rotor and leave it at rest: they balance, and are not jammed"
@@ -103,7 +103,7 @@ class PhaseJam(AbstractPhaseJam):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Where the loads stand, on a circle.
+        """Plot the phases of the loads on a circle.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -308,7 +308,11 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
         return np.full(speeds.shape, np.nan)
     starts = np.where(known, speeds, float(scene.drive.speed))
     found = _growths(scene, jnp.asarray(starts))
-    near = known & (np.abs(found.omega - starts) < _NEAR * starts) & np.asarray(found.pattern == PhasePattern.together)
+    near = (
+        known
+        & (np.abs(found.omega - starts) < _SAME_JAM_DISTANCE * starts)
+        & np.asarray(found.pattern == PhasePattern.together)
+    )
     return np.where(near, found.growth, np.nan)
 
 

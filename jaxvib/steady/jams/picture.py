@@ -48,7 +48,7 @@ MARKS = {
     "symmetry": "symmetry lost: loads part, or half-turns differ",
     "period_doubling": "period doubles",
 }
-"""What special points mean, for a legend."""
+"""Meanings of special points, for a legend."""
 
 
 def picture(

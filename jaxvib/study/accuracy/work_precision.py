@@ -47,7 +47,7 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver | None]] = {
 """Methods of time integration by name; the default is what `simulate` takes unless told otherwise."""
 
 _TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
-_POINTS = (8, 16)
+_ORBIT_POINTS = (8, 16)
 _AVERAGED = (1e-3, 1e-6)
 
 _SINGLE = 2e-6
@@ -167,7 +167,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
     else:
         start = State(*jam.fine.at(jnp.zeros(())))
         left_out.append(f"leading order: {light.message}; runs start on the exact motion in its place")
-    for few in _POINTS:
+    for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
         call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
         rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))

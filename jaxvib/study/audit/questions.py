@@ -117,8 +117,8 @@ class JamQuestion(NamedTuple):
 
 
 class RunQuestion(NamedTuple):
-    """Where the motion has come to at the end `until` (s) of a run from `start`: "rest", "turning" with the rotor, loads evenly
-    spread, or a state."""
+    """Question about the end `until` (s) of a run from `start`: "rest", "turning" with the rotor, loads evenly spread, or a
+    state."""
 
     until: float
     start: Literal["rest", "turning"] | State

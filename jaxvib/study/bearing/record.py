@@ -19,7 +19,7 @@ __all__ = ["Record", "read_record"]
 _MAX_BYTES, _MAX_LINE = 2**26, 10_000
 """Bytes of a record, some million samples, and characters of a line."""
 
-_LEAST = 16
+_MIN_SAMPLES = 16
 """Samples a record needs: fewer hold no swing."""
 
 _NAMES = {"time": ("time", "t", "zeit", "время"), "angle": ("angle", "phi", "theta", "f", "winkel", "угол")}
@@ -74,8 +74,8 @@ class Record(eqx.Module):
         if self.time.ndim != 1 or self.time.shape != self.angle.shape:
             shapes = f"time {self.time.shape}, angle {self.angle.shape}"
             raise InputError(name, f"has shapes {shapes}; two lists of one length are needed")
-        if self.time.size < _LEAST:
-            raise InputError(name, f"has {self.time.size} samples; a swing needs at least {_LEAST}")
+        if self.time.size < _MIN_SAMPLES:
+            raise InputError(name, f"has {self.time.size} samples; a swing needs at least {_MIN_SAMPLES}")
         for what, values in (("time", self.time), ("angle", self.angle)):
             wrong = np.flatnonzero(~np.isfinite(values))
             if wrong.size:
@@ -100,7 +100,7 @@ class Record(eqx.Module):
     def between(self, start: float, stop: float) -> Record:
         """The part of the record from `start` to `stop`, s. **Raises** `InputError` where too little is left."""
         kept = (self.time >= start) & (self.time <= stop)
-        if np.count_nonzero(kept) < _LEAST:
+        if np.count_nonzero(kept) < _MIN_SAMPLES:
             span = f"{self.time[0]:g} s to {self.time[-1]:g} s"
             raise InputError(
                 self.name, f"has {np.count_nonzero(kept)} samples from {start:g} s to {stop:g} s; it goes from {span}"

@@ -98,7 +98,8 @@ class Capture(Result):
 
     @property
     def islands(self) -> int:
-        """How often, going up the speeds, captures give way to failures again: 0 where there is one clean threshold."""
+        """Number of speeds, in ascending order, at which captures change to failures again: 0 where there is one clean
+        threshold."""
         all_of_them = np.all(self.captured, axis=1)
         return int(np.sum(np.any(self.captured, axis=1)[:-1] & ~all_of_them[1:]))
 

@@ -42,7 +42,7 @@ _FAILED = "failed"
 _TOLERANCE = Tolerance(1e-7)
 """Error of a step in double precision: enough to name a motion."""
 
-_FEWEST = 2**20
+_MIN_ALLOWED_STEPS = 2**20
 """Steps that a run may take at least, so that run-ups of any usual length share one program."""
 
 
@@ -184,7 +184,7 @@ def run_ups(
     if stepsize_controller is None and end.dtype.itemsize >= 8:
         stepsize_controller = _TOLERANCE
     if max_steps is None:
-        max_steps = max(_FEWEST, enough_steps(frequency_bounds(scene)[0], end))
+        max_steps = max(_MIN_ALLOWED_STEPS, enough_steps(frequency_bounds(scene)[0], end))
 
     def together(drags: Array, angles: Array) -> tuple[Regime, Array, Array]:
         return _together(scene, end, drags, angles, stepsize_controller, max_steps)

@@ -23,7 +23,7 @@ from jaxvib.steady.orbits.jam_orbit import jam_orbit
 __all__ = ["CASES", "begun"]
 
 _UNTIL = 40.0
-"""Of runs, in the published machine's unit of time: 16 turns of the rotor."""
+"""Duration of runs in the published machine's unit of time: 16 turns of the rotor."""
 
 
 def begun(scene: Scene) -> np.ndarray:

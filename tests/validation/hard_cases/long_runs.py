@@ -174,7 +174,7 @@ def _exponent(scene: Scene) -> Answer:
 
 
 def _exponent_again(scene: Scene) -> Reference:
-    """By the variational equation of Ueda's, in stretches of a turn, the first fifth left out."""
+    """Lyapunov exponent by the variational equation of Ueda's oscillator, in stretches of a turn, the first fifth left out."""
 
     def field(t: float, y: np.ndarray) -> list[float]:
         x, v, dx, dv = y

@@ -207,7 +207,7 @@ def _friction(coefficient: float, speed: float, width: float = 1e-4, drive: Driv
     return Scene(machine, loads, ConstantSpeed(speed) if drive is None else drive, effects)
 
 
-_FINE = (Tolerance(1e-10), None)
+_FINE_TOLERANCE = (Tolerance(1e-10), None)
 
 
 def _bent(
@@ -220,7 +220,7 @@ def _bent(
         against="the sharp law from event to event, SciPy's DOP853 on the reference model between them",
         scene=scene,
         # the error that a run claims is its own, that of its smoothed friction is not in it
-        answer=final_state(until, start, steps=_FINE, claims=law is not _dry)[0],
+        answer=final_state(until, start, steps=_FINE_TOLERANCE, claims=law is not _dry)[0],
         reference=law(until, start),
         within=within,
     )

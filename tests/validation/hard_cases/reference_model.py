@@ -160,7 +160,8 @@ def reference_model(scene: Scene) -> ReferenceModel:
 
 
 def light_speed(p: ReferenceModel, omega: float) -> tuple[float, NDArray[np.complex128], float]:
-    """Of light loads together that turn at `omega`: the rotor speed n, the complex displacements (nd,), the force on the bed.
+    """Motion of coincident light loads that turn at `omega`: the rotor speed n, the complex displacements (nd,), the force on
+    the bed.
 
     n = w - w^4 S^2 Im A / (2 sum b R^2),    A the receptance at the exciter, S = sum m R
     """
@@ -223,5 +224,5 @@ def light_modes(p: ReferenceModel, speed: float) -> np.ndarray:
 
 
 def root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function is 0 between two points at which its signs differ, as exactly as it can be computed."""
+    """Root of a function between two points with different signs, as exactly as it can be computed."""
     return float(root_scalar(function, bracket=(low, high), method="brentq", xtol=1e-300, rtol=1e-15).root)

@@ -95,7 +95,8 @@ def _frequencies(scene: Scene) -> Answer:
 
 
 def _frequencies_again(scene: Scene) -> Reference:
-    """By a symmetric eigenproblem; the sum of squares is the trace of M^-1 K, whose derivatives are inverse masses."""
+    """Frequencies by a symmetric eigenproblem; the sum of squares is the trace of M^-1 K, whose derivatives are inverse
+    masses."""
     p = reference_model(scene)
     mass = np.diag(p.whole_mass)
     root = np.sqrt(mass)

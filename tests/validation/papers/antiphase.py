@@ -44,7 +44,8 @@ def _resonance(k: int) -> float:
 
 
 def _ratio(quantity: str, *which: int) -> float:
-    """Of mode 3 with three loads to that with one. Amplitudes are lengths: in both machines the length y~ of one load."""
+    """Ratio of a quantity of mode 3 with three loads to that with one. Amplitudes are lengths: in both machines the length y~
+    of one load."""
     one, three = (np.asarray(getattr(_modes(count).select(3), quantity)) for count in (1, 3))
     return float((three / one)[which])
 

@@ -42,7 +42,8 @@ _DAMPER_2 = _B1 - _DAMPER_1
 
 @functools.cache
 def _nearest_critical_speeds() -> list[float]:
-    """Of the four readings (c2 as printed or 0, with pendulums or without) those nearest to the printed speeds."""
+    """Critical speeds of that one of four readings (c2 as printed or 0, with pendulums or without) which is nearest to the
+    printed speeds."""
     readings = []
     for variant in ("printed", "uncoupled"):
         for loads in ("none", "fixed"):

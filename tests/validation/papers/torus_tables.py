@@ -27,7 +27,7 @@ from papers.printed_torus import TABLES, PublishedRow, cosine_torus, gap_torus, 
 __all__ = ["CONTACT", "MODELS", "TorusTables", "published_tables"]
 
 CONTACT = LoadContact(stiffness=4e4, restitution=0.5)
-"""Of balls that touch: the paper leaves contact open. A contact lasts 3 ms, 0.07 turns."""
+"""Contact of balls that touch: the paper leaves contact open. A contact lasts 3 ms, 0.07 turns."""
 
 SPIN = FreeSpin()
 
@@ -248,7 +248,7 @@ def published_tables(
 
 
 _SHARES = np.arange(1, 5) / 5.0
-"""Where between two speeds others are tried."""
+"""Positions between two speeds at which others are tried."""
 
 
 def _from(captured: np.ndarray) -> np.ndarray:
