@@ -175,6 +175,10 @@ def test_a_spectrum_has_the_height_of_the_vibration(run):
     assert "resonances" in [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     fall = run.spectrum(6)
     assert fall.amplitude.shape[0] == 6 and np.all(np.diff(fall.time) > 0.0)
+    data = fall.to_xarray()
+    assert data["amplitude"].dims == ("piece", "frequency", "coordinate") and data["force"].dims[:2] == ("piece", "frequency")
+    for name, unit in (("time", "s"), ("rotor_speed", "rad/s"), ("load_speed", "rad/s")):
+        assert data[name].dims == ("piece",) and data[name].attrs["units"] == unit
     labels = [axes.get_ylabel() for axes in fall.plot(unit="rpm").axes]
     assert labels == ["frequency, rpm", "y1, mm, zero to peak"]
 
@@ -187,6 +191,7 @@ def test_mode_shapes_against_the_eigenproblem():
     for w, x in zip(np.asarray(found.frequency), np.asarray(found.shape), strict=True):
         np.testing.assert_allclose(carrier.stiffness @ x, w**2 * mass @ x, atol=1e-9 * np.max(np.abs(carrier.stiffness)))
         assert np.max(np.abs(x)) == pytest.approx(1.0)
+    assert found.to_xarray()["shape"].dims == ("shape_mode", "coordinate")
     bars = [bar.get_height() for bar in found.plot().axes[0].patches]
     np.testing.assert_allclose(np.sort(bars), np.sort(np.ravel(found.shape)))
 
