@@ -48,7 +48,7 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
-                heads.append(f"{part}{head} ({own})" if own else part + head)
+                heads.append(f"{part}{head}" + (f" ({own})" if own else ""))
                 rows.append(numbers)
     if not rows:
         there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
