@@ -21,22 +21,22 @@ _folder: list[Path] = []
 
 @validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
-    """Caches compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
+    """Cache compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
 
-    Two caches are used: jaxvib's own in `folder/programs`, of traced programs, and JAX's compilation cache, of what XLA makes
-    of them, in `folder` itself (where `jax_compilation_cache_dir` is set already, it stays). jaxvib does this by itself with
-    the default folder, unless the environment has JAXVIB_AUTOMATIC=off. Programs that differ in shapes, in options, in a
-    version of jaxvib or JAX, or in the processor are kept apart. The folder may be deleted at any time.
+    There are two caches: jaxvib's own in `folder/programs` holds traced programs, JAX's compilation cache in `folder` itself
+    holds compiled ones (`jax_compilation_cache_dir` stays if it is set already). jaxvib calls this function with the default
+    folder, unless JAXVIB_AUTOMATIC=off in the environment. Programs that differ in shapes, in options, in a version of jaxvib
+    or JAX, or in the processor have different keys. The folder may be deleted at any time.
 
-    A program that calls back into Python, such as a progress meter's, cannot be stored. No program is stored or read while a
-    function or a constant of the package is replaced (by a mock, for example) or after a source file was edited in the
-    course of this process.
+    A program that calls back into Python, such as one with a progress bar, cannot be stored. No program is stored or read
+    while a function or a constant of the package is replaced (by a mock, for example), or after a source file was edited
+    since its import.
 
-    **Arguments**: `folder`, made where it does not exist; None: the one that JAX caches in already, else
-    `$XDG_CACHE_HOME/jaxvib`, else `~/.cache/jaxvib`; `only_if_unset` leaves a folder that was chosen before.
+    **Arguments**: `folder` is created if it does not exist; default: JAX's compilation cache if it is set, otherwise
+    `$XDG_CACHE_HOME/jaxvib`, otherwise `~/.cache/jaxvib`. `only_if_unset` keeps a folder that was chosen before.
 
-    **Returns** the folder. **Raises** `InputError` for a folder that cannot be made, that belongs to another user, or in which
-    others may write: whoever can write there can run code as you.
+    **Returns** the folder. **Raises** `InputError` for a folder that cannot be created, that belongs to another user, or in
+    which others may write: users with write access to it can run code as you.
 
     >>> import jaxvib as jv
     >>> jv.use_cache("/dev/null")           # doctest: +IGNORE_EXCEPTION_DETAIL
@@ -62,25 +62,24 @@ def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bo
 
 
 def default_folder() -> Path:
-    """Where programs are cached if no folder is named."""
+    """Return the folder in which programs are cached by default."""
     set_already = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     return Path(set_already or user_folder())
 
 
 def keep_programs(folder: Path | None) -> None:
-    """From now on traced programs are looked for in `folder` and written there; None: they are not."""
+    """Set the folder of traced programs; None: do not store them."""
     _folder[:] = [] if folder is None else [folder]
 
 
 def program_folder() -> Path | None:
-    """Where traced programs are cached; None where they are not."""
+    """Return the folder of traced programs; None if they are not stored."""
     return _folder[0] if _folder else None
 
 
 @contextlib.contextmanager
 def compiled_anew() -> Iterator[None]:
-    """In here no program is read from the disk or written there: what compiling takes can be measured, of programs that this
-    process has not compiled yet."""
+    """Disable both caches, to measure the compile time of programs that this process has not compiled yet."""
     folder, enabled = program_folder(), bool(jax.config.jax_enable_compilation_cache)  # pyright: ignore[reportAttributeAccessIssue]
     keep_programs(None)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -92,7 +91,7 @@ def compiled_anew() -> Iterator[None]:
 
 
 def require_own(folder: Path) -> None:
-    """**Raises** `InputError` where another user may write to a folder, or put another one in its place."""
+    """Raise `InputError` if another user may write to a folder or replace it."""
     if not hasattr(os, "geteuid"):  # Windows: a home folder is its owner's
         return
     for place in (folder, *folder.resolve().parents):

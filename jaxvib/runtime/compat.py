@@ -1,6 +1,6 @@
-"""All that the project uses of JAX, Equinox and XLA beyond what they promise to keep, each with what is done without it.
+"""Private interfaces of JAX, Equinox, diffrax and XLA that the project uses, each with a fallback.
 
-tests/runtime/test_compat.py has a test for each, which fails by its name when a new version changes it.
+tests/runtime/test_compat.py has a test for each, which fails when a new version changes it.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ __all__ = [
     "without_source_locations",
 ]
 
-_TESTED = ((0, 10), (0, 12))
-"""The first and the last version of jaxlib (major, minor) of which it is known which flags of `prepare_cpu` it has."""
+_TESTED_JAXLIB = ((0, 10), (0, 12))
+"""First and last version of jaxlib (major, minor) whose flags are known, see `accepted_flags`."""
 
-_GONE = {"--xla_cpu_use_fusion_emitters": (0, 11)}
-"""The flags of `prepare_cpu` that jaxlib has no more, each with the first version without it."""
+_REMOVED_FLAGS = {"--xla_cpu_use_fusion_emitters": (0, 11)}
+"""Flags of `prepare_cpu` that jaxlib no longer has, each with the first version without it."""
 
 try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var, jaxpr_as_fun
@@ -72,13 +72,13 @@ except ImportError:
     if TYPE_CHECKING:
         raise
     ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Primitive = Var = jaxpr_as_fun = None
-"""Traced programs; `jax.extend.core` may change at any time. Without them equations are integrated as they are, on arrays."""
+"""Traced programs. `jax.extend.core` may change at any time; without it equations are integrated on arrays."""
 
 
 def rewritten(
     program: ClosedJaxpr, equations: Sequence[tuple[JaxprEqn, list[Var | Literal]]], results: list[Var | Literal]
 ) -> ClosedJaxpr:
-    """A program of these equations, each with its inputs, and results; the same program where JAX lets nobody write one."""
+    """Return a program of these equations, each with its inputs, and results; the same program if JAX does not allow it."""
     try:
         changed = [equation.replace(invars=inputs) for equation, inputs in equations]
         return program.replace(jaxpr=program.jaxpr.replace(eqns=changed, outvars=results))
@@ -90,13 +90,13 @@ Atoms: TypeAlias = "list[Var | Literal]"
 """The inputs of an operation."""
 
 Instead: TypeAlias = "tuple[list[tuple[JaxprEqn, Atoms]], Var]"
-"""Operations, each with its inputs, that stand for another one, and the variable that stands for its result."""
+"""Operations, each with its inputs, that replace another one, and the variable that replaces its result."""
 
 
 def operation_like(function: Callable[..., object], *like: Any) -> JaxprEqn:
-    """The one operation of a function of such arguments, with variables of its own."""
+    """Return the single operation of a function of such arguments, with variables of its own."""
     shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in (x.aval for x in like)]
-    # Of the same function JAX would give the same program again, with the same variables.
+    # For the same function JAX would return the same program again, with the same variables.
     (equation,) = jax.make_jaxpr(lambda *x: function(*x))(*shapes).jaxpr.eqns
     return equation
 
@@ -106,7 +106,7 @@ Rule = TypeVar("Rule", bound=Callable)
 
 
 class _PlainVmap(Generic[Out]):
-    """In place of `jax.custom_batching.custom_vmap`: JAX's own rule, by which the function is mapped operation by operation."""
+    """Substitute for `jax.custom_batching.custom_vmap`: JAX's own rule, which batches operation by operation."""
 
     def __init__(self, function: Callable[..., Out]):
         self.function = function
@@ -119,11 +119,11 @@ class _PlainVmap(Generic[Out]):
 
 
 custom_vmap: type[_PlainVmap] = getattr(getattr(jax, "custom_batching", None), "custom_vmap", _PlainVmap)
-"""A function with a rule of its own for `vmap`. Without it the results are the same, and slower."""
+"""Function with a rule of its own for `vmap`. Without it the results are the same, but slower."""
 
 
 def traced(value: object) -> bool:
-    """Whether JAX is transforming the computation that `value` is part of, so that it has no number yet.
+    """Return True if JAX is transforming the computation of `value`, which then has no number.
 
     >>> traced(1.0)
     False
@@ -138,53 +138,52 @@ def traced(value: object) -> bool:
 
 
 def primal_of(tracer: object) -> object | None:
-    """What a derivative or a batch is taken of where `tracer` stands for it; None where that is not known, as under `jit`."""
+    """Return the value whose derivative or batch `tracer` represents; None if it is unknown, as inside `jit`."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
 
 
 def evaluating() -> contextlib.AbstractContextManager[None]:
-    """In here known numbers are computed with at once, whatever JAX is transforming; without it they are part of that."""
+    """Evaluate operations on known numbers at once inside a transformation; without JAX's context they are traced."""
     context = getattr(getattr(jax, "core", None), "eval_context", contextlib.nullcontext)
     return context()
 
 
 @contextlib.contextmanager
 def without_source_locations() -> Iterator[None]:
-    """What is traced in here does not note for each operation from where it was called, and does not ask anew for each check at
-    run time which of the callers' files are JAX's own: a tenth of the time until a program is compiled. Without JAX's names for
-    these it does."""
+    """Trace without source locations of operations, and remember which files are JAX's own instead of searching for each
+    run-time check. This saves a tenth of the time until a program is compiled. Without JAX's names nothing changes."""
     limit = getattr(sys.modules.get("jax._src.config"), "traceback_in_locations_limit", None)
     frames = sys.modules.get("jax._src.traceback_util")
     with contextlib.ExitStack() as stack:
         if limit is not None:
             stack.enter_context(limit(0))
         if frames is not None and hasattr(frames, "include_filename"):
-            stack.enter_context(_patched(frames, "include_filename", _is_shown))
+            stack.enter_context(_patched(frames, "include_filename", _includes_file))
         yield
 
 
 @functools.cache
-def _is_shown(filename: str) -> bool:
+def _includes_file(filename: str) -> bool:
     return _unpatched(sys.modules.get("jax._src.traceback_util"), "include_filename")(filename)
 
 
 def backend_started() -> bool:
-    """Whether JAX has begun to compute, so that flags for the compiler come too late; False where that cannot be found out.
+    """Return True if JAX has started a backend, so that compiler flags have no effect; False if that is unknown.
 
-    There is no public way to ask without starting a backend.
+    Public functions start a backend when asked.
     """
     return bool(getattr(sys.modules.get("jax._src.xla_bridge"), "_backends", None))
 
 
 def accepted_flags(flags: list[str]) -> list[str]:
-    """Those of XLA's `flags` that this jaxlib knows: XLA ends the process at the first one in XLA_FLAGS that it does not know.
+    """Return the `flags` that this jaxlib knows: an unknown flag in XLA_FLAGS ends the process.
 
-    A version that is not known to accept them is asked, in a process of its own (seconds); the answer is remembered in a file.
+    Untested versions of jaxlib are tried in a separate process (seconds); the answer is stored in a file.
     """
     version, number = importlib.metadata.version("jaxlib"), _jaxlib()
-    if _TESTED[0] <= number <= _TESTED[1]:
-        return [flag for flag in flags if number < _GONE.get(flag.partition("=")[0], (number[0], number[1] + 1))]
+    if _TESTED_JAXLIB[0] <= number <= _TESTED_JAXLIB[1]:
+        return [flag for flag in flags if number < _REMOVED_FLAGS.get(flag.partition("=")[0], (number[0], number[1] + 1))]
     path = user_folder() / f"flags-{version}.json"
     answers: dict[str, bool] = {}
     with contextlib.suppress(OSError, ValueError):
@@ -199,9 +198,9 @@ def accepted_flags(flags: list[str]) -> list[str]:
 
 
 def wide_vectors_are_right(flags: list[str]) -> bool:
-    """Whether programs are right that use vectors of 512 bits, under these XLA_FLAGS.
+    """Return True if programs with vectors of 512 bits are correct under these XLA_FLAGS.
 
-    The newer code generator of jaxlib 0.10 then gives 0 for the arctangent of arrays of 64 numbers and more.
+    With the newer code generator of jaxlib 0.10 the arctangent of arrays of 64 numbers or more is then 0.
     """
     return "--xla_cpu_use_fusion_emitters=false" in flags or _jaxlib() >= (0, 12)
 
@@ -211,19 +210,19 @@ def _jaxlib() -> tuple[int, ...]:
 
 
 def starts_with(flags: list[str]) -> bool:
-    """Whether JAX starts with these XLA_FLAGS, tried in a process of its own."""
+    """Return True if JAX starts with these XLA_FLAGS in a separate process."""
     environment = {**os.environ, "XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     return subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0
 
 
 _patching = threading.Lock()
-_patches: dict[tuple[str, str], tuple[list[int], Any]] = {}  # the threads that are inside, and what the attribute was
+_patches: dict[tuple[str, str], tuple[list[int], Any]] = {}  # threads inside, and the original attribute
 
 
 @contextlib.contextmanager
 def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> Iterator[None]:
-    """In here, and in this thread, a function of a module is another one; of several threads each may come and go."""
+    """Replace a function of a module in this thread; several threads may do so at the same time."""
     key, thread = (module.__name__, name), threading.get_ident()
     with _patching:
         if key not in _patches:
@@ -244,7 +243,7 @@ def _patched(module: ModuleType, name: str, instead: Callable[..., object]) -> I
 
 
 def _unpatched(module: ModuleType | None, name: str) -> Any:
-    """A function of a module as it was before it was `_patched`; None where there is none."""
+    """Return a function of a module as it was before `_patched`; None if there is none."""
     with _patching:
         known = _patches.get((getattr(module, "__name__", ""), name))
     return getattr(module, name, None) if known is None else known[1]
@@ -252,11 +251,11 @@ def _unpatched(module: ModuleType | None, name: str) -> Any:
 
 @contextlib.contextmanager
 def no_host_checks() -> Iterator[None]:
-    """What is traced in here has Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
+    """Trace Equinox's run-time checks (`equinox.error_if`) as NaN in place of errors.
 
-    Errors need a callback into Python, which keeps a program from being stored on disk. Equinox's own switch, EQX_ON_ERROR in
-    the environment, is read when it is imported and holds for the whole process; another choice than its default stays. Without
-    the two attributes checks stay as they are.
+    Errors need a callback into Python, and a program with a callback cannot be stored on disk. Equinox's own switch,
+    EQX_ON_ERROR in the environment, is read at its import and holds for the whole process; if it differs from the default it
+    stays. Without Equinox's two attributes the checks stay as they are.
     """
     errors = sys.modules.get("equinox._errors")
     plain = getattr(errors, "branched_error_if_impl", None)
@@ -266,7 +265,7 @@ def no_host_checks() -> Iterator[None]:
         return
 
     def to_nan(*args: object, on_error: str) -> object:
-        # Not the compiled one: what it is traced to would be found again outside.
+        # The function itself, not its compiled form, whose trace JAX would use again outside.
         return plain(*args, on_error="nan" if on_error == "default" else on_error)
 
     with _patched(errors, "branched_error_if_impl_jit", to_nan):
@@ -274,7 +273,7 @@ def no_host_checks() -> Iterator[None]:
 
 
 class _Instead:
-    """A module with some of its names replaced."""
+    """Module with some of its names replaced."""
 
     def __init__(self, module: ModuleType, **names: object):
         self._module = module
@@ -285,19 +284,19 @@ class _Instead:
 
 
 _ULPS = 100
-"""So many units in the last place before its end a time loop of diffrax makes its last step end there."""
+"""Distance from the end of a time loop of diffrax, in units in the last place, within which a step ends there."""
 
-_SHORTENING = threading.RLock()
+_REPLACING = threading.RLock()
 
 _ULPS_ONE_BY_ONE = re.compile(rf"for _ in range\({_ULPS}\):\s+t1_clip_floor = eqxi\.prevbefore\(t1_clip_floor\)\n")
 
 
 @contextlib.contextmanager
 def fast_diffrax_loop_end() -> Iterator[None]:
-    """What is traced in here has diffrax's time loops find the time `_ULPS` units in the last place before their end at once.
+    """Trace diffrax's time loops with one operation for the time `_ULPS` units in the last place before their end.
 
-    diffrax takes as many steps of one unit, written out: 300 operations, 2000 of the compiler's, 0.4 s for each loop. Where its
-    code does not read so, it stays as it is.
+    diffrax takes as many steps of one unit, unrolled: 300 operations, 2000 of the compiler's, 0.4 s for each loop. If its code
+    differs from `_ULPS_ONE_BY_ONE`, nothing changes.
     """
     integrate = sys.modules.get("diffrax._integrate")
     loop, internals = _unpatched(integrate, "loop"), getattr(integrate, "eqxi", None)
@@ -316,7 +315,7 @@ def fast_diffrax_loop_end() -> Iterator[None]:
             left -= 1
             return x if left else ulps_below(x, _ULPS)
 
-        with _SHORTENING:  # another thread may trace a loop of its own
+        with _REPLACING:  # another thread may trace a loop of its own
             internals = integrate.eqxi
             setattr(integrate, "eqxi", _Instead(internals, prevbefore=prevbefore))  # noqa: B010
             try:
@@ -337,13 +336,13 @@ def _source(function: FunctionType) -> str:
 
 
 def ulps_below(x: Array, number: int) -> Array:
-    """The floating-point number so many below `x`, which is not one of the very smallest."""
+    """Return the floating-point number `number` units in the last place below `x`, which is not subnormal."""
     whole = jax.lax.bitcast_convert_type(x, jnp.int64 if x.dtype.itemsize == 8 else jnp.int32)
     return jax.lax.bitcast_convert_type(jnp.where(x > 0.0, whole - number, whole + number), x.dtype)
 
 
 def enumeration_of(item: object) -> type[eqx.Enumeration]:
-    """The `equinox.Enumeration` that a member, or an array of members, is of. Without its attribute, what its text names."""
+    """Return the `equinox.Enumeration` of a member or an array of members. Without its attribute, read it from the text."""
     found = getattr(item, "_enumeration", None)
     if found is None:
         module, _, name = repr(item).split("<")[0].rpartition(".")
@@ -352,7 +351,7 @@ def enumeration_of(item: object) -> type[eqx.Enumeration]:
 
 
 def enumeration_names(enumeration: type[eqx.Enumeration]) -> tuple[str, ...]:
-    """The names of the members in the order of their numbers. Without Equinox's table of them, those in its source."""
+    """Return the names of the members in the order of their numbers. Without Equinox's table, read them from the source."""
     known = getattr(enumeration, "_name_to_item", None)
     if known is not None:
         return tuple(known)

@@ -1,4 +1,4 @@
-"""Which accelerators share the work of this process, and which one is a worker's own."""
+"""Accelerators that share the work of this process, and the assignment of one to each worker process."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from jaxvib.runtime.compat import traced
 __all__ = ["arrays_on_device", "known", "numpy_of", "on_device", "shared_devices", "take_a_device"]
 
 _VISIBLE = ("CUDA_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES")
-"""What restricts a process to some of its machine's accelerators."""
+"""Environment variables that restrict a process to some of the machine's accelerators."""
 
 _TAKING = threading.Lock()
 
 
 def shared_devices() -> list[object]:
-    """The accelerators that share this process's work; [None] where there is one device, or one that the caller chose.
+    """Return the accelerators that share this process's work; [None] for a single device, or if the caller chose one.
 
-    Processors are one device, however many XLA was told to make of them: their cores are shared by threads.
+    Processors count as one device, even if XLA divides them: threads share their cores.
     """
     found = jax.local_devices()
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
@@ -39,7 +39,7 @@ def shared_devices() -> list[object]:
 
 
 def known(value: ArrayLike) -> Any:
-    """A value as NumPy has it, if it has a number yet: arithmetic with it then needs no program compiled."""
+    """Convert a known value to NumPy, since arithmetic on JAX arrays compiles a program; return a tracer as it is."""
     return value if traced(value) else np.asarray(value)
 
 
@@ -49,7 +49,7 @@ def numpy_of(tree: PyTree) -> ModuleType:
 
 
 def on_device(tree: PyTree) -> PyTree:
-    """A tree with NumPy's arrays and numbers moved to JAX's device; `jnp.asarray` compiles a program for each shape.
+    """Move NumPy's arrays and numbers in a tree to JAX's device; `jnp.asarray` would compile a program for each shape.
 
     >>> on_device({"a": np.arange(2.0), "b": None})
     {'a': Array([0., 1.], dtype=float64), 'b': None}
@@ -60,13 +60,13 @@ def on_device(tree: PyTree) -> PyTree:
 
 
 def arrays_on_device(leaves: Sequence[Any]) -> list[Any]:
-    """Leaves of a tree with NumPy's arrays moved to JAX's device; numbers are part of programs, and stay."""
+    """Move NumPy's arrays among leaves of a tree to JAX's device; Python's numbers stay, since programs contain them."""
     return [on_device(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves]
 
 
 def take_a_device() -> None:
-    """Lets this process compute on an accelerator of its own, where its machine has several and other workers."""
-    # Before the first array: a worker would else take most of the memory of every accelerator, its neighbours' too.
+    """Assign an accelerator of its own to this worker process, if the machine has several."""
+    # Before the first array: otherwise a worker reserves most of the memory of every accelerator.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     devices = jax.local_devices()
     if len(devices) > 1:
@@ -77,10 +77,10 @@ def take_a_device() -> None:
 
 @functools.cache
 def _place() -> int:
-    """This process's number, from 0, among the workers on this machine that see the same accelerators.
+    """Return this process's index among the workers on this machine that see the same accelerators.
 
-    The number is a locked file, which the system gives free when the process ends, however it ends: the worker that comes in
-    place of a dead one has its accelerator.
+    The index is a locked file. The system unlocks it when the process ends in any way; the worker that replaces a dead one
+    gets its accelerator.
     """
     import fcntl  # not on Windows, where JAX has no accelerators
 

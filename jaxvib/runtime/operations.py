@@ -1,4 +1,4 @@
-"""The operations of a program: how many there are, and which of them are needed."""
+"""Number of operations of a program, and removal of those that no result needs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ __all__ = ["operations", "pruned"]
 
 
 def operations(function: Callable[..., Any], *arguments: Any) -> int:
-    """Operations of the program that `function` is traced to, those of loop bodies and of called programs counted once.
+    """Count the operations of the program of a function; those of loop bodies and called programs count once.
 
-    **Arguments**: the function's own; of arrays shapes and types are enough (`jax.ShapeDtypeStruct`). **Returns** a count.
+    **Arguments**: those of the function; `jax.ShapeDtypeStruct` may stand for arrays. **Returns** a count.
 
     >>> operations(lambda x: x * x + 1.0, 2.0)
     2
@@ -45,8 +45,7 @@ def _programs(value: Any) -> Iterator[Any]:
 
 
 def pruned(function: Callable[..., Sequence[Array]], *like: Array) -> Callable[..., list[Array]]:
-    """A function of such arrays, traced, without the operations that none of its results needs: who differentiates it does not
-    differentiate these."""
+    """Trace a function of such arrays and remove the operations that no result needs, before it is differentiated."""
     if not HAS_JAXPRS:
         return lambda *arrays: list(function(*arrays))
     program = jax.make_jaxpr(function)(*like)

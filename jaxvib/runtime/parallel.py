@@ -1,8 +1,8 @@
-"""The one way to compute many cases: chunks of one width, one compiled program for all, side by side on what this machine has.
+"""Parallel evaluation of many cases on all cores and accelerators, with one compiled program for all chunks.
 
-Sweeps, ensembles, run-ups, maps and searches rest on it. A map whose cases are questions of their own (a diagram, a criterion)
-takes `in_parallel`; cases that are entries of arrays take `in_chunks`, which fills the last chunk up, so that another number of
-cases needs no other program.
+Sweeps, ensembles, run-ups, maps and searches use it. `in_parallel` is for cases with host code (a diagram, a criterion),
+`in_chunks` for cases that are entries of arrays: it fills the last chunk up, so that another number of cases needs no other
+program.
 """
 
 from __future__ import annotations
@@ -36,34 +36,34 @@ _OPTIONS = {
     "jax_default_matmul_precision": jax.default_matmul_precision,
     "jax_default_device": jax.default_device,
 }
-"""JAX's options on which results depend, and what sets them in one thread alone."""
+"""JAX's options on which results depend, and the context managers that set them in one thread."""
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Generator[tuple[Item, Found], None, None]:
-    """A function of many items: threads compute them on all cores and accelerators; gives each with its item as it is finished.
+    """Evaluate a function of many items in threads, on all cores and accelerators; yield each item with its result.
 
-    Threads that need the same new program wait for the one that compiles it. Items are taken as there is room for them: one
-    more than threads is held at most, so that memory does not grow with their number. JAX's options are
-    those of the caller, with those that a context manager set for the caller's thread alone. When an error is raised, here or
-    by who takes the results, items that have not begun are not computed.
+    Results come in the order in which they are finished. Threads that need the same new program wait for the one that
+    compiles it. At most one more item than threads is taken from the iterator, so that memory does not grow with the number
+    of items. JAX's options are those of the caller's thread. After an error, of the function or of the consumer of the
+    results, no further item is computed.
 
     >>> sorted(in_parallel(lambda x: x * x, [3, 1, 2]))
     [(1, 1), (2, 4), (3, 9)]
     """
     left, devices = iter(items), itertools.cycle(shared_devices())
-    alike, threads = _same_options(function), cores()
+    with_options, threads = _same_options(function), cores()
     pool = ThreadPoolExecutor(threads)
     running: dict[Future[Found], Item] = {}
 
     try:
         while True:
             for item in itertools.islice(left, threads + 1 - len(running)):
-                running[pool.submit(alike, item, next(devices))] = item
+                running[pool.submit(with_options, item, next(devices))] = item
             if not running:
                 return
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -74,31 +74,31 @@ def in_parallel(function: Callable[[Item], Found], items: Iterable[Item]) -> Gen
 
 
 def _same_options(function: Callable[[Item], Found]) -> Callable[[Item, object], Found]:
-    """The function, in any thread under JAX's options as they are now, on a device."""
+    """Return the function of an item and a device, with JAX's options of the present thread."""
     wanted = {name: getattr(jax.config, name) for name in _OPTIONS}
 
-    def alike(item: Item, device: object) -> Found:
+    def with_options(item: Item, device: object) -> Found:
         with contextlib.ExitStack() as stack:
             for name, value in (wanted if device is None else wanted | {"jax_default_device": device}).items():
-                if getattr(jax.config, name) != value:  # set again it would make JAX trace programs again
+                if getattr(jax.config, name) != value:  # setting an option makes JAX trace programs again
                     stack.enter_context(_OPTIONS[name](value))
             return function(item)
 
-    return alike
+    return with_options
 
 
 def in_chunks(
     size: int, function: Callable[..., PyTree], *cases: PyTree, shared: tuple[PyTree, ...] = ()
 ) -> PyTree[np.ndarray]:
-    """A function of `size` cases at a time, for any number of them, put together in their order.
+    """Evaluate a function for any number of cases, `size` at a time, and concatenate the results in their order.
 
     The last chunk is filled up with copies of the last case. Under a JAX transformation the chunks are computed one after
     another within the program.
 
-    **Arguments**: `size` of a chunk; `function` of trees of arrays (size, ...) and of what all cases have in common, `shared`;
+    **Arguments**: `size` of a chunk; `function` of trees of arrays (size, ...) and of the `shared` values of all cases;
     `cases` trees of arrays (n, ...).
 
-    **Returns** the function's tree with NumPy arrays (n, ...); under a transformation with JAX's.
+    **Returns** the function's tree with NumPy arrays (n, ...), under a transformation JAX arrays.
 
     >>> in_chunks(4, lambda x, y: {"sum": x + y}, np.arange(6.0), shared=(1.0,))
     {'sum': array([1., 2., 3., 4., 5., 6.])}
@@ -128,18 +128,18 @@ def in_chunks(
 
 
 def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[object] = (None,)) -> list[Found]:
-    """The function of 0, 1, ... so many: each thread, the caller's too, takes the next number as soon as it is free, which
-    takes less time than to hand out items one by one. Options and errors as `in_parallel`; a thread has one of the `devices`.
+    """Return the function's results for 0, 1, ..., `number` - 1, in this order, computed in threads.
 
-    Programs that one thread asks for are run one after the other, whether it waits for their results or not. Where JAX is
-    debugging, operation by operation or looking for NaN, the caller's thread does all.
+    Each thread, also the caller's, takes the next number as soon as it is free, which is faster than handing out items one by
+    one. Options and errors as in `in_parallel`; a thread has one of the `devices`. While JAX is debugging (operation by
+    operation, or looking for NaN) the caller's thread computes everything.
 
     >>> in_threads(lambda k: k * k, 3)
     [0, 1, 4]
     """
     if is_debugging():
         return [function(k) for k in range(number)]
-    alike = _same_options(function)
+    with_options = _same_options(function)
     workers = min(max(cores(), len(devices)), number)
     left, found, failed = iter(range(number)), [], []
 
@@ -148,7 +148,7 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
             for k in left:
                 if failed:
                     break
-                found.append((k, alike(k, devices[worker % len(devices)])))
+                found.append((k, with_options(k, devices[worker % len(devices)])))
         except BaseException:
             failed.append(True)
             raise
@@ -166,6 +166,6 @@ def in_threads(function: Callable[[int], Found], number: int, devices: Sequence[
 
 @functools.cache
 def _threads() -> ThreadPoolExecutor:
-    """Those beside the caller's, which stay: to begin them anew takes longer than to hand them a run. Nobody waits for one that
-    has not begun, so that they may themselves ask for threads."""
+    """Return the threads beside the caller's. They are kept, since starting threads takes longer than handing them a run.
+    Callers cancel tasks that have not begun instead of waiting for them; therefore a task may use threads itself."""
     return ThreadPoolExecutor(max(64, cores()))

@@ -1,4 +1,4 @@
-"""What is set once in a process before the first question: XLA's options for the CPU, and the cache of compiled programs."""
+"""Settings of a process before the first question: XLA's options for the CPU, and the cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["start"]
 
 @functools.cache
 def start() -> None:
-    """Does what `prepare_cpu()` and `use_cache()` do, unless they were called or the environment has JAXVIB_AUTOMATIC=off.
+    """Call `prepare_cpu()` and `use_cache()`, unless they were called before or JAXVIB_AUTOMATIC=off in the environment.
 
-    It is called when the first public name of jaxvib is asked for, errors and those two apart. Where JAX has begun to compute
-    already, so that XLA's options come too late, a warning says what that costs; one too where programs cannot be cached.
+    The first use of a public name of jaxvib, other than errors and these two functions, calls it. A warning is issued if JAX
+    has computed already, so that XLA's options have no effect, and if programs cannot be cached.
     """
     if os.environ.get("JAXVIB_AUTOMATIC", "").lower() in ("off", "0", "no", "false"):
         return

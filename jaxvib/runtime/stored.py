@@ -1,7 +1,7 @@
 """Programs stored on disk, so that the next process that asks the same question need not trace them.
 
-A program is stored as `jax.export` writes it, under a line of JSON that describes the structure of its result. What XLA makes
-of it is in JAX's own compilation cache. Nothing that is read is run as Python.
+A program is stored in the format of `jax.export`, below a line of JSON that describes the structure of its result. XLA's
+compiled form is in JAX's own compilation cache. Files are data: nothing in them is run as Python.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["StoredFunction", "is_debugging"]
 T = TypeVar("T")
 
 _PACKAGES = (*sorted(KNOWN_PACKAGES - {"jaxvib", "optimize"}), "jaxlib", "numpy")
-"""Whose versions a traced program depends on."""
+"""Packages whose versions a traced program depends on."""
 
 _OPTIONS = ("jax_enable_x64", "jax_numpy_rank_promotion", "jax_numpy_dtype_promotion", "jax_default_matmul_precision")
 """JAX's options that a traced program depends on."""
@@ -68,51 +68,51 @@ _listing = threading.Lock()  # of `_functions`
 
 
 class StoredFunction(Generic[T]):
-    """A function of trees of arrays and of what can be hashed, compiled, whose programs are stored on disk.
+    """Compiled function of trees of arrays and hashable values, whose programs are stored on disk.
 
     The key of a program on disk holds all that it depends on: the shapes and types of arrays, the static parts of the
-    arguments, JAX's options, the versions, the sources, and the processor. The programs used last are held in memory,
-    at most `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`; others are read or traced again.
+    arguments, JAX's options, the versions, the sources, and the processor. The least recently used programs in memory, beyond
+    `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`, are freed and later read or traced again.
 
-    Some programs are not stored, but traced in each process: those with arguments of a class from outside
-    (its source may change unseen), with functions that have no name, with host callbacks, with arrays on several devices. In a
-    process whose code is not that of the sources (see `jaxvib.imported`) no program is stored or read. As soon as that is
-    noticed, nothing that was traced of the former code is used again.
+    Some programs are not stored, but traced in each process: those with arguments of other packages' classes (their sources
+    are not part of the key), with functions that have no name, with host callbacks, with arrays on several devices. In a
+    process whose code differs from the sources (see `jaxvib.imported`) no program is stored or read, and programs traced from
+    the former code are not used again.
     """
 
     def __init__(self, function: Callable[..., T]):
         self.function = no_host_checks()(function)
         self.jitted = eqx.filter_jit(self.function)
         self.ready: dict[Hashable, _Program | None] = {}
-        self.lock = threading.RLock()  # threads that ask for the same program wait for the one that traces it
+        self.lock = threading.RLock()  # threads that need the same program wait for the one that traces it
         with _listing:
             _functions.add(self)
 
     def __call__(self, leaves: Sequence[Any], treedef: Any) -> T:
-        """The function of arguments (args, kwargs) with these leaves, none of which JAX is transforming."""
+        """Evaluate the function; its arguments (args, kwargs) have these leaves, none of them a tracer."""
         folder = program_folder()
         if folder is None or is_debugging():
             return self._jitted(leaves, treedef)
         home = _home(leaves)
-        question = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
-        asked = (_current_code(), question)
+        call = (folder, treedef, tuple(map(leaf_key, leaves)), home, _options())
+        key = (_current_code(), call)
         try:
-            program = self.ready.get(asked, _UNKNOWN)
+            program = self.ready.get(key, _UNKNOWN)
         except TypeError:  # an argument without a hash
             return self._jitted(leaves, treedef)
         if program is _UNKNOWN:
             with self.lock:
-                asked = (_current_code(look=True), question)
-                program = self.ready.get(asked, _UNKNOWN)
+                key = (_current_code(look=True), call)
+                program = self.ready.get(key, _UNKNOWN)
                 if program is _UNKNOWN:
-                    with evaluating():  # JAX would trace these transfers if it transforms what is around this call
+                    with evaluating():  # inside a transformation JAX would trace these transfers
                         moved = arrays_on_device(leaves)
-                    program = self.ready[asked] = self._program(folder, moved, treedef, home)
+                    program = self.ready[key] = self._program(folder, moved, treedef, home)
             _evict_least_recently_used()
         if program is None:
             return self._jitted(leaves, treedef)
         program.used = next(_clock)
-        with evaluating():  # where JAX transforms what is around it, a program of known numbers would go through its slow way
+        with evaluating():  # inside a transformation JAX would dispatch a program of known numbers by its slow path
             return program(x for x in leaves if isinstance(x, _ARRAYS))
 
     def _jitted(self, leaves: Sequence[Any], treedef: Any) -> T:
@@ -120,7 +120,7 @@ class StoredFunction(Generic[T]):
         return self.jitted(*args, **kwargs)
 
     def _program(self, folder: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program | None:
-        """From the disk, or traced and written there; None where this call has no program that could be stored."""
+        """Read the program from disk, or trace it and write it there; None for calls whose program cannot be stored."""
         if not code_state().is_on_disk:
             return None
         try:
@@ -133,27 +133,27 @@ class StoredFunction(Generic[T]):
         def abstract(leaf: Array) -> str:
             device, *others = leaf.sharding.device_set
             if others or device.platform != jax.devices()[0].platform:
-                raise Undescribable("an array is not on one device of the kind that is used first")
+                raise Undescribable("an array is not on one device of the default kind")
             return f"{leaf.dtype}{leaf.shape}{jax.typeof(leaf).weak_type}"
 
-        asked = describe(jax.tree.unflatten(treedef, leaves), abstract)
+        arguments = describe(jax.tree.unflatten(treedef, leaves), abstract)
         name = f"{self.function.__module__}:{self.function.__qualname__}"
-        return _digest(json.dumps([name, _sources(), _machine(), str(_options()), asked]).encode())[:32]
+        return _digest(json.dumps([name, _sources(), _machine(), str(_options()), arguments]).encode())[:32]
 
     def _write(self, path: Path, leaves: Sequence[object], treedef: Hashable, home: Sharding) -> _Program:
         structure: list[Description] = []
-        # Not the arrays of this call, which would live as long as the program.
-        given, state = Skeleton.of(leaves, treedef), code_state()
+        # The skeleton, since the arrays of this call would live as long as the program.
+        arguments, state = Skeleton.of(leaves, treedef), code_state()
 
         def flat(*arrays: Array) -> list[Array]:
-            args, kwargs = given.filled(arrays)
-            out, found = self.function(*args, **kwargs), []
-            structure[:] = [describe(out, found.append)]
-            return [jnp.asarray(x, x.dtype) for x in found]  # read from the disk, results have types of their own
+            args, kwargs = arguments.filled(arrays)
+            result, outputs = self.function(*args, **kwargs), []
+            structure[:] = [describe(result, outputs.append)]
+            return [jnp.asarray(x, x.dtype) for x in outputs]  # outputs of a stored program have no weak types
 
         jitted = jax.jit(flat)
         try:
-            with without_source_locations(), _uncollected():
+            with without_source_locations(), _no_garbage_collection():
                 exported = export.export(jitted)(*(leaf for leaf in leaves if eqx.is_array(leaf)))
                 stored = bytes(exported.serialize())
         except (ValueError, TypeError, NotImplementedError, ImportError):  # a host callback; JAX without flatbuffers
@@ -162,17 +162,17 @@ class StoredFunction(Generic[T]):
             return _Program.of(jitted, structure[0])
         exported = export.deserialize(bytearray(stored))  # the first one holds its trace, 1 to 3 MB
         program = _Program.of(_compiled(path, exported, home), structure[0], size=len(stored))
-        if code_state(look=True) != state:  # it changed while it was traced
+        if code_state(look=True) != state:  # the code changed during the trace
             return program
         head = json.dumps({"structure": structure[0]}).encode() + b"\n"
-        with contextlib.suppress(OSError):  # a full disk, a folder that cannot be written to: this process has it all the same
+        with contextlib.suppress(OSError):  # a full disk or a read-only folder: the program still works in this process
             _replace(path, _digest(head + stored).encode() + b"\n" + head + stored)
         return program
 
 
 @dataclasses.dataclass
 class _Program:
-    """A function of all arrays of the arguments, compiled by `jax.jit`.
+    """Function of all arrays of the arguments, compiled by `jax.jit`.
 
     `result` is the structure of its result, `memory` its estimated memory in bytes, `used` the time of the last use.
     """
@@ -195,45 +195,45 @@ class _Program:
 
 
 _pausing = threading.Lock()
-_tracing: list[bool] = []
-"""An entry for each trace that is under way, the first of them whether Python looked for garbage before."""
+_traces: list[bool] = []
+"""An entry for each trace in progress: True if garbage collection was enabled before the first one."""
 
 
 @contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """In here Python looks for no garbage: among the many objects that tracing makes that takes a fifteenth of its time."""
+def _no_garbage_collection() -> Iterator[None]:
+    """Disable garbage collection, which takes a fifteenth of the time of a trace with its many objects."""
     with _pausing:
-        _tracing.append(gc.isenabled() if not _tracing else _tracing[0])
+        _traces.append(gc.isenabled() if not _traces else _traces[0])
         gc.disable()
     try:
         yield
     finally:
         with _pausing:
-            if _tracing.pop() and not _tracing:
+            if _traces.pop() and not _traces:
                 gc.enable()
 
 
-_ARRAYS = (jax.Array, np.ndarray)  # NumPy's go to the device with the call, in a tenth of the time of asking for that
+_ARRAYS = (jax.Array, np.ndarray)  # a call moves NumPy's arrays to the device in a tenth of the time of `jax.device_put`
 _UNKNOWN = _Program(lambda *_: [], Skeleton(()))
 
 
 def _evict_least_recently_used() -> None:
-    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`, all but the last one."""
+    """Free the least recently used programs beyond `MAX_PROGRAMS_IN_MEMORY` and `MAX_PROGRAM_MEMORY`; keep the last one."""
     with _listing:
         functions = list(_functions)
-    held = [
-        (p.used, p, function, asked) for function in functions for asked, p in list(function.ready.items()) if p is not None
+    programs = [
+        (p.used, p, function, key) for function in functions for key, p in list(function.ready.items()) if p is not None
     ]
-    held.sort(key=lambda each: each[0], reverse=True)
-    memory = itertools.accumulate(program.memory for _, program, _, _ in held)
-    beyond = [each for k, each in enumerate(held) if next(memory) > MAX_PROGRAM_MEMORY or k >= MAX_PROGRAMS_IN_MEMORY]
-    for _, program, function, asked in beyond if len(beyond) < len(held) else beyond[1:]:
-        if function.ready.pop(asked, None) is not None:
+    programs.sort(key=lambda each: each[0], reverse=True)
+    memory = itertools.accumulate(program.memory for _, program, _, _ in programs)
+    beyond = [each for k, each in enumerate(programs) if next(memory) > MAX_PROGRAM_MEMORY or k >= MAX_PROGRAMS_IN_MEMORY]
+    for _, program, function, key in beyond if len(beyond) < len(programs) else beyond[1:]:
+        if function.ready.pop(key, None) is not None:
             program.run.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def _replace(path: Path, content: bytes) -> None:
-    """Writes a file at once, so that another process never reads half a program; nothing is left where that fails."""
+    """Write a file atomically: another process never reads half a program, and a failure leaves no file behind."""
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
         try:
             file.write(content)
@@ -245,7 +245,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 def _read(path: Path, home: Sharding) -> _Program | None:
-    """None where there is no such file, where it is another user's, and where it is damaged: it is written anew."""
+    """Read a program; None if the file is missing, damaged or another user's, and is to be written anew."""
     try:
         with path.open("rb") as file:
             if hasattr(os, "geteuid") and os.fstat(file.fileno()).st_uid != os.geteuid():
@@ -264,15 +264,15 @@ def _compiled(path: Path, exported: export.Exported, home: Sharding) -> Callable
     def run(*arrays: Array) -> list[Array]:
         return exported.call(*arrays)  # pyright: ignore[reportReturnType]
 
-    # Part of the key in JAX's compilation cache, which holds the program, but not the processor. It does not name the sources:
-    # what a change of theirs leaves alone need not be compiled again.
+    # The name is part of the key in JAX's compilation cache. It holds the processor, which JAX's key lacks, but no digest of
+    # the sources: a program that an edit leaves unchanged is not compiled again.
     run.__name__ = f"{path.stem.rpartition('-')[0]}-{_digest(processor().encode())[:16]}"
-    # Without a word on where, JAX compiles once for arrays that it may move and once for those that another program gave.
+    # Without shardings JAX compiles twice: for arrays that it may move, and for outputs of another program.
     return jax.jit(run, in_shardings=home)
 
 
 def _home(leaves: Sequence[object]) -> Sharding:
-    """Where JAX computes with these arrays: where those are that it must not move, otherwise on the default device."""
+    """Return the sharding of the first array that JAX must not move, otherwise that of the default device."""
     for leaf in leaves:
         if isinstance(leaf, jax.Array) and leaf.committed:
             return leaf.sharding
@@ -281,7 +281,7 @@ def _home(leaves: Sequence[object]) -> Sharding:
 
 
 def is_debugging() -> bool:
-    """Whether JAX runs programs operation by operation, or may have to."""
+    """Return True if JAX runs programs operation by operation, or may have to."""
     return any(getattr(jax.config, name) for name in ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs"))
 
 
@@ -295,30 +295,30 @@ def _digest(content: bytes) -> str:
 
 @functools.cache
 def _sources() -> str:
-    """Changes whenever a line of the code that programs are traced from does."""
+    """Identify the code that programs are traced from: versions of packages and a digest of the sources."""
     versions = [importlib.metadata.version(name) for name in _PACKAGES]
     return f"{versions} {os.environ.get('EQX_ON_ERROR')} {digest_of_sources()}"
 
 
 @functools.cache
 def _machine() -> str:
-    """What a program is compiled for."""
+    """Identify the devices, the compiler flags and the processor."""
     return f"{jax.devices()} {os.environ.get('XLA_FLAGS')} {processor()}"
 
 
-_coding = threading.RLock()
-_coded = [code_state()]
-"""The state of the code of which JAX holds traced functions."""
+_clearing = threading.RLock()
+_traced_code = [code_state()]
+"""State of the code that JAX's traced functions belong to."""
 
 
 def _current_code(*, look: bool = False) -> CodeState:
-    """The state of the code, see `code_state`; after a change nothing that was traced or derived of the former code is held."""
+    """Return the state of the code, see `code_state`; after a change, clear what was traced or derived from the former code."""
     state = code_state(look=look)
-    if state != _coded[0]:
-        with _coding:
-            if state != _coded[0]:
+    if state != _traced_code[0]:
+        with _clearing:
+            if state != _traced_code[0]:
                 clear_derived()
                 eqx.clear_caches()
                 jax.clear_caches()
-                _coded[0] = state
+                _traced_code[0] = state
     return state

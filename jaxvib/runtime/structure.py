@@ -1,6 +1,6 @@
-"""A tree of dataclasses, tuples, lists and dictionaries described in JSON, and made from such a description again.
+"""Descriptions in JSON of trees of dataclasses, tuples, lists and dictionaries, and trees from descriptions.
 
-JSON holds no code: a description can name classes and functions of known packages, and nothing that is named is called.
+JSON holds no code: a description can name classes and functions of known packages, but none of them is called.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ import numpy as np
 __all__ = ["KNOWN_PACKAGES", "Description", "Skeleton", "Slot", "Undescribable", "describe", "leaf_key", "rebuild"]
 
 Description: TypeAlias = "bool | int | float | str | list[Description] | dict[str, Description] | None"
-"""What JSON can hold."""
+"""Values of JSON."""
 
 KNOWN_PACKAGES = {"jaxvib", "optimize", "jax", "equinox", "diffrax", "optimistix", "optax", "lineax"}
-"""Whose classes and functions a description may name: their sources and versions are known."""
+"""Packages whose classes and functions a description may name: their sources or versions are part of keys."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-    """Stands in a tree where an array goes, the one of this number."""
+    """Placeholder in a tree for the array of this index."""
 
     place: int
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A tree without its arrays: a `Slot` stands for each. Two are equal where their structures and all other leaves are."""
+    """Tree with a `Slot` in place of each array. Two are equal if their structures and all other leaves are equal."""
 
     tree: Any
 
     @classmethod
     def of(cls, leaves: Sequence[object], treedef: Any) -> Skeleton:
-        """That of a tree with these leaves."""
+        """Return the skeleton of a tree with these leaves."""
         places = itertools.count()
         return cls(jax.tree.unflatten(treedef, [Slot(next(places)) if eqx.is_array(x) else x for x in leaves]))
 
     @functools.cached_property
     def flat(self) -> tuple[tuple[object, ...], Any]:
-        """Leaves and structure."""
+        """Leaves and tree structure."""
         leaves, treedef = jax.tree.flatten(self.tree)
         return tuple(leaves), treedef
 
@@ -74,18 +74,18 @@ class Skeleton:
 
 
 def leaf_key(leaf: Any) -> Hashable:
-    """What a program depends on of a leaf of its arguments: of an array its type, else the leaf."""
+    """Return the part of a leaf that a program depends on: the type of an array, otherwise the leaf itself."""
     if isinstance(leaf, (jax.Array, np.ndarray)):
         return jax.typeof(leaf)
-    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 and -0.0 are equal and not the same
+    return type(leaf), repr(leaf) if isinstance(leaf, float) else leaf  # 0.0 equals -0.0, but gives another program
 
 
 class Undescribable(Exception):
-    """A value that has no description: a function without a name, or of a class that is not of a known package."""
+    """Raised for a value without description: a function without a name, or of a class of an unknown package."""
 
 
 def describe(value: object, array: Callable[[Any], Description]) -> Description:
-    """The description of a tree; `array` gives that of an array in it.
+    """Describe a tree; `array` describes an array in it.
 
     **Raises** `Undescribable`.
 
@@ -113,7 +113,7 @@ def describe(value: object, array: Callable[[Any], Description]) -> Description:
 
 
 def rebuild(description: Description, arrays: Iterator[object]) -> Any:
-    """The tree of a description; its arrays are taken from `arrays` in the order in which `describe` met them.
+    """Build the tree of a description; `arrays` yields its arrays in the order in which `describe` reached them.
 
     **Raises** `Undescribable` for a description that `describe` cannot have given.
 
@@ -147,7 +147,7 @@ def _fields(kind: type) -> list[str]:
 
 
 def _instance(kind: object, values: list[object]) -> object:
-    """An object with these values in its fields; its constructor, which may convert and check them, is not called."""
+    """Return an object with these values in its fields, without its constructor, which may convert and check them."""
     if not isinstance(kind, type):
         raise Undescribable(f"{kind} is no class")
     names = _fields(kind)
@@ -160,7 +160,7 @@ def _instance(kind: object, values: list[object]) -> object:
 
 
 def _name(value: object) -> str:
-    """`module:name` of a class or function that can be found by it."""
+    """Return `module:name` of a class or function that this name leads to."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
     if _named(name) is not value:
         raise Undescribable(f"{value!r} cannot be found by its name")
@@ -176,5 +176,5 @@ def _named(name: str) -> object:
     except (ImportError, AttributeError) as error:
         raise Undescribable(f"{name} cannot be found") from error
     if (getattr(found, "__module__", None), getattr(found, "__qualname__", None)) != (module, path):
-        raise Undescribable(f"{name} is not defined in {module}")  # a module that this one imports, and all within it
+        raise Undescribable(f"{name} is not defined in {module}")  # names that this module imports
     return found

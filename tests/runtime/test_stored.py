@@ -346,15 +346,15 @@ print(round(float(total)), len(list((folder / "programs").iterdir())))
 
 def test_python_looks_for_no_garbage_while_a_program_is_traced(folder):
     before = gc.isenabled()
-    with stored._uncollected():
+    with stored._no_garbage_collection():
         assert not gc.isenabled()
-        with stored._uncollected():
+        with stored._no_garbage_collection():
             assert not gc.isenabled()
         assert not gc.isenabled()
     assert gc.isenabled() == before
     gc.disable()
     try:
-        with stored._uncollected():
+        with stored._no_garbage_collection():
             pass
         assert not gc.isenabled()
     finally:
