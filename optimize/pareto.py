@@ -16,11 +16,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
-from jaxvib.units import count
+from jaxvib.units import count, shown_unit
 from optimize.quantities.quantity import Demand, Quantity
 from optimize.result import Synthesis
 from optimize.space import DesignSpace
-from optimize.space.numbers import shown_unit
 from optimize.synthesize import synthesize
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.motion.run import Run
 from jaxvib.results.fields import Plain, in_unit, plain
 from jaxvib.results.result import Result
-from optimize.space.numbers import shown_unit
+from jaxvib.units import shown_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

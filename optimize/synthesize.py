@@ -329,11 +329,12 @@ def _table(
     other: tuple[list[float], list[float]],
 ) -> tuple[Row, ...]:
     """Free numbers and quantities before and after."""
-    start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.places]) for s in (space.scene, scene))
-    numbers = zip(space.words(), start, end, strict=True)
+    start, end = (np.concatenate([np.asarray(p.read(s)) for p in space.free]) for s in (space.scene, scene))
+    absent = [each.spec.zero_is_absent for each in space.free for _ in range(each.size)]
+    numbers = zip(space.words(), absent & (start == 0.0) & (end != 0.0), start, end, strict=True)
     table = [
-        Row(f"{word} (new)" if a == 0.0 != b else word, unit, float(a), float(b), math.nan, math.nan)
-        for (word, unit), a, b in numbers
+        Row(f"{word} (new)" if new else word, unit, float(a), float(b), math.nan, math.nan)
+        for (word, unit), new, a, b in numbers
     ]
     if space.counts:
         counts = float(space.scene.loads.count), float(scene.loads.count)

@@ -63,10 +63,10 @@ def chain(free: int) -> tuple[DesignSpace, Quantity]:
     space = DesignSpace(scene, numbers)
     assert space.size == free
     mode = max(m for m in jv.jam_modes(scene).mode_numbers() if m % 2)
-    there = jnp.concatenate([place.read(scene) for place in space.places])
+    there = jnp.concatenate([place.read(scene) for place in space.free])
 
     def change(s: jv.Scene) -> jax.Array:
-        return jnp.mean(jnp.log(jnp.concatenate([place.read(s) for place in space.places]) / there) ** 2)
+        return jnp.mean(jnp.log(jnp.concatenate([place.read(s) for place in space.free]) / there) ** 2)
 
     return space, (force_per_amplitude(mode=mode, of=(1, n)) / "1 N/mm") ** 2 + Quantity("change of springs", "", change)
 

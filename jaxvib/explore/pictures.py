@@ -100,7 +100,7 @@ def toml(scene: SceneOrProblem) -> str:
 def prepare(scene: Scene) -> None:
     """Compiles and draws once what the page will ask for, so that its first slider moves as fast as the next."""
     for slider in sliders_of(scene):
-        if slider.place is not None:  # another number of loads is another program
+        if slider.number is not None:  # another number of loads is another program
             moved = {slider.name: slider.steps[slider.steps.index(slider.start) - 1]}
             scene_or_problem(functools.partial(scene_at, scene, moved))
     for _ in range(2):
@@ -114,7 +114,7 @@ def prepare_counts(scene: Scene) -> None:
 
     Meant for a thread beside the page. What cannot be computed is left to the page, which says why."""
     for slider in sliders_of(scene):
-        if slider.place is None:
+        if slider.number is None:
             others = sorted(slider.steps, key=lambda count: (abs(count - slider.start), -count))[1 : 1 + _PREPARED_COUNTS]
             for count in others:
                 moved = scene_or_problem(functools.partial(scene_at, scene, {slider.name: count})).value

@@ -12,8 +12,9 @@ import numpy as np
 
 from jaxvib.errors import InputError
 from jaxvib.machine.files import rebuild_part
+from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
-from optimize.space.numbers import Place, changed, names_of, places_of, shown_unit
+from jaxvib.units import shown_unit
 
 __all__ = ["COUNT", "Slider", "scene_at", "sliders_of"]
 
@@ -32,7 +33,7 @@ _SHARES = tuple((np.arange(1, 301) / 100.0).tolist())
 
 class Slider(NamedTuple):
     """A number of a scene that is moved: its `name`, what a designer calls it (`label`), the `unit` in which it is shown, the
-    values that it takes (`steps`, ascending) with the scene's own among them (`start`), and its `place` in the scene, None for
+    values that it takes (`steps`, ascending) with the scene's own among them (`start`), and the `number` of the scene, None for
     the number of loads. The scene's number is multiplied by value / start, so that at `start` it is itself, bit for bit."""
 
     name: str
@@ -40,7 +41,7 @@ class Slider(NamedTuple):
     unit: str
     steps: tuple[float, ...]
     start: float
-    place: Place | None
+    number: NamedNumber | None
 
     @property
     def title(self) -> str:
@@ -62,15 +63,15 @@ def sliders_of(scene: Scene) -> list[Slider]:
     >>> sliders_of(scene)[-2].title, sliders_of(scene)[-2].start
     ('stiffness of the support, N/mm', 40.0)
     """
-    found = [_slider(scene, places_of(scene, "drive.speed", "slider"), _SHARES)]
+    found = [_slider(scene, find_number(scene, "drive.speed", "slider"), _SHARES)]
     if _shared(scene):
         counts = tuple(range(1, min(256, max(8, 2 * scene.loads.count)) + 1))
         found.append(Slider(COUNT, "number of loads", "", counts, scene.loads.count, None))
-    places = [places_of(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _has(scene, name)]
-    arrays = [places_of(scene, name, "slider") for name in _MACHINE_NUMBERS if _has(scene, name)]
-    single = [one for place in arrays for one in _entries(scene, place)]
-    places += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
-    return found + [_slider(scene, place, _DECADES) for place in places]
+    numbers = [find_number(scene, name, "slider") for name in ("loads.mass", "loads.drag") if _has(scene, name)]
+    arrays = [find_number(scene, name, "slider") for name in _MACHINE_NUMBERS if _has(scene, name)]
+    single = [one for array in arrays for one in array.single(scene) if np.any(one.read(scene))]
+    numbers += single if len(single) <= _MAX_SINGLE_SLIDERS else arrays
+    return found + [_slider(scene, number, _DECADES) for number in numbers]
 
 
 def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
@@ -94,10 +95,10 @@ def scene_at(scene: Scene, values: Mapping[str, float]) -> Scene:
         slider = sliders[name]
         if value == slider.start:
             continue
-        if slider.place is None:
+        if slider.number is None:
             loads = dataclasses.replace(loads, count=int(value))
         else:
-            scene = changed(scene, slider.place, slider.place.read(scene) * (value / slider.start))
+            scene = put_numbers(scene, (slider.number,), slider.number.read(scene) * (value / slider.start))
     if loads.count == scene.loads.count:
         return scene
     more = dataclasses.replace(scene.loads, count=loads.count)
@@ -117,23 +118,15 @@ def _shared(scene: Scene) -> bool:
     return scene.machine.mounting().at_one_point and all(np.ndim(leaf) == 0 for leaf in jax.tree.leaves(scene.loads))
 
 
-def _entries(scene: Scene, place: Place) -> list[Place]:
-    """A place for each number of an array that is not 0."""
-    if not np.ndim(place.leaf(scene)):
-        return [place]
-    values = np.asarray(place.read(scene))
-    return [places_of(scene, f"{place.name}[{k}]", "slider") for k in range(place.size) if values[k]]
-
-
-def _slider(scene: Scene, place: Place, factors: tuple[float, ...]) -> Slider:
-    values = np.asarray(place.read(scene))
-    if place.size > 1:
-        part, _, field = place.name.partition(".")
+def _slider(scene: Scene, number: NamedNumber, factors: tuple[float, ...]) -> Slider:
+    values = np.asarray(number.read(scene))
+    if number.size > 1:
+        part, _, field = number.name.partition(".")
         steps = tuple(float(f"{f:.3g}") for f in factors)
-        return Slider(place.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, place)
-    unit, scale = shown_unit(place.unit, float(values[0]))
+        return Slider(number.name, f"every {field.replace('_', ' ')} of the {part}, times", "", steps, 1.0, number)
+    unit, scale = shown_unit(number.unit, float(values[0]))
     start = float(f"{scale * values[0]:.6g}")
-    return Slider(place.name, names_of(scene, place)[0], unit, _steps(start, factors), start, place)
+    return Slider(number.name, number.words(scene)[0], unit, _steps(start, factors), start, number)
 
 
 @functools.lru_cache(maxsize=256)

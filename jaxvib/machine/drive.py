@@ -9,12 +9,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.errors import InputError
-from jaxvib.units import Number, number
-from jaxvib.units.known import when_known
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
 
+
+_SPEED = unit("rad/s", low=0.0, open_low=True, words="rotor speed")
+_INERTIA = unit("kg m^2", low=0.0, open_low=True, words="moment of inertia of the rotor")
 
 Rotor = tuple[Array, Array] | None
 """Angle (rad) and speed (rad/s) of the rotor if they are states of the motion, otherwise None."""
@@ -137,11 +139,11 @@ class ConstantSpeed(IdealDrive):
 
     constant = True
 
-    speed: Array
+    speed: Array = eqx.field(metadata=_SPEED)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number):
-        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
+        self.speed = read_numbers(ConstantSpeed, "drive", speed=speed)["speed"]
         self.kind = "constant_speed"
 
     def speed_at(self, t: Array) -> Array:
@@ -174,13 +176,12 @@ class SpinUp(IdealDrive):
     [0.0, 50.0, 100.0, 100.0]
     """
 
-    speed: Array
-    duration: Array
+    speed: Array = eqx.field(metadata=_SPEED)
+    duration: Array = eqx.field(metadata=unit("s", low=0.0, open_low=True, words="duration of the spin-up"))
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, duration: Number):
-        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
-        self.duration = number(duration, "s", "drive.duration", low=0.0, open_low=True)
+        self.speed, self.duration = read_numbers(SpinUp, "drive", speed=speed, duration=duration).values()
         self.kind = "spin_up"
 
     def speed_at(self, t: Array) -> Array:
@@ -219,13 +220,12 @@ class RunUp(IdealDrive):
     Source: Artyunin 2013, section IV.
     """
 
-    speed: Array
-    acceleration: Array
+    speed: Array = eqx.field(metadata=_SPEED)
+    acceleration: Array = eqx.field(metadata=unit("rad/s^2", low=0.0, open_low=True, words="acceleration of the run-up"))
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, acceleration: Number):
-        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
-        self.acceleration = number(acceleration, "rad/s^2", "drive.acceleration", low=0.0, open_low=True)
+        self.speed, self.acceleration = read_numbers(RunUp, "drive", speed=speed, acceleration=acceleration).values()
         self.kind = "run_up"
 
     def _end(self) -> Array:
@@ -265,15 +265,14 @@ class DCMotor(Motor):
     1.0
     """
 
-    speed: Array
-    stall_torque: Array
-    inertia: Array
+    speed: Array = eqx.field(metadata=_SPEED)
+    stall_torque: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="stall torque of the motor"))
+    inertia: Array = eqx.field(metadata=_INERTIA)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, stall_torque: Number, inertia: Number):
-        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
-        self.stall_torque = number(stall_torque, "N m", "drive.stall_torque", low=0.0, open_low=True)
-        self.inertia = number(inertia, "kg m^2", "drive.inertia", low=0.0, open_low=True)
+        given = {"speed": speed, "stall_torque": stall_torque, "inertia": inertia}
+        self.speed, self.stall_torque, self.inertia = read_numbers(DCMotor, "drive", **given).values()
         self.kind = "dc_motor"
 
     def torque(self, speed: Array) -> Array:
@@ -299,26 +298,26 @@ class InductionMotor(Motor):
     Source: Kloss's formula for the steady torque; transients of the currents are neglected.
     """
 
-    speed: Array
-    breakdown_torque: Array
-    breakdown_slip: Array
-    inertia: Array
+    speed: Array = eqx.field(metadata=_SPEED)
+    breakdown_torque: Array = eqx.field(metadata=unit("N m", low=0.0, open_low=True, words="breakdown torque of the motor"))
+    breakdown_slip: Array = eqx.field(
+        metadata=unit("", low=0.0, open_low=True, high=1.0, open_high=True, words="breakdown slip of the motor")
+    )
+    inertia: Array = eqx.field(metadata=_INERTIA)
     kind: str = eqx.field(static=True)
 
     def __init__(self, speed: Number, breakdown_torque: Number, breakdown_slip: Number, inertia: Number):
-        self.speed = number(speed, "rad/s", "drive.speed", low=0.0, open_low=True)
-        self.breakdown_torque = number(breakdown_torque, "N m", "drive.breakdown_torque", low=0.0, open_low=True)
-        self.breakdown_slip = number(breakdown_slip, "", "drive.breakdown_slip", low=0.0, open_low=True)
-        when_known(_require_below_one, self.breakdown_slip)
-        self.inertia = number(inertia, "kg m^2", "drive.inertia", low=0.0, open_low=True)
+        self.speed, self.breakdown_torque, self.breakdown_slip, self.inertia = read_numbers(
+            InductionMotor,
+            "drive",
+            speed=speed,
+            breakdown_torque=breakdown_torque,
+            breakdown_slip=breakdown_slip,
+            inertia=inertia,
+        ).values()
         self.kind = "induction_motor"
 
     def torque(self, speed: Array) -> Array:
         """Return the torque of Kloss's formula."""
         slip = 1.0 - speed / self.speed
         return 2.0 * self.breakdown_torque * slip * self.breakdown_slip / (slip**2 + self.breakdown_slip**2)
-
-
-def _require_below_one(slip: float) -> None:
-    if not slip < 1.0:
-        raise InputError("drive.breakdown_slip", f"is {slip:g}; it must be below 1")

@@ -13,10 +13,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.units import Number, Numbers, count, number, numbers
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number, Numbers, count
 from jaxvib.units.known import when_known
 
 __all__ = [
+    "DRAG",
+    "MASS",
+    "OWN_RADIUS",
     "CircularLoads",
     "DrillingSpin",
     "Loads",
@@ -28,6 +32,11 @@ __all__ = [
     "rollers",
     "side_by_side",
 ]
+
+
+MASS = unit("kg", low=0.0, open_low=True, each="load")
+DRAG = unit("N s/m", low=0.0, each="load")
+OWN_RADIUS = unit("m", low=0.0, open_low=True, words="own radius of each {load}")
 
 
 class NormalForce(NamedTuple):
@@ -163,13 +172,13 @@ class CircularLoads(Loads):
 
     circular = True
 
-    mass: Array
-    radius: Array
-    drag: Array
-    inertia: Array | None
+    mass: Array = eqx.field(metadata=MASS)
+    radius: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="track radius", each="load"))
+    drag: Array = eqx.field(metadata=DRAG)
+    inertia: Array | None = eqx.field(metadata=unit("kg m^2", low=0.0, words="moment of inertia", each="load"))
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
-    own_radius: Array | None = None
+    own_radius: Array | None = eqx.field(metadata=OWN_RADIUS, default=None)
 
     @property
     def has_bearing(self) -> bool:
@@ -237,18 +246,13 @@ def _circular(
     own_radius: Number | None = None,
 ) -> CircularLoads:
     n = count(count_, "loads.count", each=256)
-
-    def each(value: Numbers, unit: str, name: str, open_low: bool) -> Array:
-        return numbers(value, unit, f"loads.{name}", n, low=0.0, open_low=open_low, shared=True)
-
+    read = partial(read_numbers, CircularLoads, "loads", n)
     loads = CircularLoads(
-        mass=each(mass, "kg", "mass", True),
-        radius=each(radius, "m", "radius", True),
-        drag=each(drag, "N s/m", "drag", False),
-        inertia=None if inertia is None else each(inertia, "kg m^2", "inertia", False),
+        **read(mass=mass, radius=radius, drag=drag),
+        inertia=None if inertia is None else read(inertia=inertia)["inertia"],
         count=n,
         kind=kind,
-        own_radius=None if own_radius is None else number(own_radius, "m", "loads.own_radius", low=0.0, open_low=True),
+        own_radius=None if own_radius is None else read(own_radius=own_radius)["own_radius"],
     )
     if loads.own_radius is not None:
         _fit(loads, loads.own_radius)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from jax import Array
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import Mount, Place
-from jaxvib.units import Number, Numbers, count, numbers
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number, Numbers, count
 
 __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 
@@ -35,11 +37,11 @@ class Platforms(Machine):
     Source: Filimonikhin et al. 2022, equations (1)-(39) for one, two and three masses.
     """
 
-    mass: Array
-    stiffness: Array
-    damping: Array
-    link_stiffness: Array
-    link_damping: Array
+    mass: Array = eqx.field(metadata=unit("kg", low=0.0, open_low=True, each="platform"))
+    stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, each="support"))
+    damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, each="support"))
+    link_stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness", each="link"))
+    link_damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping", each="link"))
     links: tuple[tuple[int, int], ...] = eqx.field(static=True)
     exciter: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -95,22 +97,16 @@ def _platforms(
     if which > n:
         raise InputError("machine.exciter", f"is {which}; the machine has platforms 1 to {n}")
 
-    def links_of(value: Numbers, unit: str, field: str) -> Array:
+    read = functools.partial(read_numbers, Platforms, "machine")
+    found = read(n, mass=mass, stiffness=stiffness, damping=damping)
+    of_links = {"link_stiffness": link_stiffness, "link_damping": link_damping}
+    for name, value in of_links.items():
         given = len(value) if isinstance(value, (list, tuple)) else getattr(value, "size", 1)
         if not joined and given > 0:
-            raise InputError(field, f"has {given} values; the machine has no links, leave it out or give links")
-        return numbers(value, unit, field, len(joined), low=0.0) if joined else jnp.asarray(np.zeros(0), dtype=float)
-
-    return Platforms(
-        mass=numbers(mass, "kg", "machine.mass", n, low=0.0, open_low=True),
-        stiffness=numbers(stiffness, "N/m", "machine.stiffness", n, low=0.0),
-        damping=numbers(damping, "N s/m", "machine.damping", n, low=0.0),
-        link_stiffness=links_of(link_stiffness, "N/m", "machine.link_stiffness"),
-        link_damping=links_of(link_damping, "N s/m", "machine.link_damping"),
-        links=joined,
-        exciter=which,
-        kind=kind,
-    )
+            problem = f"has {given} values; the machine has no links, leave it out or give links"
+            raise InputError(f"machine.{name}", problem)
+    found |= read(len(joined), **of_links) if joined else dict.fromkeys(of_links, jnp.asarray(np.zeros(0), dtype=float))
+    return Platforms(**found, links=joined, exciter=which, kind=kind)
 
 
 def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...]:
@@ -225,6 +221,6 @@ def network(
 
     Source: Filimonikhin et al. 2022, equations (1)-(39) for one to three platforms, for any number of them.
     """
-    masses = numbers(mass, "kg", "machine.mass", None, low=0.0, open_low=True)
+    masses = read_numbers(Platforms, "machine", mass=mass)["mass"]
     n = 1 if masses.ndim == 0 else masses.shape[0]
     return _platforms("network", n, masses, stiffness, damping, links, link_stiffness, link_damping, exciter)

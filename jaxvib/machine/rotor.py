@@ -10,13 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.errors import InputError, quoted
+from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Carrier, Machine
 from jaxvib.machine.mount import Mount, Place
-from jaxvib.units import Number, Numbers, number, numbers
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number, Numbers
 from jaxvib.units.known import when_known
 
 __all__ = ["TEMPLATES", "PlanarRotor", "Rotor", "planar_rotor", "rotor"]
+
+
+_MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
 
 class Rotor(Machine):
@@ -41,15 +45,15 @@ class Rotor(Machine):
     Source: Artyunin 2013, equation (1), with L_2 counted negative.
     """
 
-    mass: Array
-    transverse_inertia: Array
-    polar_inertia: Array
-    stiffness: Array
-    damping: Array
-    position: Array
-    stations: Array
-    stiffness_terms: Array | None
-    damping_terms: Array | None
+    mass: Array = eqx.field(metadata=_MASS)
+    transverse_inertia: Array = eqx.field(metadata=unit("kg m^2", low=0.0, open_low=True, words="transverse moment of inertia"))
+    polar_inertia: Array = eqx.field(metadata=unit("kg m^2", low=0.0, words="polar moment of inertia"))
+    stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, each="support"))
+    damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, each="support"))
+    position: Array = eqx.field(metadata=unit("m", each="support", typical=0.1))
+    stations: Array = eqx.field(metadata=unit("m", words="station", each="load", typical=0.1))
+    stiffness_terms: Array | None = eqx.field(metadata=unit("N/m", "N", "N m", words="stiffness term", typical=1e4))
+    damping_terms: Array | None = eqx.field(metadata=unit("N s/m", "N s", "N m s", words="damping term", typical=10.0))
     kind: str = eqx.field(static=True)
     places = "shaft"
 
@@ -143,34 +147,29 @@ def rotor(
     Source: Artyunin 2013, equation (1).
     """
 
-    def terms(values: Sequence[Number] | None, units: tuple[str, str, str], field: str) -> Array | None:
+    read = partial(read_numbers, Rotor, "machine")
+
+    def terms(field: str, values: Sequence[Number] | None) -> Array | None:
         if values is None:
             return None
-        if not isinstance(values, (list, tuple)) and getattr(values, "ndim", 0) != 1:
-            problem = f"is {quoted(values)}; it must be a list of three numbers, in {', '.join(units)}"
-            raise InputError(f"machine.{field}", problem)
-        if len(values) != 3:
-            raise InputError(f"machine.{field}", f"has {len(values)} values; 3 are needed")
-        given = [number(v, unit, f"machine.{field}[{i}]") for i, (v, unit) in enumerate(zip(values, units, strict=True))]
+        given = read(**{field: values})[field]
         when_known(partial(_require_passive, field), *given)
-        return jnp.stack(given)
+        return given
 
-    places = numbers(position, "m", "machine.position", 2)
+    places = read(2, position=position)["position"]
     if stiffness_terms is None:
         when_known(_require_two_places, places)
-    across = number(transverse_inertia, "kg m^2", "machine.transverse_inertia", low=0.0, open_low=True)
-    along = number(polar_inertia, "kg m^2", "machine.polar_inertia", low=0.0)
+    across, along = read(transverse_inertia=transverse_inertia, polar_inertia=polar_inertia).values()
     when_known(_require_body, across, along)
     return Rotor(
-        mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
+        **read(mass=mass),
+        **read(2, stiffness=stiffness, damping=damping),
+        **read(stations=stations),
         transverse_inertia=across,
         polar_inertia=along,
-        stiffness=numbers(stiffness, "N/m", "machine.stiffness", 2, low=0.0),
-        damping=numbers(damping, "N s/m", "machine.damping", 2, low=0.0),
         position=places,
-        stations=numbers(stations, "m", "machine.stations", None, shared=True),
-        stiffness_terms=terms(stiffness_terms, ("N/m", "N", "N m"), "stiffness_terms"),
-        damping_terms=terms(damping_terms, ("N s/m", "N s", "N m s"), "damping_terms"),
+        stiffness_terms=terms("stiffness_terms", stiffness_terms),
+        damping_terms=terms("damping_terms", damping_terms),
         kind="rotor",
     )
 
@@ -201,9 +200,9 @@ class PlanarRotor(Machine):
     Source: the special case of `Rotor` with both supports and all loads in the plane of its mass centre.
     """
 
-    mass: Array
-    stiffness: Array
-    damping: Array
+    mass: Array = eqx.field(metadata=_MASS)
+    stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the support"))
+    damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the support"))
     kind: str = eqx.field(static=True)
 
     def carrier(self) -> Carrier:
@@ -236,12 +235,8 @@ def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarR
 
     Source: the special case of Artyunin 2013, equation (1), see `PlanarRotor`.
     """
-    return PlanarRotor(
-        mass=number(mass, "kg", "machine.mass", low=0.0, open_low=True),
-        stiffness=number(stiffness, "N/m", "machine.stiffness", low=0.0),
-        damping=number(damping, "N s/m", "machine.damping", low=0.0),
-        kind="planar_rotor",
-    )
+    found = read_numbers(PlanarRotor, "machine", mass=mass, stiffness=stiffness, damping=damping)
+    return PlanarRotor(**found, kind="planar_rotor")
 
 
 _ROTOR = """

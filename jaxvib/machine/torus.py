@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.loads import DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
-from jaxvib.units import Number, number, numbers
+from jaxvib.machine.loads import DRAG, MASS, OWN_RADIUS, DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 from jaxvib.units import count as whole
 from jaxvib.units.known import when_known
 
@@ -48,11 +49,11 @@ class TorusBalls(Loads):
 
     one_sided = True
 
-    mass: Array
-    radius: Array
-    tube: Array
-    own_radius: Array
-    drag: Array
+    mass: Array = eqx.field(metadata=MASS)
+    radius: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="radius of the torus"))
+    tube: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="radius of the tube"))
+    own_radius: Array = eqx.field(metadata=OWN_RADIUS)
+    drag: Array = eqx.field(metadata=DRAG)
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
@@ -155,20 +156,10 @@ def torus_balls(
     Source: Strautmanis et al. 2018.
     """
     n = whole(count, "loads.count")
-    large, wide, own = (
-        number(value, "m", f"loads.{name}", low=0.0, open_low=True)
-        for name, value in (("radius", radius), ("tube", tube), ("own_radius", own_radius))
-    )
-    when_known(partial(_require_room, n), large, wide, own)
-    return TorusBalls(
-        mass=numbers(mass, "kg", "loads.mass", n, low=0.0, open_low=True, shared=True),
-        radius=large,
-        tube=wide,
-        own_radius=own,
-        drag=numbers(drag, "N s/m", "loads.drag", n, low=0.0, shared=True),
-        count=n,
-        kind="torus_ball",
-    )
+    read = partial(read_numbers, TorusBalls, "loads", n)
+    sizes = read(radius=radius, tube=tube, own_radius=own_radius)
+    when_known(partial(_require_room, n), *sizes.values())
+    return TorusBalls(**sizes, **read(mass=mass, drag=drag), count=n, kind="torus_ball")
 
 
 def _require_room(count: int, radius: float, tube: float, own_radius: float) -> None:

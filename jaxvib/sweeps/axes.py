@@ -14,10 +14,10 @@ from jax import Array
 from jaxvib.equations.dynamics import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
+from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.units import Number, count, number
-from optimize.space.numbers import Place, changed, places_of, value_of
 
 __all__ = [
     "SAMPLE",
@@ -51,10 +51,10 @@ AxisSpec: TypeAlias = Sequence[Number] | np.ndarray | Mapping[str, Number | int 
 
 
 class Spot(NamedTuple):
-    """Place of the numbers of an axis: `place` in the scene; or, if it is None, the entry `entry` (None: all) of the field
+    """Numbers that an axis changes: a `number` of the scene; or, if it is None, the entry `entry` (None: all) of the field
     `field` of the start."""
 
-    place: Place | None
+    number: NamedNumber | None
     field: str
     entry: int | None
 
@@ -154,9 +154,7 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
     spot, unit = _where(scene, name)
 
     def value(given: Number, field: str) -> float:
-        if spot.place is None:
-            return float(number(given, unit, field))
-        return value_of(name, given)
+        return float(number(given, unit, field)) if spot.number is None else spot.number.value(given, field)
 
     if isinstance(spec, Mapping):
         for key in spec:
@@ -194,8 +192,8 @@ def axis_of(scene: Scene, name: str, spec: AxisSpec) -> Axis:
 def _where(scene: Scene, name: str) -> tuple[Spot, str]:
     """Place of the numbers of that name, in the scene or in the start, and their unit."""
     if not str(name).startswith("start."):
-        place = places_of(scene, name, "axes")
-        return Spot(place, "", None), place.unit
+        found = find_number(scene, name, "axes")
+        return Spot(found, "", None), found.unit
     match = re.fullmatch(r"start\.([a-z]+)(?:\[(\d+)\])?", str(name))
     if match is None or match[1] not in _START:
         raise InputError(f"axes.{name}", f"is no number of a start; {suggest_name(str(name), [f'start.{f}' for f in _START])}")
@@ -210,9 +208,9 @@ def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
     """**Raises** `InputError` where two axes change the same number."""
     taken: dict[object, str] = {}
     for axis in axes:
-        place, field, entry = axis.spot
-        if place is not None:
-            entries: set = place.entries
+        found, field, entry = axis.spot
+        if found is not None:
+            entries: set = found.entries
         else:
             size = scene.loads.count if field in ("angle", "rate") else scene.machine.structure().mass.shape[0]
             entries = {(field, k) for k in (range(size) if entry is None else (entry,))}
@@ -225,15 +223,15 @@ def require_apart(scene: Scene, axes: Sequence[Axis]) -> None:
 def put(scene: Scene, spots: Sequence[Spot], values: Array) -> Scene:
     """The scene with a case's numbers (axes,)."""
     for k, spot in enumerate(spots):
-        if spot.place is not None:
-            scene = changed(scene, spot.place, jnp.full(spot.place.size, values[k]))
+        if spot.number is not None:
+            scene = put_numbers(scene, (spot.number,), jnp.full(spot.number.size, values[k]))
     return scene
 
 
 def put_start(state: State, spots: Sequence[Spot], values: Array) -> State:
     """Return the state with a case's numbers (axes,); one number for all angles moves the middle of the loads."""
-    for k, (place, field, entry) in enumerate(spots):
-        if place is None:
+    for k, (found, field, entry) in enumerate(spots):
+        if found is None:
             old = getattr(state, field)
             leaf = old[0] if isinstance(old, tuple) else old
             if entry is not None:

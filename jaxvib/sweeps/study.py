@@ -87,8 +87,8 @@ def study(
         end = float(number(until, "s", "until", low=0.0, open_low=True))
         initial_state(scene, start, mode=mode, throw=False)
         plan = planned(scene, corners(found), spots, end, None if steps is None else count(steps, "steps"))
-    elif until is not None or any(spot.place is None for spot in spots):
-        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.place is None)
+    elif until is not None or any(spot.number is None for spot in spots):
+        what = "until" if until is not None else next(f"axes.{a.name}" for a in found if a.spot.number is None)
         raise InputError(what, "is about runs, and nothing is read off a run; measure for example run.regime")
     grid = Grid(found, samples, seed, sampling, ())
     if math.prod(grid.shape) > _MAX_CASES:

@@ -7,7 +7,7 @@ import contextvars
 import math
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from jaxvib.runtime.compat import traced
 from jaxvib.units.reading import Number, Numbers, Quantity, in_own_unit, require_real, to_float, unit_name, unit_ratio
 
 __all__ = [
-    "FIELD_UNITS",
+    "Bounds",
     "Number",
     "Numbers",
     "Quantity",
@@ -33,23 +33,39 @@ __all__ = [
     "numbers",
     "random_numbers",
     "require_real",
+    "shown_unit",
     "to_float",
     "traced",
     "unit_ratio",
 ]
 
-FIELD_UNITS = {
-    "mass": "kg",
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "link_stiffness": "N/m",
-    "link_damping": "N s/m",
-    "radius": "m",
-    "drag": "N s/m",
-    "inertia": "kg m^2",
-    "speed": "rad/s",
-}
-"""The unit of each number of a scene that a design may free or hold."""
+
+class Bounds(NamedTuple):
+    """Allowed values of a number: from `low` to `high`, without an end that is open.
+
+    >>> Bounds(0.0, open_low=True).words, Bounds(0.0, high=1.0).words, Bounds(0.0).allow(np.asarray([-1.0, 0.0])).tolist()
+    ('greater than 0', 'at least 0 and at most 1', [False, True])
+    """
+
+    low: float = -math.inf
+    open_low: bool = False
+    high: float = math.inf
+    open_high: bool = False
+
+    def allow(self, value: Array | np.ndarray) -> Array | np.ndarray:
+        """Return True for each entry that is finite and within the bounds."""
+        finite = jnp.isfinite(value) if isinstance(value, jax.Array) else np.isfinite(value)
+        allowed = finite & ((value > self.low) if self.open_low else (value >= self.low))
+        if self.high == math.inf:
+            return allowed
+        return allowed & ((value < self.high) if self.open_high else (value <= self.high))
+
+    @property
+    def words(self) -> str:
+        """The bounds in a sentence, "" if there are none."""
+        low = f"{'greater than' if self.open_low else 'at least'} {self.low:g}" if self.low > -math.inf else ""
+        high = f"{'less than' if self.open_high else 'at most'} {self.high:g}" if self.high < math.inf else ""
+        return " and ".join(filter(None, (low, high)))
 
 
 _COLLECTED: contextvars.ContextVar[list[Array] | None] = contextvars.ContextVar("collected", default=None)
@@ -70,45 +86,59 @@ _MAX_NUMBERS = 10**7
 """The longest list of numbers; larger ones come as arrays."""
 
 
-def _checked(value: Array | np.ndarray, field: str, unit: str, low: float, open_low: bool, place: str = "") -> None:
+def _checked(value: Array | np.ndarray, field: str, unit: str, bounds: Bounds, place: str = "") -> None:
     """Check known values; a traced one has no value yet, see `bounds_of_unknowns`."""
     if traced(value):
         collected = _COLLECTED.get()
         if collected is not None:
-            collected.append(jnp.all(jnp.isfinite(value) & ((value > low) if open_low else (value >= low))))
+            collected.append(jnp.all(bounds.allow(value)))
         return
     flat = np.atleast_1d(np.asarray(value))
-    for index, entry in enumerate(flat):
-        name = f"{field}[{index}]" if place == "each" else field
-        shown = f"{entry:g} {unit}".strip()
-        if not np.isfinite(entry):
-            raise InputError(name, f"is {shown}; a finite number is needed")
-        if unit == "rad" and abs(entry) * np.finfo(flat.dtype).eps > 1.0:
-            most = 1.0 / np.finfo(flat.dtype).eps
-            raise InputError(
-                name, f"is {shown}; it must be below {most:.1e} rad, above which angles have no digits within a turn"
-            )
-        if entry < low or (open_low and entry == low):
-            raise InputError(name, f"is {shown}; it must be {'greater than' if open_low else 'at least'} {low:g}")
+    allowed, precision = bounds.allow(flat), np.finfo(flat.dtype).eps
+    if unit == "rad":
+        allowed = allowed & (np.abs(flat) * precision <= 1.0)
+    if np.all(allowed):
+        return
+    index = int(np.argmin(allowed))
+    entry, name = flat[index], f"{field}[{index}]" if place == "each" else field
+    needed = f"it must be {bounds.words}"
+    if not np.isfinite(entry):
+        needed = "a finite number is needed"
+    elif unit == "rad" and abs(entry) * precision > 1.0:
+        needed = f"it must be below {1.0 / precision:.1e} rad, above which angles have no digits within a turn"
+    raise InputError(name, f"is {f'{entry:g} {unit}'.strip()}; {needed}")
 
 
-def number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Array:
-    """One number as a floating-point scalar array in SI units, checked against a lower bound (`open_low`: exclusive).
+def number(
+    value: Number,
+    unit: str,
+    field: str,
+    *,
+    low: float = -math.inf,
+    open_low: bool = False,
+    high: float = math.inf,
+    open_high: bool = False,
+) -> Array:
+    """One number as a floating-point scalar array in SI units, checked against `Bounds`.
 
-    **Raises** `InputError` for a wrong unit, a list, a value that is not finite or below the bound.
+    **Raises** `InputError` for a wrong unit, a list, a value that is not finite or not within the bounds.
 
     >>> float(number("2 t", "kg", "machine.mass"))
     2000.0
     """
-    return jnp.asarray(known_number(value, unit, field, low=low, open_low=open_low))
+    return jnp.asarray(_number(value, unit, field, Bounds(low, open_low, high, open_high)))
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
     """`number` as NumPy has it where JAX does not yet: it goes to a program with the call, in a tenth of the time that moving
     it there first takes."""
+    return _number(value, unit, field, Bounds(low, open_low))
+
+
+def _number(value: Number, unit: str, field: str, bounds: Bounds) -> Array | np.ndarray:
     if isinstance(value, (list, tuple)):
         raise InputError(field, f"is a list of {len(value)} values; one number in {unit_name(unit)} is needed")
-    return _converted(to_float(value, unit, field), unit, field, (), low, open_low)
+    return _converted(to_float(value, unit, field), unit, field, (), bounds)
 
 
 def numbers(
@@ -119,6 +149,8 @@ def numbers(
     *,
     low: float = -math.inf,
     open_low: bool = False,
+    high: float = math.inf,
+    open_high: bool = False,
     shared: bool = False,
 ) -> Array:
     """`length` numbers as an array in SI units; `length` None takes any number of them, one at least.
@@ -130,6 +162,7 @@ def numbers(
     >>> numbers(["44 N/mm", 5e4], "N/m", "machine.stiffness", 2).tolist()
     [44000.0, 50000.0]
     """
+    bounds = Bounds(low, open_low, high, open_high)
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes, bytearray)):
         if len(value) > (_MAX_NUMBERS if length is None else length):
             needed = f"{length} are needed" if length is not None else f"at most {_MAX_NUMBERS} are allowed"
@@ -144,14 +177,14 @@ def numbers(
             raise InputError(field, "is an empty list; at least 1 value is needed")
         if not all(isinstance(part, jax.Array) for part in parts):
             for i, part in enumerate(parts):
-                _array(part, unit, f"{field}[{i}]", (), low, open_low)
+                _array(part, unit, f"{field}[{i}]", (), bounds)
         known = not any(isinstance(part, jax.Array) for part in parts)
         stacked = np.asarray(parts, dtype=float) if known else jnp.stack([jnp.asarray(p, dtype=float) for p in parts])
-        return _array(stacked, unit, field, stacked.shape, low, open_low)
+        return _array(stacked, unit, field, stacked.shape, bounds)
     single: Any = value
     magnitude = to_float(single, unit, field)
     if np.ndim(magnitude) == 0:
-        scalar = _array(magnitude, unit, field, (), low, open_low)
+        scalar = _array(magnitude, unit, field, (), bounds)
         if shared or length is None:
             return scalar
         known = not isinstance(magnitude, jax.Array)
@@ -160,16 +193,14 @@ def numbers(
         raise InputError(field, "is an empty array; at least 1 value is needed")
     if np.ndim(magnitude) != 1 or (length is not None and np.shape(magnitude)[0] != length):
         raise InputError(field, f"has shape {np.shape(magnitude)}; {'a list' if length is None else f'({length},)'} is needed")
-    return _array(magnitude, unit, field, np.shape(magnitude), low, open_low)
+    return _array(magnitude, unit, field, np.shape(magnitude), bounds)
 
 
-def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool) -> Array:
-    return jnp.asarray(_converted(value, unit, field, shape, low, open_low))
+def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array:
+    return jnp.asarray(_converted(value, unit, field, shape, bounds))
 
 
-def _converted(
-    value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], low: float, open_low: bool
-) -> Array | np.ndarray:
+def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
     """What JAX does not hold yet NumPy converts: no program need be compiled for it."""
     try:
         if isinstance(value, jax.Array):
@@ -183,7 +214,7 @@ def _converted(
         raise InputError(field, f"is {quoted(value)}, which is not a number; write a number in {unit_name(unit)}") from error
     if array.shape != shape:
         raise InputError(field, f"has shape {array.shape}; one number in {unit_name(unit)} is needed")
-    _checked(array, field, unit, low, open_low, place="each" if shape else "")
+    _checked(array, field, unit, bounds, place="each" if shape else "")
     return array
 
 
@@ -222,3 +253,20 @@ def random_numbers(seed: object) -> np.random.Generator:
     jaxvib.errors.InputError: seed is -1; it must be a whole number, at least 0
     """
     return np.random.default_rng(count(seed, "seed", low=0))
+
+
+def shown_unit(unit: str, size: float) -> tuple[str, float]:
+    """The unit that a designer reads values of about that size in, and by what SI values are multiplied."""
+    if unit == "N/m" and size >= 1e3:
+        return "N/mm", 1e-3
+    if unit in ("m", "meter") and 0.0 < size < 1.0:
+        return ("mm", 1e3) if size >= 1e-5 else ("um", 1e6)
+    if unit == "rad/s":
+        return "rpm", 30.0 / np.pi
+    if unit == "rad":
+        return "deg", 180.0 / np.pi
+    if unit == "kg" and 0.0 < size < 1.0:
+        return "g", 1e3
+    if unit == "N" and size >= 1e4:
+        return "kN", 1e-3
+    return unit, 1.0

@@ -14,12 +14,12 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers, put_present, read_value
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import greatest
 from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder
 from optimize.quantities.quantity import Quantity, require_quantity
-from optimize.space.numbers import Place, changed, places_of, set_present, value_of
 
 __all__ = ["expected", "quantile", "under", "worst"]
 
@@ -36,7 +36,7 @@ class Changed:
     def scenes(self, scene: Scene) -> Scene:
         """The scene with these values."""
         for name, value in self.values:
-            scene = set_present(scene, places_of(scene, name, "under"), value)
+            scene = put_present(scene, find_number(scene, name, "under"), value)
         return scene
 
 
@@ -50,28 +50,28 @@ class Sampled:
 
     several = True
 
-    def factors(self, scene: Scene) -> list[tuple[Place, np.ndarray]]:
+    def factors(self, scene: Scene) -> list[tuple[NamedNumber, np.ndarray]]:
         """Factors of each number (samples, entries), normal, within three deviations: a Latin hypercube, in which every
         number's samples fill the distribution evenly, in an order of their own."""
         random, out = np.random.default_rng(self.seed), []
         normal = NormalDist()
         for name, error in self.errors:
-            place = places_of(scene, name, "tolerance")
+            found = find_number(scene, name, "tolerance")
             shares = (np.arange(self.samples) + 0.5) / self.samples
             deviations = np.clip([normal.inv_cdf(float(share)) for share in shares], -3.0, 3.0)
-            drawn = np.stack([random.permutation(deviations) for _ in range(place.size)], axis=1)
+            drawn = np.stack([random.permutation(deviations) for _ in range(found.size)], axis=1)
             # Half the width is two deviations: 95 of 100 machines are within the tolerance.
-            out.append((place, np.maximum(1.0 + 0.5 * error * drawn, 0.05)))
+            out.append((found, np.maximum(1.0 + 0.5 * error * drawn, 0.05)))
         return out
 
     def scenes(self, scene: Scene) -> Scene:
         """The scenes, every array with a leading axis."""
-        factors = [(place, jnp.asarray(f)) for place, f in self.factors(scene)]
+        factors = [(found, jnp.asarray(f)) for found, f in self.factors(scene)]
 
         def one(*each: Array) -> Scene:
             made = scene
-            for (place, _), factor in zip(factors, each, strict=True):
-                made = changed(made, place, place.read(made) * factor)
+            for (found, _), factor in zip(factors, each, strict=True):
+                made = put_numbers(made, (found,), found.read(made) * factor)
             return made
 
         return jax.vmap(one)(*(f for _, f in factors))
@@ -171,7 +171,7 @@ def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quant
     require_quantity(quantity, "quantity")
     if not isinstance(changes, Mapping) or not changes:
         raise InputError("changes", f"is {quoted(changes)}; give a dictionary such as {{'drive.speed': '1200 rpm'}}")
-    values = tuple((key, value_of(key, value)) for key, value in changes.items())
+    values = tuple((key, read_value(key, value)) for key, value in changes.items())
     case = Changed(name, values)
     return Under(f"{quantity.words} ({name})", quantity.unit, of=quantity.of, case=case, parts=(quantity,))
 

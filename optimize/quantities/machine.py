@@ -14,9 +14,10 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.equations.linear import linear_model
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.numbers.named import spec_of
 from jaxvib.machine.platforms import Platforms
 from jaxvib.machine.scene import Scene
-from jaxvib.units import FIELD_UNITS, Number, count
+from jaxvib.units import Number, count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import BuiltinQuantity, Quantity, Tier
 from optimize.quantities.user_inputs import number_in
@@ -58,11 +59,13 @@ def _budget(evaluation: Evaluation, tier: Tier) -> Array:
     return jnp.sum(machine.stiffness / jnp.diagonal(evaluation.model.mass))
 
 
-def _entries(field: str, what: str) -> tuple[str, str, str, str]:
+def _entries(field: str) -> tuple[str, str, str, str]:
+    """Part, name and unit of an array of numbers of one unit, and words for its entries."""
     part, _, name = field.partition(".") if isinstance(field, str) else ("", "", "")
-    if part not in ("machine", "loads") or name not in FIELD_UNITS:
+    spec = spec_of(field) if part in ("machine", "loads") and "[" not in name else None
+    if spec is None or len(spec.units) > 1:
         raise InputError("field", f"is {quoted(field)}; it must name numbers of a scene, for example 'machine.stiffness'")
-    return part, name, f"{what} {field}", f"all {_WORDS.get(field, field)}"
+    return part, name, spec.unit, spec.words.format(load="load") + (f" of all {spec.each}s" if spec.each else "")
 
 
 def _leaf(scene: Scene, part: str, name: str) -> Array:
@@ -84,8 +87,8 @@ def total(field: str) -> Quantity:
     >>> total("machine.stiffness").unit
     'N/m'
     """
-    part, name, called, words = _entries(field, "total")
-    return _asking(called, FIELD_UNITS[name], _total, f"sum of {words}", part, name)
+    part, name, unit, words = _entries(field)
+    return _asking(f"total {field}", unit, _total, f"sum of {words}", part, name)
 
 
 def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
@@ -101,27 +104,14 @@ def product(field: str) -> Quantity:
 
     >>> from optimize import product
     >>> product("machine.mass").words
-    'product of all masses of platforms'
+    'product of mass of all platforms'
     """
-    part, name, called, words = _entries(field, "product of")
-    return _asking(called, "", _product, f"product of {words}", part, name)
+    part, name, _, words = _entries(field)
+    return _asking(f"product of {field}", "", _product, f"product of {words}", part, name)
 
 
 def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
     return jnp.prod(_leaf(evaluation.scene, part, name))
-
-
-_WORDS = {
-    "machine.mass": "masses of platforms",
-    "machine.stiffness": "support stiffnesses",
-    "machine.damping": "support dampings",
-    "machine.link_stiffness": "link stiffnesses",
-    "machine.link_damping": "link dampings",
-    "loads.mass": "masses of loads",
-    "loads.drag": "drags of loads",
-    "loads.radius": "track radii of loads",
-    "loads.inertia": "moments of inertia of loads",
-}
 
 
 def total_mass() -> Quantity:

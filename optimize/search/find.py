@@ -17,7 +17,7 @@ from optimize.search.descent import descend
 from optimize.search.evolve import evolve, require_cma
 from optimize.search.polish import FEASIBLE, Optimality, Polished, draw_starts, optimality, polish, violation
 from optimize.search.problem import Point, Problem, evaluate, looked_up
-from optimize.space.space import DesignSpace
+from optimize.space import DesignSpace
 
 __all__ = ["Found", "Options", "Searcher", "choose", "find", "require_searcher"]
 

@@ -24,7 +24,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.jam import JamModes, jam_modes
 from optimize.quantities.evaluation import Evaluation, Key, TargetRecorder, guesses
 from optimize.quantities.quantity import BuiltinQuantity, Demand, Quantity, walk
-from optimize.space.space import DesignSpace, Held
+from optimize.space import DesignSpace, Held
 
 __all__ = ["Known", "Point", "Problem", "evaluate", "looked_up", "made", "problem_of", "report_keys", "reported"]
 

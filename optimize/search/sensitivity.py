@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxvib.units import shown_unit
 from optimize.quantities.quantity import Demand
 from optimize.result import Influence, Limit, Machine
 from optimize.search.find import Found
 from optimize.search.polish import FEASIBLE
 from optimize.search.problem import Problem
-from optimize.space.numbers import shown_unit
 
 __all__ = ["influences_of", "limits_of", "machines_of", "neighbours"]
 
@@ -48,16 +48,18 @@ def limits_of(problem: Problem, demands: Sequence[Demand], found: Found, sides: 
         rows.append(Limit(demand.words, demand.quantity.unit, value, limit, float(broken), active, float(share), gain(share)))
     numbers = space.numbers(found.point.z[best])
     low, high = (np.asarray(b) for b in (problem.space.low, problem.space.high))
+    sizes = np.abs([low, high])
+    edge = 1e-9 * np.where(problem.space.logs, sizes, np.max(sizes, axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
         slopes = np.where(space.logs, numbers * np.log(high / low), high - low)
     for k, (word, unit) in enumerate(problem.space.words()):
         dual = duals.bounds[best, k]
-        upper = numbers[k] >= high[k] * (1.0 - 1e-9)
-        if low[k] == high[k] or slopes[k] == 0.0 or not (upper or numbers[k] <= low[k] * (1.0 + 1e-9)) or dual == 0.0:
+        upper = numbers[k] >= high[k] - edge[1, k]
+        if low[k] == high[k] or slopes[k] == 0.0 or not (upper or numbers[k] <= low[k] + edge[0, k]) or dual == 0.0:
             continue
         shown, factor = shown_unit(unit, abs(numbers[k]))
         what = f"{word} {'at most' if upper else 'at least'} {numbers[k] * factor:.5g} {shown}"
-        share = -abs(dual) * numbers[k] / slopes[k]
+        share = -abs(dual * numbers[k]) / slopes[k]
         rows.append(Limit(what, unit, float(numbers[k]), float(numbers[k]), 0.0, True, float(share), gain(share)))
     return tuple(rows)
 

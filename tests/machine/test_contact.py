@@ -81,7 +81,7 @@ def test_restitution_is_read_from_files_and_checked():
     again = jv.scene_from_toml(jv.scene_to_toml(s))
     assert float(again.effects[0].restitution) == 0.7 and RADIUS > OWN
     for arguments, says in (
-        (dict(restitution=1.2), "restitution is 1.2; it must be at most 1"),
+        (dict(restitution=1.2), "restitution is 1.2; it must be greater than 0 and at most 1"),
         (dict(restitution=0.0), "restitution is 0; it must be greater than 0"),
         (dict(restitution=0.5, damping=3.0), "goes without damping, which it stands for"),
     ):

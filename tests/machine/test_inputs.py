@@ -145,12 +145,12 @@ def touching():
 
 WRONG_ROTORS = {
     "stations of other loads": (lambda: rotor_scene(count=3), r"machine\.stations has 4 values; one for all loads or 3"),
-    "slip": (lambda: motor(slip=1.2), r"drive\.breakdown_slip is 1\.2; it must be below 1"),
+    "slip": (lambda: motor(slip=1.2), r"drive\.breakdown_slip is 1\.2; it must be greater than 0 and less than 1"),
     "no inertia": (lambda: motor(inertia=0.0), r"drive\.inertia is 0 kg m\^2; it must be greater than 0"),
     "terms": (lambda: jv.rotor(**ROTOR, stiffness_terms=(1.0, 2.0)), r"machine\.stiffness_terms has 2 values; 3 are needed"),
     "one term": (
         lambda: jv.rotor(**ROTOR, stiffness_terms=5),
-        r"machine\.stiffness_terms is 5; it must be a list of three numbers, in N/m, N, N m",
+        r"machine\.stiffness_terms is 5; it must be a list of 3 numbers, in N/m, N, N m",
     ),
     "terms in words": (lambda: jv.rotor(**ROTOR, damping_terms="5 N s/m"), r"damping_terms is '5 N s/m'; it must be a list"),
     "terms in a table": (lambda: jv.rotor(**ROTOR, damping_terms={"a": 1}), r"damping_terms is {'a': 1}; it must be a list"),

@@ -10,9 +10,9 @@ from scenes import scene
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.machine.numbers.named import find_number, put_numbers
 from optimize import DesignSpace, Quantity, amplitude, fold_margin, force_per_amplitude, pareto, recipes
 from optimize.recipes import anti_resonance, antiphase, lightest_exciter, retune, widest_range
-from optimize.space.numbers import changed, places_of
 
 SCENE = scene("two_mass", speed=120.0)
 
@@ -46,9 +46,9 @@ def test_springs_are_ranked_by_the_best_that_each_search_found(monkeypatch):
     ends = {"machine.stiffness[0]": [3.0, 9.0], "machine.stiffness[1]": [4.0, 4.0], "machine.link_stiffness[0]": [1.0, 99.0]}
 
     def search(space, objective, *, starts, verify):
-        (place,) = space.places
+        (number,) = space.free
         assert starts == 16 and not verify and float(space.high[0] / space.low[0]) == pytest.approx(9.0)
-        return SimpleNamespace(values=np.array(ends[place.name]))
+        return SimpleNamespace(values=np.array(ends[number.name]))
 
     monkeypatch.setattr(recipes, "synthesize", search)
     found = [name for name, _ in retune(SCENE, None)]
@@ -74,10 +74,10 @@ def test_recipes_seek_and_hold_what_they_are_named_for():
     np.testing.assert_allclose(design.space.high, np.array([5e4, 3e4, 2e5]) * 4.0)
     middle = anti_resonance(scene("three_mass", speed=60.0), mode=3)
     assert middle.objective.operation == "/" and [part.of for part in middle.objective.parts] == [2, (1, 3)]
-    assert [place.name for place in middle.space.places] == [f"machine.link_stiffness[{k}]" for k in range(3)]
+    assert [place.name for place in middle.space.free] == [f"machine.link_stiffness[{k}]" for k in range(3)]
     assert [held.quantity.name for held in middle.space.held] == ["jam_frequency"]
     light = lightest_exciter(SCENE, "5 mm", mode=3, of=2)
-    assert light.objective.name == "total_mass" and light.space.places[0].name == "loads.mass"
+    assert light.objective.name == "total_mass" and light.space.free[0].name == "loads.mass"
     np.testing.assert_allclose([light.space.low[0], light.space.high[0]], [0.08, 8.0])
     assert light.subject_to[0].words == "amplitude of platform 2, mode 3 at least 5 mm"
     wide = widest_range(SCENE, mode=3, keep=0.5, of=1)
@@ -87,7 +87,7 @@ def test_recipes_seek_and_hold_what_they_are_named_for():
 
 def test_recipes_leave_springs_that_are_not_there():
     hung = eqx.tree_at(lambda s: s.machine.stiffness, SCENE, jnp.array([5e4, 0.0]))
-    assert [place.name for place in widest_range(hung, mode=3).space.places] == [
+    assert [place.name for place in widest_range(hung, mode=3).space.free] == [
         "machine.stiffness[0]",
         "machine.link_stiffness[0]",
     ]
@@ -137,8 +137,8 @@ def test_the_spring_that_is_exchanged_is_the_best_of_a_scan():
     asked = stored_jit(force_per_amplitude(mode=3).__call__)
     least = {}
     for name, _ in found:
-        place = places_of(SCENE, name, "free")
-        scan = [changed(SCENE, place, place.read(SCENE) * share) for share in np.geomspace(1.0 / 3.0, 3.0, 301)]
+        spring = find_number(SCENE, name, "free")
+        scan = [put_numbers(SCENE, (spring,), spring.read(SCENE) * share) for share in np.geomspace(1.0 / 3.0, 3.0, 301)]
         least[name] = np.nanmin([float(asked(each)) for each in scan])
     assert [name for name, _ in found] == sorted(least, key=lambda name: least[name])
     for name, best in found:

@@ -43,7 +43,7 @@ def test_the_table_has_each_quantity_once():
     assert [name for name, _ in _standard(SCENE, 3, None)] == standard and _standard(SCENE, None, None) == []
     force, mass = foundation_force(mode=3), total_mass()
     named = _named(SPACE, SCENE, force, [mass < 300.0, force < 9.0, amplitude(mode=3, of=1) < 1.0], 3)
-    assert [name for name, _ in named] == [*standard, "sum of all support stiffnesses", "mass of platforms and loads"]
+    assert [name for name, _ in named] == [*standard, "sum of stiffness of all supports", "mass of platforms and loads"]
     largest = _named(SPACE, SCENE, -mass, [], None)  # what is to be large is told as it is
     assert [q for _, q in largest] == [mass, total("machine.stiffness")]
     values = np.array([[1.0, 2.0], [3.0, 4.0]])

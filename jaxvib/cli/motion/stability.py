@@ -100,17 +100,10 @@ def _varied(scene: Scene, name: str) -> tuple[Callable[[float], Scene], Callable
     """Function that makes the scene at a value of the number of that name, and function that reads such a value."""
     import jax.numpy as jnp
 
-    from optimize.space.numbers import changed, places_of, value_of
+    from jaxvib.machine.numbers.named import find_number, put_numbers
 
-    place = places_of(scene, name, "--vary")
-
-    def read(value: str, option: str) -> float:
-        try:
-            return value_of(name, value)
-        except InputError as error:
-            raise InputError(option, str(error)) from error
-
-    return lambda x: changed(scene, place, jnp.full(place.size, x)), read
+    found = find_number(scene, name, "--vary")
+    return lambda x: put_numbers(scene, (found,), jnp.full(found.size, x)), found.value
 
 
 def _range(omega: tuple[str, str]) -> tuple[float, float]:

@@ -15,7 +15,8 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, GravityField, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import Loads
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = [
     "BALANCE_GRADE",
@@ -130,12 +131,12 @@ class Gravity(Effect):
     9.81
     """
 
-    g: Array
+    g: Array = eqx.field(metadata=unit("m/s^2", low=0.0, words="acceleration of gravity"))
     along: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
     def __init__(self, g: Number = 9.81, along: Literal["up", "axis"] = "up"):
-        self.g = number(g, "m/s^2", "effects.gravity.g", low=0.0)
+        self.g = read_numbers(Gravity, "effects.gravity", g=g)["g"]
         require_one_of(along, _AXES, "effects.gravity.along")
         self.along = along
         self.kind = "gravity"
@@ -178,13 +179,13 @@ class StaticImbalance(Effect):
     Source: Artyunin 2013, equation (1), the terms with M e.
     """
 
-    moment: Array
-    angle: Array
+    moment: Array = eqx.field(metadata=unit("kg m", low=0.0, words="imbalance of the rotor"))
+    angle: Array = eqx.field(metadata=unit("rad", words="angle of the imbalance", typical=1.0))
     kind: str = eqx.field(static=True)
 
     def __init__(self, moment: Number, angle: Number = 0.0):
-        self.moment = number(moment, "kg m", "effects.static_imbalance.moment", low=0.0)
-        self.angle = number(angle, "rad", "effects.static_imbalance.angle")
+        given = read_numbers(StaticImbalance, "effects.static_imbalance", moment=moment, angle=angle)
+        self.moment, self.angle = given.values()
         self.kind = "static_imbalance"
 
     @classmethod
@@ -214,13 +215,13 @@ class MomentImbalance(Effect):
     Source: Artyunin 2013, equation (1), the terms with (A - C) delta.
     """
 
-    moment: Array
-    angle: Array
+    moment: Array = eqx.field(metadata=unit("kg m^2", words="moment imbalance of the rotor", typical=1e-4))
+    angle: Array = eqx.field(metadata=unit("rad", words="angle of the moment imbalance", typical=1.0))
     kind: str = eqx.field(static=True)
 
     def __init__(self, moment: Number, angle: Number = 0.0):
-        self.moment = number(moment, "kg m^2", "effects.moment_imbalance.moment")
-        self.angle = number(angle, "rad", "effects.moment_imbalance.angle")
+        given = read_numbers(MomentImbalance, "effects.moment_imbalance", moment=moment, angle=angle)
+        self.moment, self.angle = given.values()
         self.kind = "moment_imbalance"
 
     @classmethod

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,8 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import Coordinates, LoadInteraction, Term
 from jaxvib.machine.loads import CircularLoads, Loads, own_radius
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 from jaxvib.units.known import when_known
 
 __all__ = ["LoadContact", "damping_ratio"]
@@ -50,21 +53,22 @@ class LoadContact(Effect):
     (Schwager and Poeschel 2007).
     """
 
-    stiffness: Array
-    damping: Array
-    restitution: Array | None
+    stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, open_low=True, words="stiffness of contacts between loads"))
+    damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of contacts between loads"))
+    restitution: Array | None = eqx.field(
+        metadata=unit("", low=0.0, open_low=True, high=1.0, words="restitution of contacts between loads")
+    )
     kind: str = eqx.field(static=True)
 
     def __init__(self, stiffness: Number, damping: Number = 0.0, restitution: Number | None = None):
-        self.stiffness = number(stiffness, "N/m", "effects.load_contact.stiffness", low=0.0, open_low=True)
-        self.damping = number(damping, "N s/m", "effects.load_contact.damping", low=0.0)
+        read = functools.partial(read_numbers, LoadContact, "effects.load_contact")
+        self.stiffness, self.damping = read(stiffness=stiffness, damping=damping).values()
         self.restitution = None
         if restitution is not None:
-            field = "effects.load_contact.restitution"
-            self.restitution = number(restitution, "", field, low=0.0, open_low=True)
-            when_known(_require_at_most_one, self.restitution)
+            self.restitution = read(restitution=restitution)["restitution"]
             if when_known(lambda damping: damping == 0.0, self.damping) is not True:
-                raise InputError(field, "goes without damping, which it stands for; leave one of them out")
+                problem = "goes without damping, which it stands for; leave one of them out"
+                raise InputError("effects.load_contact.restitution", problem)
         self.kind = "load_contact"
 
     def terms(self) -> tuple[Term, ...]:
@@ -200,9 +204,3 @@ def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
         distance = jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, square)))
         found.append(distance - 2.0 * own)
     return found or [jnp.ones_like(u[0])]
-
-
-def _require_at_most_one(restitution: float) -> None:
-    if restitution > 1.0:
-        field = "effects.load_contact.restitution"
-        raise InputError(field, f"is {restitution:g}; it must be at most 1, where nothing is lost")

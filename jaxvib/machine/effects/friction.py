@@ -14,7 +14,8 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
 from jaxvib.machine.loads import CircularLoads, Loads
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = ["DryFriction", "dry_lever", "sliding_sign"]
 
@@ -69,18 +70,16 @@ class DryFriction(Effect):
     Source: Artyunin and Sumenkov 2019, equations (1)-(5).
     """
 
-    coefficient: Array
-    diameter: Array
-    width: Array
+    coefficient: Array = eqx.field(metadata=unit("", low=0.0, words="coefficient of dry friction"))
+    diameter: Array = eqx.field(metadata=unit("m", low=0.0, words="diameter of the bearings of the loads"))
+    width: Array = eqx.field(metadata=unit("rad/s", low=0.0, open_low=True, words="smoothing width of dry friction"))
     reaction: str = eqx.field(static=True)
     kind: str = eqx.field(static=True)
 
     def __init__(self, coefficient: Number, diameter: Number, reaction: Reaction = "exact", width: Number = 0.01):
-        field = "effects.dry_friction"
-        self.coefficient = number(coefficient, "", f"{field}.coefficient", low=0.0)
-        self.diameter = number(diameter, "m", f"{field}.diameter", low=0.0)
-        self.width = number(width, "rad/s", f"{field}.width", low=0.0, open_low=True)
-        require_one_of(reaction, get_args(Reaction), f"{field}.reaction")
+        given = {"coefficient": coefficient, "diameter": diameter, "width": width}
+        self.coefficient, self.diameter, self.width = read_numbers(DryFriction, "effects.dry_friction", **given).values()
+        require_one_of(reaction, get_args(Reaction), "effects.dry_friction.reaction")
         self.reaction = reaction
         self.kind = "dry_friction"
 

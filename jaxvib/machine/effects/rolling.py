@@ -16,7 +16,8 @@ from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.friction import sliding_sign
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
 from jaxvib.machine.loads import Loads, own_radius
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = ["RollingFriction"]
 
@@ -48,16 +49,15 @@ class RollingFriction(Effect):
     Source: Strautmanis et al. 2018, equations (6)-(10), with the normal force and the levers derived again.
     """
 
-    coefficient: Array
+    coefficient: Array = eqx.field(metadata=unit("m", low=0.0, words="lever of rolling friction"))
     direction: str = eqx.field(static=True)
-    width: Array
+    width: Array = eqx.field(metadata=unit("m/s", low=0.0, open_low=True, words="smoothing width of rolling friction"))
     kind: str = eqx.field(static=True)
 
     def __init__(self, coefficient: Number, direction: Direction = "along", width: Number = 0.01):
-        field = "effects.rolling_friction"
-        self.coefficient = number(coefficient, "m", f"{field}.coefficient", low=0.0)
-        self.width = number(width, "m/s", f"{field}.width", low=0.0, open_low=True)
-        require_one_of(direction, get_args(Direction), f"{field}.direction")
+        given = read_numbers(RollingFriction, "effects.rolling_friction", coefficient=coefficient, width=width)
+        self.coefficient, self.width = given.values()
+        require_one_of(direction, get_args(Direction), "effects.rolling_friction.direction")
         self.direction = direction
         self.kind = "rolling_friction"
 

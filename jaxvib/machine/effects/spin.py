@@ -12,7 +12,8 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease, Term
 from jaxvib.machine.loads import Loads, own_radius
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = ["FreeSpin", "Sliding"]
 
@@ -89,13 +90,13 @@ class Sliding(Effect):
     Source: derived here from Coulomb's law.
     """
 
-    coefficient: Array
-    width: Array
+    coefficient: Array = eqx.field(metadata=unit("", low=0.0, open_low=True, words="coefficient of sliding friction"))
+    width: Array = eqx.field(metadata=unit("m/s", low=0.0, open_low=True, words="smoothing width of sliding friction"))
     kind: str = eqx.field(static=True)
 
     def __init__(self, coefficient: Number, width: Number = 0.2):
-        self.coefficient = number(coefficient, "", "effects.sliding.coefficient", low=0.0, open_low=True)
-        self.width = number(width, "m/s", "effects.sliding.width", low=0.0, open_low=True)
+        given = read_numbers(Sliding, "effects.sliding", coefficient=coefficient, width=width)
+        self.coefficient, self.width = given.values()
         self.kind = "sliding"
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:

@@ -11,7 +11,8 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.terms import SupportForce, Term
 from jaxvib.machine.loads import Loads
-from jaxvib.units import Number, number
+from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.units import Number
 
 __all__ = ["CubicSupport", "Stop"]
 
@@ -34,12 +35,12 @@ class _Support(Effect):
         return machine.rows_at(self.position, f"effects.{self.kind}.position")
 
 
-def _where(kind: str, platform: int | None, position: Number | None) -> tuple[int | None, Array | None]:
+def _where(part: type[_Support], kind: str, platform: int | None, position: Number | None) -> tuple[int | None, Array | None]:
     if platform is not None and position is not None:
         raise InputError(f"effects.{kind}", "names a platform and a position; a support has one place")
     if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
         raise InputError(f"effects.{kind}.platform", f"is {quoted(platform)}; it must be a whole number, at least 1")
-    return platform, None if position is None else number(position, "m", f"effects.{kind}.position")
+    return platform, None if position is None else read_numbers(part, f"effects.{kind}", position=position)["position"]
 
 
 class CubicSupport(_Support):
@@ -55,15 +56,15 @@ class CubicSupport(_Support):
     2000000000.0
     """
 
-    stiffness: Array
+    stiffness: Array = eqx.field(metadata=unit("N/m^3", words="stiffness of the cubic support", typical=1e9))
     platform: int | None = eqx.field(static=True)
-    position: Array | None
+    position: Array | None = eqx.field(metadata=unit("m", words="position of the cubic support", typical=0.1))
     kind: str = eqx.field(static=True)
 
     def __init__(self, stiffness: Number, platform: int | None = None, position: Number | None = None):
         self.kind = "cubic_support"
-        self.stiffness = number(stiffness, "N/m^3", "effects.cubic_support.stiffness")
-        self.platform, self.position = _where(self.kind, platform, position)
+        self.stiffness = read_numbers(CubicSupport, "effects.cubic_support", stiffness=stiffness)["stiffness"]
+        self.platform, self.position = _where(CubicSupport, self.kind, platform, position)
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
@@ -105,12 +106,12 @@ class Stop(_Support):
     0.003
     """
 
-    stiffness: Array
-    gap: Array
-    damping: Array
+    stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the stop"))
+    gap: Array = eqx.field(metadata=unit("m", low=0.0, words="gap of the stop"))
+    damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the stop"))
     side: str = eqx.field(static=True)
     platform: int | None = eqx.field(static=True)
-    position: Array | None
+    position: Array | None = eqx.field(metadata=unit("m", words="position of the stop", typical=0.1))
     kind: str = eqx.field(static=True)
 
     def __init__(
@@ -123,12 +124,11 @@ class Stop(_Support):
         position: Number | None = None,
     ):
         self.kind = "stop"
-        self.stiffness = number(stiffness, "N/m", "effects.stop.stiffness", low=0.0)
-        self.gap = number(gap, "m", "effects.stop.gap", low=0.0)
-        self.damping = number(damping, "N s/m", "effects.stop.damping", low=0.0)
+        given = read_numbers(Stop, "effects.stop", stiffness=stiffness, gap=gap, damping=damping)
+        self.stiffness, self.gap, self.damping = given.values()
         require_one_of(side, ("above", "below", "both"), "effects.stop.side")
         self.side = side
-        self.platform, self.position = _where(self.kind, platform, position)
+        self.platform, self.position = _where(Stop, self.kind, platform, position)
 
     def _beyond(self, displacement: Array) -> tuple[Array, Array]:
         """Distance of the motion beyond the gap (negative: free), and the direction (k,) in which it presses."""

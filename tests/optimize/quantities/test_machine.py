@@ -31,10 +31,10 @@ def test_a_number_that_loads_share_counts_for_each():
 
 
 def test_sums_are_named_by_what_they_add():
-    assert total("loads.mass").words == "sum of all masses of loads"
-    assert total("machine.mass").words == "sum of all masses of platforms"
-    assert product("loads.drag").words == "product of all drags of loads" and product("loads.drag").unit == ""
-    assert total("machine.link_damping").words == "sum of all link dampings" and total("loads.inertia").unit == "kg m^2"
+    assert total("loads.mass").words == "sum of mass of all loads"
+    assert total("machine.mass").words == "sum of mass of all platforms"
+    assert product("loads.drag").words == "product of drag of all loads" and product("loads.drag").unit == ""
+    assert total("machine.link_damping").words == "sum of damping of all links" and total("loads.inertia").unit == "kg m^2"
     for wrong in ("drive.speed", "machine.length", "mass", 3, "machine.drag.x"):
         with pytest.raises(jv.InputError, match=r"must name numbers of a scene|field is 3; it must be a text"):
             total(wrong)

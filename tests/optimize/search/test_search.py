@@ -42,7 +42,7 @@ def test_multipliers_are_those_computed_by_hand():
     np.testing.assert_allclose([budget.multiplier, first.multiplier], [-1e8 * 9.0, -2e8 * 4.5], rtol=1e-6)
     assert budget.active and first.active and budget.gain < 0.0
     lines = "\n".join(best.findings())
-    assert "at its limit: sum of all support stiffnesses at most 90 N/mm (90 N/mm)" in lines
+    assert "at its limit: sum of stiffness of all supports at most 90 N/mm (90 N/mm)" in lines
     assert [row.what for row in best.table[:2]] == ["stiffness of support 1", "stiffness of support 2"]
     assert best.rows()[0] == ["stiffness of support 1, N/mm", "50", "45", "", ""]
 

@@ -13,12 +13,12 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
+from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.units import Number, count, number
 from jaxvib.units.known import require_known
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.quantity import Quantity, require_quantity
-from optimize.space.numbers import Place, changed, names_of, places_of, present_places
 
 __all__ = ["Bounds", "DesignSpace", "Held", "Source", "hold"]
 
@@ -62,8 +62,8 @@ def hold(quantity: Quantity, value: Number | None = None) -> Held:
 class Tie(NamedTuple):
     """Numbers that follow others: `target` = `factor` times `source`, entry by entry."""
 
-    target: Place
-    source: Place
+    target: NamedNumber
+    source: NamedNumber
     factor: tuple[float, ...]
 
 
@@ -111,7 +111,7 @@ class DesignSpace(eqx.Module):
     scene: Scene
     low: Array | np.ndarray
     high: Array | np.ndarray
-    places: tuple[Place, ...] = eqx.field(static=True)
+    free: tuple[NamedNumber, ...] = eqx.field(static=True)
     logs: tuple[bool, ...] = eqx.field(static=True)
     ties: tuple[Tie, ...] = eqx.field(static=True)
     held: tuple[Held, ...]
@@ -136,20 +136,20 @@ class DesignSpace(eqx.Module):
             if name in free:
                 raise InputError(f"choices.{name}", "is free already; name it once, as free or as a choice")
             wide = values[-1] / values[0] >= 10.0 if values[0] > 0.0 else False
-            ranges.append((name, places_of(scene, name, "choices"), values[0], values[-1], wide))
+            ranges.append((name, find_number(scene, name, "choices"), values[0], values[-1], wide))
         taken: set = set()
-        free_places, lows, highs, logs, choices_ = [], [], [], [], []
+        numbers, lows, highs, logs, choices_ = [], [], [], [], []
         for name, whole, low, high, log in ranges:
             if whole.entries & taken:
                 raise InputError(f"free.{name}", "frees a number that is free already; name each one once")
             taken |= whole.entries
-            for place in present_places(scene, whole, "choices" if name in chosen else "free"):
+            for each in present_numbers(scene, whole, "choices" if name in chosen else "free"):
                 if name in chosen:
-                    choices_ += [Choice(name, chosen[name], len(lows) + k) for k in range(place.size)]
-                free_places.append(place)
-                lows, highs, logs = lows + [low] * place.size, highs + [high] * place.size, logs + [log] * place.size
+                    choices_ += [Choice(name, chosen[name], len(lows) + k) for k in range(each.size)]
+                numbers.append(each)
+                lows, highs, logs = lows + [low] * each.size, highs + [high] * each.size, logs + [log] * each.size
         self.scene = scene
-        self.places, self.logs, self.choices = tuple(free_places), tuple(logs), tuple(choices_)
+        self.free, self.logs, self.choices = tuple(numbers), tuple(logs), tuple(choices_)
         self.low, self.high = np.asarray(lows), np.asarray(highs)
         self.ties = _tied(scene, ties or {}, taken)
         self.counts = counts
@@ -165,7 +165,7 @@ class DesignSpace(eqx.Module):
     @property
     def size(self) -> int:
         """Number of free numbers."""
-        return sum(place.size for place in self.places)
+        return sum(each.size for each in self.free)
 
     def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
         """NumPy or jax.numpy, by whose array `like` is, and the bounds as its arrays."""
@@ -185,17 +185,14 @@ class DesignSpace(eqx.Module):
 
     def scene_of(self, values: Array) -> Scene:
         """The scene with these free numbers (d,), SI."""
-        scene, start, values = self.scene, 0, jnp.asarray(values)
-        for place in self.places:
-            scene = changed(scene, place, values[start : start + place.size])
-            start += place.size
+        scene = put_numbers(self.scene, self.free, jnp.asarray(values))
         for tie in self.ties:
-            scene = changed(scene, tie.target, jnp.asarray(tie.factor) * tie.source.read(scene))
+            scene = put_numbers(scene, (tie.target,), jnp.asarray(tie.factor) * tie.source.read(scene))
         return scene
 
     def where(self, scene: Scene) -> Array:
         """The design z (d,) of a scene, moved into the bounds where it lies outside."""
-        return self.shares(jnp.concatenate([place.read(scene) for place in self.places]))
+        return self.shares(jnp.concatenate([each.read(scene) for each in self.free]))
 
     def shares(self, numbers: Numbers) -> Numbers:
         """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
@@ -209,11 +206,11 @@ class DesignSpace(eqx.Module):
     @validated
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
         """The free numbers of a scene by name, in SI."""
-        return {p.name: (p.leaf(scene) if p.entry is None else p.leaf(scene)[p.entry]).tolist() for p in self.places}
+        return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
         """Name in a designer's words and unit of each free number."""
-        return [(word, place.unit) for place in self.places for word in names_of(self.scene, place)]
+        return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
@@ -238,14 +235,14 @@ def _require_tables(scene: object, free: object, hold: object, ties: object, cho
         raise InputError("hold", f"is {quoted(hold)}; it must be a list of quantities in optimize.hold(...)")
 
 
-def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[Place, float, float, bool]:
+def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[NamedNumber, float, float, bool]:
     if isinstance(bounds, Mapping):
         example = f"{name}.{next(iter(bounds), '')}"
         raise InputError(f"free.{name}", f'is a table; write the whole name in quotes, for example "{example}"')
-    place = places_of(scene, name, "free")
+    found = find_number(scene, name, "free")
     if not isinstance(bounds, (list, tuple)) or len(bounds) not in (2, 3):
         raise InputError(f"free.{name}", f"is {quoted(bounds)}; give the bounds as (low, high)")
-    low, high = (float(number(b, place.unit, f"free.{name}", low=0.0)) for b in bounds[:2])
+    low, high = (found.value(bound, f"free.{name}") for bound in bounds[:2])
     if not low < high:
         raise InputError(f"free.{name}", f"has bounds {low:g} and {high:g}; the first must be less than the second")
     log = low > 0.0 and high / low >= 10.0
@@ -255,7 +252,7 @@ def _bounds(scene: Scene, name: str, bounds: Bounds) -> tuple[Place, float, floa
         log = bounds[2] == "log"
         if log and not low > 0.0:
             raise InputError(f"free.{name}", "has the scale 'log' and a low bound of 0; give a low bound greater than 0")
-    return place, low, high, log
+    return found, low, high, log
 
 
 def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict[str, tuple[float, ...]], tuple[int, ...]]:
@@ -268,9 +265,8 @@ def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict
         if name == "loads.count":
             counts = tuple(sorted({count(v, f"choices.{name}") for v in values}))
             continue
-        place = places_of(scene, name, "choices")
-        low = 0.0
-        given = sorted({float(number(v, place.unit, f"choices.{name}[{k}]", low=low)) for k, v in enumerate(values)})
+        one = find_number(scene, name, "choices")
+        given = sorted({one.value(v, f"choices.{name}[{k}]") for k, v in enumerate(values)})
         if len(given) < 2:
             raise InputError(f"choices.{name}", "has one value; put it into the scene, or give several")
         found[name] = tuple(given)
@@ -280,14 +276,14 @@ def _chosen(scene: Scene, choices: Mapping[str, Sequence[Number]]) -> tuple[dict
 def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ...]:
     found = []
     for name, given in ties.items():
-        target = places_of(scene, name, "ties")
+        target = find_number(scene, name, "ties")
         if target.entries & taken:
             raise InputError(f"ties.{name}", "is free as well; a number that follows another cannot be free")
         pair = isinstance(given, (list, tuple)) and len(given) == 2
         source_name, factor = given if pair else (given, 1.0)
         if not isinstance(source_name, str):
             raise InputError(f"ties.{name}", f"is {quoted(given)}; give another number's name, or (name, factor)")
-        source = places_of(scene, source_name, f"ties.{name}")
+        source = find_number(scene, source_name, f"ties.{name}")
         if source.entries & target.entries:
             raise InputError(f"ties.{name}", "is tied to itself; name another number")
         if source.size not in (1, target.size):
@@ -299,7 +295,7 @@ def _tied(scene: Scene, ties: Mapping[str, Source], taken: set) -> tuple[Tie, ..
             ratio = np.full(target.size, float(factor))
         else:
             raise InputError(f"ties.{name}", f"has the factor {quoted(factor)}; give a number greater than 0, or 'keep'")
-        if target.entry is None and target.leaf(scene).ndim > 0:  # what the machine does not have follows nothing
+        if target.keeps_zeros(scene):  # what the machine does not have follows nothing
             ratio = np.where(np.asarray(target.read(scene)) == 0.0, 0.0, ratio)
         if not np.all(np.isfinite(ratio)):
             raise InputError(f"ties.{name}", f"keeps its ratio to {source_name}, which is 0 in the scene; give a factor")

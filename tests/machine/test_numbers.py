@@ -7,7 +7,8 @@ from rotors import machine as rotor_machine
 from scenes import scene
 
 import jaxvib as jv
-from optimize.space.numbers import changed, names_of, places_of, shown_unit, value_of
+from jaxvib.machine.numbers.named import find_number, put_numbers, read_value
+from jaxvib.units import shown_unit
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,7 @@ ROTOR = jv.Scene(rotor_machine(0.1), jv.balls(count=2, mass=0.2, radius=0.08, dr
         (ONE, "machine.stiffness", ["stiffness of the support"]),
         (ONE, "machine.mass", ["mass of the platform"]),
         (ONE, "loads.mass", ["mass of each roller"]),
-        (ONE, "loads.radius", ["track radius"]),
+        (ONE, "loads.radius", ["track radius of each roller"]),
         (ONE, "drive.speed", ["rotor speed"]),
         (ONE, "effects.static_imbalance.moment", ["imbalance of the rotor"]),
         (THREE, "machine.damping", [f"damping of support {k}" for k in (1, 2, 3)]),
@@ -53,34 +54,61 @@ ROTOR = jv.Scene(rotor_machine(0.1), jv.balls(count=2, mass=0.2, radius=0.08, dr
         (THREE, "machine.link_damping", ["damping of link 1-2", "damping of link 1-3", "damping of link 2-3"]),
         (THREE, "loads.drag[2]", ["drag of pendulum 3"]),
         (THREE, "loads.inertia", ["moment of inertia of each pendulum"]),
-        (ROTOR, "machine.mass", ["mass of the platform"]),
+        (ROTOR, "machine.mass", ["mass of the rotor"]),
         (ROTOR, "machine.stiffness[1]", ["stiffness of support 2"]),
         (ROTOR, "loads.drag", ["drag of each ball"]),
     ],
 )
 def test_what_a_designer_calls_numbers(of, name, words):
-    assert names_of(of, places_of(of, name, "free")) == words
+    assert find_number(of, name, "free").words(of) == words
 
 
-def test_places_are_read_and_changed():
-    whole, entry = places_of(THREE, "machine.stiffness", "free"), places_of(THREE, "machine.stiffness[1]", "free")
+def test_numbers_are_read_and_put():
+    whole, entry = find_number(THREE, "machine.stiffness", "free"), find_number(THREE, "machine.stiffness[1]", "free")
     assert (whole.size, entry.size, whole.unit) == (3, 1, "N/m")
     assert entry.entries < whole.entries and len(whole.entries) == 3
     np.testing.assert_array_equal(whole.read(THREE), THREE.machine.stiffness)
     np.testing.assert_array_equal(entry.read(THREE), THREE.machine.stiffness[1:2])
-    np.testing.assert_array_equal(changed(THREE, entry, jnp.array([7.0])).machine.stiffness, [1e4, 7.0, 3e3])
-    np.testing.assert_array_equal(changed(THREE, whole, jnp.array([7.0, 8.0, 9.0])).machine.stiffness, [7.0, 8.0, 9.0])
-    moment = places_of(ONE, "effects.static_imbalance.moment", "free")
-    assert moment.unit == "kg m" and float(changed(ONE, moment, jnp.array([0.5])).effects[0].moment) == 0.5
-    for wrong in ("machine.stiffness[3]", "loads.inertia[0]", "drive.speed[0]", "machine.kind", "machine.stiffness[-1]", 3):
-        with pytest.raises(jv.InputError):
-            places_of(THREE, wrong, "free")
-    assert places_of(THREE, "machine.stiffness[2]", "free").entry == 2
+    np.testing.assert_array_equal(put_numbers(THREE, (entry,), jnp.array([7.0])).machine.stiffness, [1e4, 7.0, 3e3])
+    both = put_numbers(THREE, (whole, entry), jnp.array([7.0, 8.0, 9.0, 5.0]))
+    np.testing.assert_array_equal(both.machine.stiffness, [7.0, 5.0, 9.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("machine.stiffness[3]", "does not exist; machine.stiffness has 3 entries, counted from 0"),
+        ("drive.speed[0]", "does not exist; drive.speed has 1 entries"),
+        ("machine.stifness", "is no number of this scene; did you mean 'machine.stiffness'"),
+        ("machine.stiffness[-1]", "is no number of this scene"),
+        ("machine.kind", "is 'three_mass', which is no continuous number"),
+        ("loads.count", "is 4, which is no continuous number"),
+        ("loads.own_radius", "is not set in this scene; did you mean"),
+        (3, "is no name of a number"),
+    ],
+)
+def test_wrong_names_of_numbers_are_refused(name, says):
+    with pytest.raises(jv.InputError) as error:
+        find_number(THREE, name, "free")
+    assert str(error.value).startswith(f"free.{name} {says}"), str(error.value)
 
 
 def test_values_of_names_have_their_unit_and_range():
-    assert value_of("machine.stiffness[1]", "2 N/mm") == 2e3 and value_of("drive.speed", "30 rpm") == pytest.approx(np.pi)
-    assert value_of("effects.static_imbalance.moment", 0.5) == 0.5 and value_of("machine.damping", 0.0) == 0.0
-    for name, value in (("machine.mass", 0.0), ("machine.damping", -1.0), ("machine.nothing", 1.0), ("loads.mass", "1 m")):
+    assert read_value("machine.stiffness[1]", "2 N/mm") == 2e3
+    assert read_value("drive.speed", "30 rpm") == pytest.approx(np.pi)
+    assert read_value("effects.static_imbalance.moment", 0.5) == 0.5 and read_value("machine.damping", 0.0) == 0.0
+    assert (
+        read_value("machine.stiffness_terms[2]", "3 N m") == 3.0
+        and read_value("effects.cubic_support[1].stiffness", -1.0) == -1.0
+    )
+    for name, value in (
+        ("machine.mass", 0.0),
+        ("machine.damping", -1.0),
+        ("machine.nothing", 1.0),
+        ("loads.mass", "1 m"),
+        ("drive.breakdown_slip", 1.0),
+        ("machine.stiffness_terms[3]", 1.0),
+        ("effects.static_imbalance.gap", 1.0),
+    ):
         with pytest.raises(jv.InputError):
-            value_of(name, value)
+            read_value(name, value)

@@ -117,7 +117,7 @@ def test_springs_that_are_not_there_stay_away():
     """Zeros of an array are freed, tied and chosen only if they are named."""
     chain = scene("network")  # supports 1e4, 0, 0, 2e4, 1e3
     space = DesignSpace(chain, {"machine.stiffness": (1e3, 9e4, "even"), "loads.drag": (1.0, 2.0)})
-    assert space.size == 4 and [place.name for place in space.places[:2]] == ["machine.stiffness[0]", "machine.stiffness[3]"]
+    assert space.size == 4 and [place.name for place in space.free[:2]] == ["machine.stiffness[0]", "machine.stiffness[3]"]
     np.testing.assert_allclose(space.at(jnp.array([0.0, 0.5, 1.0, 0.0])).machine.stiffness, [1e3, 0.0, 0.0, 4.55e4, 9e4])
     assert space.words()[1] == ("stiffness of support 4", "N/m")
     chosen = DesignSpace(chain, {"loads.drag": (1.0, 2.0)}, choices={"machine.stiffness": [1e3, 2e3, 9e3]})

@@ -1,0 +1,115 @@
+"""Units, bounds and words of the numbers of a scene: metadata of the fields that hold them.
+
+Constructors read their arguments by it; `named` names the numbers of a whole scene with it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.units import Bounds, Numbers, number, numbers
+
+__all__ = ["PLAIN", "NumberSpec", "number_specs", "read_numbers", "unit"]
+
+_KEY = "number"
+
+
+class NumberSpec(NamedTuple):
+    """Meaning of the number, or of the array of numbers, in a field of a part of a scene; made by `unit`.
+
+    **Attributes**: `units` of all entries, or one for each of them; `bounds`; `words`: its name for a designer; `each`: the
+    owner of an entry of an array, such as "platform", "" for a single number; `typical`: the size of a number that may be 0,
+    in SI, None if 0 is its bound.
+    """
+
+    units: tuple[str, ...]
+    bounds: Bounds
+    words: str = ""
+    each: str = ""
+    typical: float | None = None
+
+    @property
+    def unit(self) -> str:
+        """The unit, or the units of the entries, for tables."""
+        return ", ".join(self.units)
+
+    @property
+    def zero_is_absent(self) -> bool:
+        """True if a 0 in an array stands for something that the machine does not have, such as a spring."""
+        return bool(self.each) and self.bounds.low == 0.0
+
+
+PLAIN = NumberSpec(("",), Bounds())
+"""Meaning of a number whose field has no metadata: any number, in SI."""
+
+
+def unit(
+    *units: str,
+    low: float = -math.inf,
+    open_low: bool = False,
+    high: float = math.inf,
+    open_high: bool = False,
+    words: str = "",
+    each: str = "",
+    typical: float | None = None,
+) -> Mapping[str, NumberSpec]:
+    """Metadata of a field of a machine, a load, a drive or an effect that holds a number or an array of numbers.
+
+    **Arguments**: as the attributes of `NumberSpec`; `low` and `high` are allowed themselves unless they are open. Entries with
+    `each="load"` may be one number that all loads share; in `words` "{load}" stands for the kind of load.
+
+    >>> import equinox as eqx
+    >>> class Seal(eqx.Module):
+    ...     torque: float = eqx.field(metadata=unit("N m", low=0.0, words="torque of the seal"))
+    >>> number_specs(Seal)["torque"].bounds.words
+    'at least 0'
+    """
+    return {_KEY: NumberSpec(units, Bounds(low, open_low, high, open_high), words, each, typical)}
+
+
+@functools.lru_cache(maxsize=256)
+def number_specs(part: type) -> Mapping[str, NumberSpec]:
+    """The meaning of each number of a part of a scene by the name of its field."""
+    fields = dataclasses.fields(part)
+    found = {field.name: field.metadata[_KEY] for field in fields if _KEY in field.metadata}
+    return {name: spec._replace(words=spec.words or name.replace("_", " ")) for name, spec in found.items()}
+
+
+def read_numbers(part: type[eqx.Module], section: str, length: int | None = None, /, **values: Numbers) -> dict[str, Array]:
+    """Arguments of a constructor as arrays in SI units, checked by the metadata of the fields of their names.
+
+    **Arguments**: `section`: the table of a scene file, for messages; `length` of arrays, None for any.
+
+    **Raises** `InputError` for a wrong unit, a value out of bounds, and a list of another length.
+
+    >>> import jaxvib as jv
+    >>> read_numbers(jv.SpinUp, "drive", speed="100 rad/s", duration=0.0)
+    Traceback (most recent call last):
+        ...
+    jaxvib.errors.InputError: drive.duration is 0 s; it must be greater than 0
+    """
+    specs = number_specs(part)
+    return {name: _read(specs[name], value, f"{section}.{name}", length) for name, value in values.items()}
+
+
+def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array:
+    bounds, size = spec.bounds._asdict(), len(spec.units)
+    if size == 1 and spec.each:
+        return numbers(value, spec.unit, field, length, **bounds, shared=spec.each == "load")
+    if size == 1:
+        return number(value, spec.unit, field, **bounds)
+    if not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) != 1:
+        raise InputError(field, f"is {quoted(value)}; it must be a list of {size} numbers, in {spec.unit}")
+    if len(value) != size:
+        raise InputError(field, f"has {len(value)} values; {size} are needed")
+    units = enumerate(spec.units)
+    return jnp.stack([number(value[k], unit, f"{field}[{k}]", **bounds) for k, unit in units])

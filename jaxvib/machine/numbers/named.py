@@ -1,0 +1,250 @@
+"""Numbers of a scene by name: "machine.stiffness[0]", "drive.inertia", "effects.stop[1].gap".
+
+Every floating-point number of a machine, a load, a drive or an effect has a name; `numbers` has their units, bounds and words.
+"""
+
+from __future__ import annotations
+
+import collections
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.errors import InputError, quoted
+from jaxvib.machine.carrier import Machine
+from jaxvib.machine.drive import Drive
+from jaxvib.machine.effects.base import Effect
+from jaxvib.machine.files import EFFECTS, suggest_name
+from jaxvib.machine.loads import Loads
+from jaxvib.machine.numbers import PLAIN, NumberSpec, number_specs
+from jaxvib.machine.scene import Scene
+from jaxvib.units import Number, number
+
+__all__ = ["NamedNumber", "find_number", "numbers_of", "present_numbers", "put_numbers", "put_present", "read_value", "spec_of"]
+
+_Path = tuple[str | int, ...]
+_SECTIONS: dict[str, type[eqx.Module]] = {"machine": Machine, "loads": Loads, "drive": Drive}
+
+
+class NamedNumber(NamedTuple):
+    """A number of a scene, or an array of numbers with one unit.
+
+    **Attributes**: `name`; `path` of attributes and indices from the scene to the array; `entry` of the array, None for all of
+    it; `size`: how many numbers it is; `spec` of the field.
+    """
+
+    name: str
+    path: _Path
+    entry: int | None
+    size: int
+    spec: NumberSpec
+
+    @property
+    def unit(self) -> str:
+        """The unit of the number, or of all entries."""
+        return self.spec.units[self.entry if self.entry is not None and len(self.spec.units) > 1 else 0]
+
+    @property
+    def entries(self) -> set[tuple[_Path, int]]:
+        """Each number by itself, to find numbers that two names share."""
+        return {(self.path, k) for k in (range(self.size) if self.entry is None else (self.entry,))}
+
+    def leaf(self, scene: Scene) -> Array:
+        """The array that the number is in."""
+        found: Any = scene
+        for step in self.path:
+            found = found[step] if isinstance(step, int) else getattr(found, step)
+        return found
+
+    def read(self, scene: Scene) -> Array:
+        """The values (size,), SI."""
+        leaf = jnp.asarray(self.leaf(scene))
+        return jnp.reshape(leaf if self.entry is None else leaf[self.entry], (-1,))
+
+    def value(self, given: Number, field: str) -> float:
+        """A value of a user in SI. **Raises** `InputError`, of `field`, for a wrong unit and a value out of bounds."""
+        return float(number(given, self.unit, field, **self.spec.bounds._asdict()))
+
+    def single(self, scene: Scene) -> tuple[NamedNumber, ...]:
+        """The numbers of an array, each with its own name; a single number itself."""
+        if self.entry is not None or not np.ndim(self.leaf(scene)):
+            return (self,)
+        return tuple(self._replace(name=f"{self.name}[{k}]", entry=k, size=1) for k in range(self.size))
+
+    def keeps_zeros(self, scene: Scene) -> bool:
+        """True for a whole array in which a 0 stands for a spring or a damper that the machine does not have."""
+        return self.entry is None and self.spec.zero_is_absent and np.ndim(self.leaf(scene)) > 0
+
+    def words(self, scene: Scene) -> list[str]:
+        """Name of each number for a designer, such as "stiffness of support 2"."""
+        leaf, load, each = self.leaf(scene), scene.loads.kind.rpartition("_")[2], self.spec.each
+        words = self._numbered(scene, self.spec.words.format(load=load))
+        which = range(self.size) if self.entry is None else (self.entry,)
+        several = np.ndim(leaf) > 0
+        if each == "load":
+            return [f"{words} of {load} {k + 1}" if several else f"{words} of each {load}" for k in which]
+        if each == "link":
+            links = getattr(scene.machine, "links", ())
+            return [f"{words} of link {'-'.join(map(str, links[k])) if k < len(links) else k + 1}" for k in which]
+        if each:
+            return [f"{words} of {each} {k + 1}" if np.size(leaf) > 1 else f"{words} of the {each}" for k in which]
+        return [f"{words} {k + 1}" if several else words for k in which]
+
+    def _numbered(self, scene: Scene, words: str) -> str:
+        """The words with the number of an effect that the scene has several of."""
+        if self.path[0] != "effects" or not isinstance(index := self.path[1], int):
+            return words
+        kinds = [effect.kind for effect in scene.effects]
+        kind = kinds[index]
+        if kinds.count(kind) == 1:
+            return words
+        called = kind.replace("_", " ")
+        return words.replace(f"the {called}", f"{called} {kinds[:index].count(kind) + 1}")
+
+
+def numbers_of(scene: Scene) -> dict[str, NamedNumber]:
+    """All continuous numbers of a scene by name; an array of one unit has one name, of several units one for each entry.
+
+    >>> import jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0), (jv.Gravity(),))
+    >>> [(name, found.unit) for name, found in numbers_of(scene).items()][-2:]
+    [('drive.speed', 'rad/s'), ('effects.gravity.g', 'm/s^2')]
+    """
+    found: dict[str, NamedNumber] = {}
+    for prefix, path, part in _parts(scene):
+        for steps, leaf in jax.tree_util.tree_leaves_with_path(part):
+            if not _is_continuous(leaf) or not np.size(leaf):
+                continue
+            inner, spec = _steps(part, steps)
+            whole = NamedNumber(prefix + jax.tree_util.keystr(steps), (*path, *inner), None, np.size(leaf), spec)
+            found |= {each.name: each for each in (whole.single(scene) if len(spec.units) > 1 else (whole,))}
+    return found
+
+
+def _is_continuous(value: object) -> bool:
+    """True for a floating-point number or an array of them, traced ones included."""
+    known = isinstance(value, (float, np.generic, np.ndarray, jax.Array))
+    return known and jnp.issubdtype(jnp.result_type(value), jnp.floating)
+
+
+def _parts(scene: Scene) -> Iterator[tuple[str, _Path, eqx.Module]]:
+    """The parts of a scene, with their names and paths; effects that may stand several times are counted, from 0."""
+    for section in _SECTIONS:
+        yield section, (section,), getattr(scene, section)
+    counted: collections.Counter[str] = collections.Counter()
+    for k, effect in enumerate(scene.effects):
+        yield f"effects.{effect.kind}" + (f"[{counted[effect.kind]}]" if effect.repeatable else ""), ("effects", k), effect
+        counted[effect.kind] += 1
+
+
+def _steps(part: eqx.Module, steps: Sequence[Any]) -> tuple[_Path, NumberSpec]:
+    """The path within a part, and the spec of the field that it ends in."""
+    inner: list[str | int] = []
+    spec, owner = PLAIN, cast(Any, part)
+    for step in steps:
+        if isinstance(step, jax.tree_util.GetAttrKey):
+            inner.append(step.name)
+            spec = number_specs(type(owner)).get(step.name, PLAIN._replace(words=step.name.replace("_", " ")))
+            owner = getattr(owner, step.name)
+        else:
+            inner.append(step.idx)
+            owner = owner[step.idx]
+    return tuple(inner), spec
+
+
+def find_number(scene: Scene, name: str, field: str) -> NamedNumber:
+    """The number, or the array of numbers, of that name.
+
+    **Raises** `InputError`, of `field`, for a name that the scene does not have, and for one that is no continuous number, such
+    as a count.
+    """
+    there, field = numbers_of(scene), f"{field}.{name}"
+    if not isinstance(name, str):
+        raise InputError(field, f"is no name of a number; {suggest_name(str(name), list(there))}")
+    if name in there:
+        return there[name]
+    array, index = m.groups() if (m := re.fullmatch(r"(.+)\[(\d+)\]", name)) else (name, None)
+    if array in there and index is not None:
+        entries = there[array].single(scene)
+        if entries[0].entry is None or int(index) >= len(entries):
+            raise InputError(field, f"does not exist; {array} has {there[array].size} entries, counted from 0")
+        return entries[int(index)]
+    raise InputError(field, f"{_why_unnamed(scene, name)}; {suggest_name(name, list(there))}")
+
+
+def _why_unnamed(scene: Scene, name: str) -> str:
+    """The reason why a name has no number."""
+    part, _, last = name.rpartition(".")
+    owner = next((each for prefix, _, each in _parts(scene) if prefix == part), None)
+    if last not in getattr(type(owner), "__dataclass_fields__", ()):
+        return "is no number of this scene"
+    value = getattr(owner, last)
+    if value is None or np.size(value) == 0:
+        return "is not set in this scene"
+    return "has entries of different units" if _is_continuous(value) else f"is {quoted(value)}, which is no continuous number"
+
+
+def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array) -> Scene:
+    """The scene with these values (sum of the sizes,), SI, one after the other."""
+    leaves: dict[_Path, Array] = {}
+    start = 0
+    for each in found:
+        leaf, new = jnp.asarray(leaves.get(each.path, each.leaf(scene))), values[start : start + each.size]
+        leaves[each.path] = jnp.reshape(new, jnp.shape(leaf)) if each.entry is None else leaf.at[each.entry].set(new[0])
+        start += each.size
+    where = {each.path: each for each in found}
+    return eqx.tree_at(lambda s: [each.leaf(s) for each in where.values()], scene, list(leaves.values()))
+
+
+def present_numbers(scene: Scene, found: NamedNumber, field: str) -> tuple[NamedNumber, ...]:
+    """The array itself, or its entries other than 0 if it keeps its zeros; what is not there is added only if it is named.
+
+    **Raises** `InputError`, of `field`, for an array that is 0 in every entry.
+    """
+    values = np.asarray(found.leaf(scene))
+    if not found.keeps_zeros(scene) or np.all(values != 0.0):
+        return (found,)
+    if not np.any(values):
+        advice = f"name the entry that shall be added, for example {found.name}[0]"
+        raise InputError(f"{field}.{found.name}", f"is 0 in every entry, and zeros stay as they are; {advice}")
+    return tuple(each for each, value in zip(found.single(scene), values, strict=True) if value != 0.0)
+
+
+def put_present(scene: Scene, found: NamedNumber, value: float) -> Scene:
+    """The scene with this value in every entry; those that are absent stay so, see `present_numbers`."""
+    now, new = found.read(scene), jnp.full(found.size, value)
+    return put_numbers(scene, (found,), jnp.where(now != 0.0, new, now) if found.keeps_zeros(scene) else new)
+
+
+def read_value(name: str, value: Number) -> float:
+    """A value for the number of that name of any scene, in SI.
+
+    **Raises** `InputError` for a name that no part of a scene has, a wrong unit, and a value out of bounds.
+    """
+    spec, index = spec_of(name), re.search(r"\[(\d+)\]$", str(name))
+    entry = int(index[1]) if index else None
+    if spec is None or (len(spec.units) > 1 and (entry or 0) >= len(spec.units)):
+        raise InputError(str(name), "is no number of a scene; give a name such as 'machine.stiffness[0]' or 'drive.speed'")
+    return NamedNumber(name, (), entry, 1, spec).value(value, name)
+
+
+def spec_of(name: str) -> NumberSpec | None:
+    """The meaning of a number by its name alone: that of the first kind of part that has it, None if no part has it."""
+    part, _, last = re.sub(r"\[\d+\]", "", str(name)).rpartition(".")
+    if part.startswith("effects."):
+        known = EFFECTS.get(part.removeprefix("effects."))
+        kinds = [known] if known else [kind for kind in _subclasses(Effect) if kind not in EFFECTS.values()]
+    else:
+        kinds = [kind for name, of in _SECTIONS.items() if name == part for kind in _subclasses(of)]
+    return next((specs[last] for kind in kinds if last in (specs := number_specs(kind))), None)
+
+
+def _subclasses(kind: type) -> list[type]:
+    return [each for sub in kind.__subclasses__() for each in (sub, *_subclasses(sub))]
