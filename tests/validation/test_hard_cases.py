@@ -20,6 +20,7 @@ FAST = {
     ("light fold, 1e-8 below", "float64"),
     ("light fold, 1e-8 below", "float32"),
     ("light fold, 1e-8 above", "float64"),
+    ("exact fold, 1e-8 below", "float32"),
     ("damping 1e-8 of critical", "float64"),
     ("three platforms alike, weak links", "float64"),
     ("one load", "float64"),

@@ -63,7 +63,7 @@ class Orbit(Result):
     **Attributes**
 
     - `status` an `OrbitStatus`; `residual` of the torque balance, relative; `error` estimate of the relative error of the
-      speeds (and, rad, of psi) that the number of harmonics leaves
+      speeds (and, rad, of psi) by the number of harmonics and by rounding
     - `omega`, `rotor_speed` rad/s; `slope` dn/dOmega along the branch
     - `amplitude` (nd,) m, of tilts rad, and `foundation_force` N: zero to peak, (max - min)/2 over the period; of two
       directions of the force the root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
@@ -242,6 +242,7 @@ def orbits(
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = residual < 4096.0 * tiny
+    speed_error = speed_error + tiny  # beside a fold the load speed magnifies rounding too
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
