@@ -36,6 +36,12 @@ _SMOOTH = 0.09
 _MAX_PICTURES = 600
 """Largest number of pictures of a film."""
 
+_NARROWEST, _WIDEST = 1.0, 50.0
+"""Widths of a picture, inches."""
+
+_PICTURES_AWAY = 100.0
+"""Heights of the picture by which the machine may be drawn away from its place."""
+
 
 @validated
 def animate(
@@ -142,6 +148,8 @@ def _fastest(motion: Run | Orbit, scene: Scene) -> float:
 
 
 def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: float | None, width: float) -> Film:
+    if not _NARROWEST <= width <= _WIDEST:
+        raise InputError("width", f"is {width:g} inches; it must be from {_NARROWEST:g} to {_WIDEST:g}")
     view = view_of(scene)
     left, right, bottom, top = view.limits
     tall = width * (top - bottom) / (right - left)
@@ -154,6 +162,11 @@ def _film(scene: Scene, shown: Stretch, strips: Stretch, fps: float, magnify: fl
     given = None if magnify is None else float(number(magnify, "", "magnify", low=0.0, open_low=True))
     chosen = view.magnified(shown.displacement) if given is None else given
     reach = chosen * view.wheel.scale
+    farthest = float(np.max(np.abs(shown.displacement), initial=0.0)) * view.wheel.scale
+    if chosen * farthest > (most_seen := _PICTURES_AWAY * (top - bottom)):
+        raise InputError(
+            "magnify", f"is {chosen:g}, which moves the machine out of the picture; at most {most_seen / farthest:.3g}"
+        )
     poses = [
         Pose(shown.displacement[k], shown.velocity[k], tuple(u[k] for u in shown.angle), float(shown.turn[k]))
         for k in range(shown.time.size)

@@ -147,6 +147,9 @@ def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
         (lambda run, orbit: jv.animate(run, begin=0.0, seconds=1.0), "end makes the rotor go on by 0.955 turns .* deceives"),
         (lambda run, orbit: jv.animate(run, seconds=-1.0), "seconds is -1 s; it must be greater than 0"),
         (lambda run, orbit: jv.animate(run, fps=0), "fps is 0; it must be a whole number"),
+        (lambda run, orbit: jv.animate(run, width=-1.0), "width is -1 inches; it must be from 1 to 50"),
+        (lambda run, orbit: jv.animate(run, width=np.inf), "width is inf inches"),
+        (lambda run, orbit: jv.animate(run, begin=1.99, magnify=1e308), r"magnify is 1e\+308, which moves the machine out of"),
         (lambda run, orbit: jv.animate(run, magnify=-1.0), "magnify is -1; it must be greater than 0"),
         (
             lambda run, orbit: jv.animate(thinned(run, 128), begin=0.1, end=0.3),

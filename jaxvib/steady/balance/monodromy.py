@@ -107,14 +107,16 @@ def fine_and_coarse(scene: Scene, angles: Any, steps: int | None) -> tuple[Array
 def checked_steps(scene: Scene, speeds: ArrayLike, steps: int | None) -> int | None:
     """Return `steps` if they are a count, or None if they are to be chosen for each speed.
 
-    **Raises** `InputError` for other steps, and for a rotor so slow that steps would have to be longer than the carrier's
-    vibration although that outlasts the turn: in the method it decays.
+    **Raises** `InputError` for other steps, for speeds that are not positive, and for a rotor so slow that steps would have
+    to be longer than the carrier's vibration although that outlasts the turn: in the method it decays.
     """
+    asked, most = np.asarray(speeds), 0.1 * float(jnp.finfo(float).max) ** 0.5
+    wrong = asked[~((asked > 0.0) & (asked < most))]
+    if wrong.size:
+        raise InputError("speeds", f"contain {wrong[0]:g} rad/s; they must be greater than 0 and below {most:.1e}")
     if steps is not None:
         return count(steps, "steps", low=2, each=64.0)
     slowest = float(np.min(np.asarray(speeds), initial=np.inf))
-    if not slowest > 0.0:
-        raise InputError("speeds", f"contain {slowest:g} rad/s; they must be greater than 0")
     decay, wanted = (float(x) for x in _slowest_decay(eqx.tree_at(lambda s: s.drive.speed, at_constant_speed(scene), slowest)))
     if wanted >= _MOST and decay * 2.0 * np.pi / slowest < _FORGOTTEN:
         problem = (

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxvib.boundary import validated
 from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, natural_frequencies
-from jaxvib.errors import InputError
+from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.loads import CircularLoads
@@ -34,6 +34,7 @@ from jaxvib.steady.balance.monodromy import (
     monodromies,
 )
 from jaxvib.steady.balance.stability import BalancedStability
+from jaxvib.units import count
 
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto
@@ -90,6 +91,8 @@ class BalancedStates(Result):
         """The angles of an arrangement. **Raises** `ComputationError` where there is none."""
         if not len(self.angles):
             raise failure(self.status)
+        if not 0 <= arrangement < len(self.angles):
+            raise InputError("arrangement", f"is {quoted(arrangement)}; there are {len(self.angles)}, counted from 0")
         return self.angles[arrangement]
 
     def summary(self) -> str:
@@ -308,9 +311,9 @@ def balanced_intervals(
     >>> [[round(w, 2) for w in row] for row in balanced_intervals(scene, 20.0, 60.0, points=40)]
     [[28.28, 60.0]]
     """
-    if not 0.0 < low < high:
-        raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed")
-    grid = np.linspace(low, high, points)
+    if not 0.0 < low < high < np.inf:
+        raise InputError("low", f"is {low:g} and high {high:g}; 0 < low < high is needed, both finite")
+    grid = np.linspace(low, high, count(points, "points", low=2, each=1e4))
     stable = balanced_growth(scene, grid, angles, steps=steps) < 0.0
     changes = stability_changes(scene, grid, stable, angles, steps=steps).tolist()
     ends = [*([low] if stable[0] else []), *changes, *([high] if stable[-1] else [])]

@@ -98,6 +98,13 @@ def test_motion_that_is_not_balanced_is_refused():
         balanced_stability(loaded(effects=(jv.Gravity(),)))
     with pytest.raises(jv.InputError, match="low is 5"):
         balanced_intervals(loaded(), 5.0, 3.0)
+    states = jv.balanced_states(loaded())
+    with pytest.raises(jv.InputError, match=r"speeds contain nan rad/s; they must be greater than 0 and below"):
+        states.growth([40.0, np.nan], steps=16)
+    with pytest.raises(jv.InputError, match=r"arrangement is 1; there are 1, counted from 0"):
+        states.stability(1)
+    with pytest.raises(jv.InputError, match=r"points is 0; it must be a whole number, at least 2"):
+        states.intervals(20.0, 40.0, points=0)
 
 
 def flat_field(s):
