@@ -62,7 +62,7 @@ MACHINES = {
     ),
 }
 LOADS = {
-    "balls": jv.balls(count=3, mass=0.05, radius=0.08, drag=0.4, own_radius=0.015),
+    "balls": jv.balls(count=3, mass=0.05, radius=0.08, drag=0.4, ball_radius=0.015),
     "pendulums": jv.pendulums(count=3, mass=0.05, radius=0.08, drag=0.4, inertia=2e-5),
 }
 EFFECTS: dict[str, tuple[jv.Effect, ...]] = {

@@ -83,7 +83,7 @@ def numbers(scene: Any) -> tuple[float, ...]:
     """The scene's numbers as the native code takes them."""
     machine, loads, (gravity, imbalance, rolling) = scene.machine, scene.loads, scene.effects
     values = (machine.mass, machine.stiffness, machine.damping, loads.mass, loads.radius, loads.gap, scene.drive.speed)
-    lever = rolling.coefficient / loads.own_radius
+    lever = rolling.coefficient / loads.ball_radius
     return tuple(float(x) for x in (*values, gravity.g, imbalance.moment, lever, rolling.width))
 
 

@@ -58,7 +58,7 @@ def two_masses(draw: Draw, *effects: jv.Effect) -> jv.Scene:
 
 
 def touching(draw: Draw) -> jv.Scene:
-    loads = jv.balls(count=2, mass=draw(0.2, 0.5), radius=0.1, drag=draw(0.3, 2.0), own_radius=draw(0.01, 0.03))
+    loads = jv.balls(count=2, mass=draw(0.2, 0.5), radius=0.1, drag=draw(0.3, 2.0), ball_radius=draw(0.01, 0.03))
     contact = jv.LoadContact(stiffness=draw(1e4, 1e5), damping=draw(1.0, 30.0))
     return jv.Scene(one_mass(draw), loads, jv.ConstantSpeed(draw(20.0, 60.0)), (contact, jv.Gravity()))
 

@@ -49,7 +49,7 @@ def rotor_scene() -> jv.Scene:
 
 @functools.cache
 def torus_scene() -> jv.Scene:
-    loads = jv.torus_balls(count=2, mass=0.05, radius=0.1, tube=0.02, own_radius=0.01, drag=0.5)
+    loads = jv.torus_balls(count=2, mass=0.05, radius=0.1, tube=0.02, ball_radius=0.01, drag=0.5)
     return jv.Scene(jv.planar_rotor(mass=10.0, stiffness=1e5, damping=100.0), loads, jv.ConstantSpeed(200.0))
 
 
@@ -125,10 +125,10 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("Dimensionless", **form, **scales)
     one = dict(omega=1.0, amplitude=1e-3, force=1.0)
     yield call("Dimensionless.read", lambda: jv.Dimensionless(**form).read, **{k: jnp.asarray(v) for k, v in one.items()})
-    yield call("balls", count=2, mass=0.8, radius=0.12, drag=1.5, own_radius=0.01)
-    yield call("rollers", count=2, mass=0.8, radius=0.12, drag=1.5, own_radius=0.01)
+    yield call("balls", count=2, mass=0.8, radius=0.12, drag=1.5, ball_radius=0.01)
+    yield call("rollers", count=2, mass=0.8, radius=0.12, drag=1.5, ball_radius=0.01)
     yield call("pendulums", count=2, mass=0.8, radius=0.12, drag=1.5, inertia=0.01)
-    yield call("torus_balls", count=2, mass=0.05, radius=0.1, tube=0.02, own_radius=0.01, drag=0.5)
+    yield call("torus_balls", count=2, mass=0.05, radius=0.1, tube=0.02, ball_radius=0.01, drag=0.5)
     yield call("ConstantSpeed", speed=120.0)
     yield call("SpinUp", speed=120.0, duration=2.0)
     yield call("RunUp", speed=120.0, acceleration=20.0)

@@ -79,7 +79,7 @@ class CollectedModel(eqx.Module):
         of_each = self.torque_of_each if of_each is None else of_each
         if not self.loads.alike:
             return jax.vmap(lambda p, r, x: of_each(p, r, speed, x), in_axes=1, out_axes=1)(phi, rate, a)
-        if self.loads.own_radius is None:
+        if self.loads.ball_radius is None:
             return self.loads.count * of_each(phi, rate, speed, a[:, None])
         return jnp.sum(of_each(*self.each_load(phi, rate), speed, a[:, None]), axis=0, keepdims=True)
 

@@ -327,7 +327,7 @@ count = 3
 mass = "800 g"              # of one load
 radius = "120 mm"           # of the circle of the loads' centres
 drag = "1.5 N s/m"          # viscous resistance of one load against the rotor, at that radius
-# own_radius = "20 mm"      # of a ball or roller: gathered loads lie side by side, otherwise at one point
+# ball_radius = "20 mm"     # of a ball or roller: gathered loads lie side by side, otherwise at one point
 # inertia = 0.0             # kg m^2 about the mass centre, pendulums only
 
 [drive]

@@ -18,15 +18,15 @@ from jaxvib.units import Number, Numbers, count
 from jaxvib.units.known import when_known
 
 __all__ = [
+    "BALL_RADIUS",
     "DRAG",
     "MASS",
-    "OWN_RADIUS",
     "CircularLoads",
     "DrillingSpin",
     "Loads",
     "NormalForce",
+    "ball_radius",
     "balls",
-    "own_radius",
     "pendulums",
     "require_side_by_side",
     "rollers",
@@ -36,7 +36,7 @@ __all__ = [
 
 MASS = unit("kg", low=0.0, open_low=True, each="load")
 DRAG = unit("N s/m", low=0.0, each="load")
-OWN_RADIUS = unit("m", low=0.0, open_low=True, words="own radius of each {load}")
+BALL_RADIUS = unit("m", low=0.0, open_low=True, words="ball radius of each {load}")
 
 
 class NormalForce(NamedTuple):
@@ -146,12 +146,12 @@ class Loads(eqx.Module):
         return None
 
 
-def own_radius(loads: Loads, field: str = "loads.own_radius") -> Array:
+def ball_radius(loads: Loads, field: str = "loads.ball_radius") -> Array:
     """Return the radius r of loads that have a size, m. **Raises** `InputError` for others, naming the `field`."""
-    own = getattr(loads, "own_radius", None)
+    own = getattr(loads, "ball_radius", None)
     if own is None:
-        advice = "give balls or rollers their own_radius"
-        raise InputError(field, f"needs loads that roll, with an own_radius; {quoted(loads.kind)} have none here: {advice}")
+        advice = "give balls or rollers their ball_radius"
+        raise InputError(field, f"needs loads that roll, with a ball_radius; {quoted(loads.kind)} have none here: {advice}")
     return own
 
 
@@ -164,7 +164,7 @@ class CircularLoads(Loads):
 
     **Attributes** (scalar: shared by all loads; or (count,)): `mass` m kg; `radius` R m of the circle of the mass centres;
     `drag` b_W N s/m at that radius; `inertia` J_C kg m^2 about the mass centre (pendulums; None for the others);
-    `count` N; `kind` "ball", "roller" or "pendulum"; `own_radius` r m of a ball or roller (scalar), None for loads that can
+    `count` N; `kind` "ball", "roller" or "pendulum"; `ball_radius` r m of a ball or roller (scalar), None for loads that can
     all be at one point. With it, collected loads lie side by side on an arc, 2 arcsin(r/R) apart.
 
     Source: the antiphase paper, equations (1), (2), (6).
@@ -178,7 +178,7 @@ class CircularLoads(Loads):
     inertia: Array | None = eqx.field(metadata=unit("kg m^2", low=0.0, words="moment of inertia", each="load"))
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
-    own_radius: Array | None = eqx.field(metadata=OWN_RADIUS, default=None)
+    ball_radius: Array | None = eqx.field(metadata=BALL_RADIUS, default=None)
 
     @property
     def has_bearing(self) -> bool:
@@ -222,14 +222,14 @@ class CircularLoads(Loads):
 
     def offsets(self) -> Array:
         """Return (2 j - N + 1) arcsin(r/R), (count,) rad: the angles of loads side by side relative to their middle."""
-        if self.own_radius is None:
+        if self.ball_radius is None:
             return jnp.zeros((self.count,), dtype=jnp.result_type(self.radius))
-        return side_by_side(self.count, self.own_radius / self.radius)
+        return side_by_side(self.count, self.ball_radius / self.radius)
 
     def unbalance(self) -> Array:
         """Return the unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
         whole = jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
-        return whole if self.own_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
+        return whole if self.ball_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
 
     def drag_sum(self) -> Array:
         """Return sum b_W R^2 of all loads, N m s: the driving torque per speed difference to the rotor."""
@@ -243,7 +243,7 @@ def _circular(
     radius: Number,
     drag: Numbers,
     inertia: Numbers | None,
-    own_radius: Number | None = None,
+    ball_radius: Number | None = None,
 ) -> CircularLoads:
     n = count(count_, "loads.count", each=256)
     read = partial(read_numbers, CircularLoads, "loads", n)
@@ -252,17 +252,17 @@ def _circular(
         inertia=None if inertia is None else read(inertia=inertia)["inertia"],
         count=n,
         kind=kind,
-        own_radius=None if own_radius is None else read(own_radius=own_radius)["own_radius"],
+        ball_radius=None if ball_radius is None else read(ball_radius=ball_radius)["ball_radius"],
     )
-    if loads.own_radius is not None:
-        _fit(loads, loads.own_radius)
+    if loads.ball_radius is not None:
+        _fit(loads, loads.ball_radius)
     return loads
 
 
 def _fit(loads: CircularLoads, r: Array) -> None:
     """**Raises** `InputError` for loads with a radius that have no room side by side."""
     if not loads.alike:
-        raise InputError("loads.own_radius", "is for loads that share every number; give one mass, radius and drag for all")
+        raise InputError("loads.ball_radius", "is for loads that share every number; give one mass, radius and drag for all")
     when_known(partial(require_side_by_side, loads.count), loads.radius, r)
 
 
@@ -272,19 +272,19 @@ def side_by_side(count: int, ratio: Array) -> Array:
     return jnp.arange(1 - count, count, 2, dtype=angle.dtype) * angle
 
 
-def require_side_by_side(count: int, radius: float, own_radius: float) -> None:
+def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
     """**Raises** `InputError` if `count` loads with a radius have no room side by side on a circle of `radius`, m."""
     most = radius * (1.0 if count == 1 else math.sin(math.pi / count))
-    if not own_radius < most:
+    if not ball_radius < most:
         problem = f"{count} side by side on a circle of {radius:.6g} m have room below {most:.6g} m"
-        raise InputError("loads.own_radius", f"is {own_radius:.6g} m; {problem}")
+        raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m; {problem}")
 
 
-def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_radius: Number | None = None) -> CircularLoads:
+def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Balls that roll in an annular track, kappa = 7/5.
 
     **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
-    all, or N of them; `own_radius` r m of a ball, for balls in one track, which cannot all be at one point: where jams and
+    all, or N of them; `ball_radius` r m of a ball, for balls in one track, which cannot all be at one point: where jams and
     the criterion take them as collected, they lie side by side and carry the unbalance m R sin(N arcsin(r/R)) / (r/R) in
     place of N m R. In time only the effect `LoadContact` sees it: without that nothing keeps loads from passing each other.
 
@@ -294,15 +294,15 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_radiu
     >>> import jaxvib as jv
     >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5).unbalance().round(6))
     0.288
-    >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5, own_radius="20 mm").unbalance().round(6))
+    >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5, ball_radius="20 mm").unbalance().round(6))
     0.277333
 
     Source: the antiphase paper, equations (1), (2), (6).
     """
-    return _circular("ball", count, mass, radius, drag, None, own_radius)
+    return _circular("ball", count, mass, radius, drag, None, ball_radius)
 
 
-def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_radius: Number | None = None) -> CircularLoads:
+def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Cylindrical rollers that roll in an annular track, kappa = 3/2.
 
     **Arguments**: as `balls`.
@@ -315,7 +315,7 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, own_rad
 
     Source: as `balls`.
     """
-    return _circular("roller", count, mass, radius, drag, None, own_radius)
+    return _circular("roller", count, mass, radius, drag, None, ball_radius)
 
 
 def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:

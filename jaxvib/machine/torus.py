@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.loads import DRAG, MASS, OWN_RADIUS, DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
+from jaxvib.machine.loads import BALL_RADIUS, DRAG, MASS, DrillingSpin, Loads, NormalForce, require_side_by_side, side_by_side
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 from jaxvib.units import count as whole
@@ -41,7 +41,7 @@ class TorusBalls(Loads):
     gyroscopic matrix of a rotor. On the equator the ball is that of a plane track of radius R + rho.
 
     **Attributes** (scalar, or (count,) for `mass` and `drag`): `mass` m kg; `radius` R m of the tube's middle line; `tube` R_1
-    m, the radius of its cross-section; `own_radius` r m of a ball; `drag` b_W N s/m, viscous resistance of a ball against the
+    m, the radius of its cross-section; `ball_radius` r m of a ball; `drag` b_W N s/m, viscous resistance of a ball against the
     wall it rolls on; `count` N; `kind` "torus_ball".
 
     Source: Strautmanis et al. 2018; the ball's own rotation is derived here from Newton's and Euler's equations.
@@ -52,7 +52,7 @@ class TorusBalls(Loads):
     mass: Array = eqx.field(metadata=MASS)
     radius: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="radius of the torus"))
     tube: Array = eqx.field(metadata=unit("m", low=0.0, open_low=True, words="radius of the tube"))
-    own_radius: Array = eqx.field(metadata=OWN_RADIUS)
+    ball_radius: Array = eqx.field(metadata=BALL_RADIUS)
     drag: Array = eqx.field(metadata=DRAG)
     count: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -60,7 +60,7 @@ class TorusBalls(Loads):
     @property
     def gap(self) -> Array:
         """Radius rho = R_1 - r, m, of the circle in the cross-section on which the ball's centre runs."""
-        return self.tube - self.own_radius
+        return self.tube - self.ball_radius
 
     def _arm(self, a: Array) -> Array:
         return self.radius + self.gap * jnp.sin(a)
@@ -77,7 +77,7 @@ class TorusBalls(Loads):
 
     def offsets(self) -> Array:
         """Return angles side by side on the outer equator, 2 arcsin(r/(R + rho)) apart."""
-        return side_by_side(self.count, self.own_radius / (self.radius + self.gap))
+        return side_by_side(self.count, self.ball_radius / (self.radius + self.gap))
 
     def inertia_factor(self) -> Array:
         """Return 7/5."""
@@ -99,7 +99,7 @@ class TorusBalls(Loads):
 
         s is w cos a for a ball that does not rotate in space.
         """
-        (_, a), (turn, climb), m, own = u, rate, self.mass, self.own_radius
+        (_, a), (turn, climb), m, own = u, rate, self.mass, self.ball_radius
         arm, up = self._arm(a), jnp.sin(a)
         lever = _ROLLING * m * own
         change = climb * (speed * arm - self.radius * turn)
@@ -133,7 +133,7 @@ def torus_balls(
     mass: Number | Sequence[Number],
     radius: Number,
     tube: Number,
-    own_radius: Number,
+    ball_radius: Number,
     drag: Number | Sequence[Number] = 0.0,
 ) -> TorusBalls:
     """Return balls that roll in a tube bent to a ring around the rotor's axis, kappa = 7/5.
@@ -142,14 +142,14 @@ def torus_balls(
     Dry friction is the effect `RollingFriction`, gravity along a vertical axis `Gravity(along="axis")`.
 
     **Arguments**: `count` N; `mass` kg of each, one number or N; `radius` R m of the tube's middle line; `tube` m, radius of
-    its cross-section; `own_radius` r m of a ball, less than `tube`: what is left is the gap in which the ball's angle in the
+    its cross-section; `ball_radius` r m of a ball, less than `tube`: what is left is the gap in which the ball's angle in the
     cross-section moves; `drag` N s/m, viscous resistance against the wall, at the ball's centre, one number or N (0).
 
     **Returns** `TorusBalls`. **Raises** `InputError` for wrong units, values that are not positive, a ball that fills its tube
     or more, a tube wider than its ring, balls that have no room side by side on the outer equator.
 
     >>> import jaxvib as jv
-    >>> loads = jv.torus_balls(count=2, mass="64 g", radius="200 mm", tube="15 mm", own_radius="12.5 mm")
+    >>> loads = jv.torus_balls(count=2, mass="64 g", radius="200 mm", tube="15 mm", ball_radius="12.5 mm")
     >>> round(float(loads.gap), 6)
     0.0025
 
@@ -157,19 +157,19 @@ def torus_balls(
     """
     n = whole(count, "loads.count")
     read = partial(read_numbers, TorusBalls, "loads", n)
-    sizes = read(radius=radius, tube=tube, own_radius=own_radius)
+    sizes = read(radius=radius, tube=tube, ball_radius=ball_radius)
     when_known(partial(_require_room, n), *sizes.values())
     return TorusBalls(**sizes, **read(mass=mass, drag=drag), count=n, kind="torus_ball")
 
 
-def _require_room(count: int, radius: float, tube: float, own_radius: float) -> None:
+def _require_room(count: int, radius: float, tube: float, ball_radius: float) -> None:
     if not tube < radius:
         raise InputError("loads.tube", f"is {tube:.6g} m; it must be less than the ring's radius, {radius:.6g} m")
-    if not own_radius < tube:
-        problem = "leaves no gap" if own_radius == tube else "is larger than the tube"
+    if not ball_radius < tube:
+        problem = "leaves no gap" if ball_radius == tube else "is larger than the tube"
         hint = "give a smaller one, or for balls that only run around the axis balls(...)"
-        raise InputError("loads.own_radius", f"is {own_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
-    require_side_by_side(count, radius + tube - own_radius, own_radius)
+        raise InputError("loads.ball_radius", f"is {ball_radius:.6g} m, which {problem} of {tube:.6g} m radius; {hint}")
+    require_side_by_side(count, radius + tube - ball_radius, ball_radius)
 
 
 TEMPLATE = """# A vertical rotor on one support, with balls in a torus that are to balance it.
@@ -186,7 +186,7 @@ count = 2
 mass = "64 g"               # of one ball
 radius = "200 mm"           # of the tube's middle line
 tube = "15 mm"              # radius of the tube's cross-section
-own_radius = "12.5 mm"      # of a ball; what is left of the tube is the gap in which it rolls up and down
+ball_radius = "12.5 mm"     # of a ball; what is left of the tube is the gap in which it rolls up and down
 # drag = 0.0                # N s/m, viscous resistance against the wall
 
 [drive]

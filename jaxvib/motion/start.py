@@ -59,7 +59,7 @@ def initial_state(
     - `angles`: the loads' angles about the rotor's axis, rad, (count,); or one number for the middle of all loads, in place of
       the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle
     - `apart`: angle between neighbouring loads, rad; loads that touch (`LoadContact`) start so much further apart than side by
-      side. Default: at rest side by side if the loads' `own_radius` is known, otherwise 1 degree; 0 in a jam, whose theory is
+      side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0 in a jam, whose theory is
       about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at exactly one angle
       (`apart=0`) stay at one angle, even where the motion is unstable against their separation
     - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
@@ -119,7 +119,7 @@ def _places(scene: Scene, start: Start, apart: Number | None, *, one_each: bool)
     """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
     n = scene.loads.count
     touching = has_term(scene.effects, LoadInteraction)
-    wide = getattr(scene.loads, "own_radius", None) is not None
+    wide = getattr(scene.loads, "ball_radius", None) is not None
     usual = apart is None and start != "jam"
     side_by_side = not one_each and (touching or (usual and wide))
     if apart is not None:
@@ -150,7 +150,7 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
     wrong shape.
 
     >>> import jax.numpy as jnp, jaxvib as jv
-    >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
+    >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
     >>> scene = jv.Scene(jv.planar_rotor(mass=9.0, stiffness=1e4, damping=9.0), loads, jv.ConstantSpeed(100.0), jv.Sliding(0.1))
     >>> rest = jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.zeros(1),), (jnp.zeros(1),))
     >>> round(float(jv.with_spin(scene, rest, "still").spin.slip[0][0]), 6)        # - w (R + r)
@@ -181,7 +181,7 @@ def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State
         drilling = zero if spin is None else spin.still
         if has_slip:
             assert normal_force is not None
-            own = loads.own_radius  # pyright: ignore[reportAttributeAccessIssue]
+            own = loads.ball_radius  # pyright: ignore[reportAttributeAccessIssue]
             across, up = (x - own * y / loads.mass for x, y in zip(loads.position(*u), normal_force.normal, strict=False))
             along = jax.jvp(loads.position, u, rate)[1]
             relative = (along[0] + w * up, along[1] - w * across, *along[2:])

@@ -202,7 +202,7 @@ class FrontView(View):
         across, up, along = places_of(loads, round_it)
         away = np.hypot(across, up)
         middle = 0.5 * (np.max(away) + np.min(away))
-        own = float(getattr(loads, "own_radius", 0.0))
+        own = float(getattr(loads, "ball_radius", 0.0))
         scale = 0.85 / (0.5 * np.ptp(away) + own)
         centre = np.array([3.2, 0.0])
         found = [Part(circle(tuple(centre), 0.85), {"fc": "white", "ec": "black", "lw": 1.4, "zorder": 3}, True)]

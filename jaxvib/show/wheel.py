@@ -95,7 +95,7 @@ class Wheel:
     def __init__(self, scene: Scene, radius: float):
         self.loads, self.radius = scene.loads, radius
         self.scale = radius / track_radius(scene.loads)
-        own = getattr(scene.loads, "own_radius", None)
+        own = getattr(scene.loads, "ball_radius", None)
         self.size = 0.12 * radius / 0.7 if own is None else max(float(own) * self.scale, 0.05)
         self.rim = radius + max(1.15 * self.size, 0.1)
 

@@ -12,7 +12,7 @@ G, R = 9.81, 0.1
 def started(coefficient, angle):
     """Acceleration, rad/s^2, of a ball at rest on a track in a body too heavy to move."""
     machine = jv.planar_rotor(mass=1e12, stiffness=1e12, damping=0.0)
-    loads = jv.balls(count=1, mass=0.2, radius=R, drag=0.0, own_radius=0.01)
+    loads = jv.balls(count=1, mass=0.2, radius=R, drag=0.0, ball_radius=0.01)
     scene = jv.Scene(machine, loads, jv.ConstantSpeed(1.0), (jv.Gravity(G), jv.Sliding(coefficient)))
     start = jv.with_spin(scene, jv.State(jnp.zeros(2), jnp.zeros(2), (jnp.full(1, angle),), (jnp.zeros(1),)))
     return float(jv.vector_field(scene)(0.0, start).rate[0][0])

@@ -44,7 +44,7 @@ def test_sliders_at_their_starts_change_no_bit(kind):
 
 
 def test_each_slider_moves_its_number_alone():
-    loads = jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5, own_radius="20 mm")
+    loads = jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5, ball_radius="20 mm")
     scene = jv.Scene(jv.two_mass(**TWO_MASS), loads, jv.ConstantSpeed("1500 rpm"))
     before = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(scene)])
     moved = []
@@ -58,7 +58,7 @@ def test_each_slider_moves_its_number_alone():
         moved.append(place)
     assert len(set(moved)) == len(moved) == 9  # four springs and dampers of supports, two of the link, mass, drag, speed
     assert scene_at(scene, {COUNT: 5}).loads.count == 5
-    with pytest.raises(jv.InputError, match=r"loads\.own_radius .* side by side"):
+    with pytest.raises(jv.InputError, match=r"loads\.ball_radius .* side by side"):
         scene_at(scene, {COUNT: 256})
     with pytest.raises(jv.InputError, match=r"machine\.mass is no slider of this scene; there are: drive\.speed"):
         scene_at(scene, {"machine.mass": 3.0})

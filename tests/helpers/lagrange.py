@@ -91,7 +91,7 @@ def residual(s, t, state, field):
             c = kinds["load_contact"]
             for j in range(n):
                 apart = jnp.sqrt(jnp.sum((bob(x, j) - bob(x, (j + 1) % n)) ** 2))
-                total += 0.5 * c.stiffness * jnp.maximum(2.0 * s.loads.own_radius - apart, 0.0) ** 2
+                total += 0.5 * c.stiffness * jnp.maximum(2.0 * s.loads.ball_radius - apart, 0.0) ** 2
         return total
 
     def resisting(x, v):
@@ -141,7 +141,7 @@ def residual(s, t, state, field):
             for j in range(n):
                 apart = lambda y, j=j: jnp.sqrt(jnp.sum((bob(y, j) - bob(y, (j + 1) % n)) ** 2))  # noqa: E731
                 gap, rate = jax.jvp(apart, (x,), (v,))
-                spring = c.stiffness * (2.0 * s.loads.own_radius - gap)
+                spring = c.stiffness * (2.0 * s.loads.ball_radius - gap)
                 press = jnp.maximum(spring - c.damping * rate, 0.0)
                 force += jnp.where(spring > 0.0, press - spring, 0.0) * jax.grad(apart)(x)
         if motor:

@@ -97,5 +97,5 @@ def case(name):
     carried, drive, effects = CASES[name]()
     loads = pendulums()
     if name == "contact":
-        loads = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.2, own_radius=0.015)
+        loads = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.2, ball_radius=0.015)
     return jv.Scene(carried, loads, DRIVES[drive](), effects)

@@ -15,7 +15,7 @@ HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
 
 
 def plane(restitution, stiffness=1e5):
-    loads = jv.balls(count=2, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
+    loads = jv.balls(count=2, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
     return jv.Scene(HEAVY, loads, jv.ConstantSpeed(1.0), (jv.LoadContact(stiffness, restitution=restitution),))
 
 
@@ -33,7 +33,7 @@ def after(s, rates, until, spacing=0.2):
     place = np.stack(jax.vmap(s.loads.position)(*run.trajectory.state.angle))
     n = len(rates)
     apart = [np.linalg.norm(place[:, :, i] - place[:, :, j], axis=0).min() for i in range(n) for j in range(i)]
-    return np.asarray(run.trajectory.state.rate[0]), min(apart) / (2.0 * float(s.loads.own_radius))
+    return np.asarray(run.trajectory.state.rate[0]), min(apart) / (2.0 * float(s.loads.ball_radius))
 
 
 @pytest.mark.parametrize("make", [plane, on_equator])
@@ -87,7 +87,7 @@ def test_restitution_is_read_from_files_and_checked():
     ):
         with pytest.raises(jv.InputError, match=says):
             jv.LoadContact(1e5, **arguments)
-    uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, own_radius=0.0125)
+    uneven = jv.torus_balls(count=2, mass=[0.06, 0.07], radius=0.2, tube=0.015, ball_radius=0.0125)
     with pytest.raises(jv.InputError, match="is for loads of one mass"):
         jv.Scene(HEAVY, uneven, jv.ConstantSpeed(1.0), (jv.LoadContact(1e5, restitution=0.5),))
 
@@ -129,8 +129,8 @@ def test_touching_jammed_balls_have_the_unbalance_of_their_arc():
     """
     own, middle, gap, mass = 0.02, 0.1, 0.005, 0.1
     machine, drive, arm = jv.planar_rotor(mass=10.0, stiffness=4e4, damping=60.0), jv.ConstantSpeed(150.0), middle + gap
-    loads = jv.torus_balls(count=3, mass=mass, radius=middle, tube=own + gap, own_radius=own, drag=0.4)
-    plane = jv.balls(count=3, mass=mass, radius=arm, drag=0.4, own_radius=own)
+    loads = jv.torus_balls(count=3, mass=mass, radius=middle, tube=own + gap, ball_radius=own, drag=0.4)
+    plane = jv.balls(count=3, mass=mass, radius=arm, drag=0.4, ball_radius=own)
     jam = jv.initial_state(jv.Scene(machine, plane, drive), "jam", mode=1)
     place = (jam.angle[0] + 1.1 * plane.offsets(), 0.5 * jnp.pi + jnp.asarray([0.05, -0.05, 0.02]))
     start = jv.State(jam.displacement, jam.velocity, place, (*jam.rate, jnp.zeros(3)))

@@ -139,7 +139,7 @@ def contact():
 
 
 def touching():
-    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, ball_radius=0.01)
     return jv.Scene(jv.rotor(**ROTOR, stations=[0.2, 0.1, -0.1, -0.2]), balls_, jv.ConstantSpeed(1.0), contact())
 
 
@@ -190,7 +190,7 @@ WRONG_ROTORS = {
     "side of a ring": (lambda: rotor_scene(effects=(jv.Stop(1.0, 0.0, side="above", position=0.1),)), r"it must be 'both'"),
     "unknown side": (lambda: jv.Stop(1.0, 0.0, side="left"), r"effects\.stop\.side is 'left'; allowed: above, below, both"),
     "reaction": (lambda: jv.DryFriction(0.1, 0.01, reaction="none"), r"is 'none'; allowed: exact, run_up, steady"),
-    "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their own_radius"),
+    "pendulums in contact": (lambda: rotor_scene(effects=contact()), r"give balls or rollers their ball_radius"),
     "contact of several tracks": (lambda: touching(), r"needs loads on one track; this machine has them at several stations"),
     "twice": (lambda: rotor_scene(effects=(jv.Gravity(), jv.Gravity())), r"names gravity 2 times"),
 }

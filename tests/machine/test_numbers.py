@@ -83,7 +83,7 @@ def test_numbers_are_read_and_put():
         ("machine.stiffness[-1]", "is no number of this scene"),
         ("machine.kind", "is 'three_mass', which is no continuous number"),
         ("loads.count", "is 4, which is no continuous number"),
-        ("loads.own_radius", "is not set in this scene; did you mean"),
+        ("loads.ball_radius", "is not set in this scene; did you mean"),
         (3, "is no name of a number"),
     ],
 )

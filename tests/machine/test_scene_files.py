@@ -86,7 +86,7 @@ def test_scene_file_of_a_rotor_with_every_effect(drive, stations, tmp_path):
     loads_ = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
     s = eqx.tree_at(lambda s: s.drive.speed, jv.Scene(machine_, loads_, drive, EVERY_EFFECT), drive.speed / 3.0)
     same(jv.scene_from_toml(jv.scene_to_toml(s)), s)
-    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, own_radius=0.01)
+    balls_ = jv.balls(count=4, mass=0.05, radius=0.08, drag=0.1, ball_radius=0.01)
     extra = (jv.Stop(1e6, gap=1e-3), jv.LoadContact(stiffness=1e5, damping=2.0))
     plane = jv.Scene(jv.planar_rotor(mass=3.0, stiffness=1e5, damping=0.1), balls_, drive, extra)
     same(jv.load_scene(jv.save_scene(plane, tmp_path / "scene.toml")), plane)

@@ -83,7 +83,7 @@ def test_sliding_ball_starts_to_roll_like_a_rigid_ball():
 def test_plane_track_ball_rolls_at_the_closed_form_speed():
     """f' grows by mu f'^2, the slip by kappa/(kappa-1) as much: it rolls at f0 + (w (1 + r/R) - f0) (kappa-1)/kappa."""
     machine = jv.one_mass(mass=1e12, stiffness=0.0, damping=0.0)
-    loads = jv.rollers(count=1, mass=0.1, radius=0.2, drag=0.0, own_radius=0.01)
+    loads = jv.rollers(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), (jv.Sliding(0.2, 0.05),))
     rest = jv.State(jnp.zeros(1), jnp.zeros(1), (jnp.zeros(1),), (jnp.full(1, 20.0),))
     start = jv.with_spin(s, rest, "still")
@@ -185,7 +185,7 @@ def test_they_go_through_files_named_starts_and_ensembles():
     np.testing.assert_allclose(many.state.angle[1][1], run.trajectory.state.angle[1][-1], rtol=1e-9)
 
 
-PLANE = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1, own_radius=0.01)
+PLANE = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1, ball_radius=0.01)
 POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
 
 
@@ -202,7 +202,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
             lambda: jv.Scene(
                 HEAVY, jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1), jv.ConstantSpeed(1.0), (jv.Sliding(0.1),)
             ),
-            "effects.sliding needs loads that roll, with an own_radius",
+            "effects.sliding needs loads that roll, with a ball_radius",
         ),
         (
             lambda: jv.Scene(HEAVY, balls(), jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1), (jv.FreeSpin(),)),

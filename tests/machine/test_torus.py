@@ -91,7 +91,7 @@ def test_energy_only_falls_with_friction_and_no_drive():
 def test_a_ball_on_the_outer_equator_is_one_of_the_plane_track():
     friction = (jv.StaticImbalance(6.87e-3), jv.RollingFriction(4e-5))
     torus = scene(friction, drag=0.3)
-    plane = jv.balls(count=2, mass=MASS, radius=torus.loads.radius + torus.loads.gap, drag=0.3, own_radius=OWN)
+    plane = jv.balls(count=2, mass=MASS, radius=torus.loads.radius + torus.loads.gap, drag=0.3, ball_radius=OWN)
     plane = jv.Scene(torus.machine, plane, torus.drive, friction)
     state, quarter = some_state(), jnp.full(2, 0.5 * jnp.pi)
     there = jv.State(state.displacement, state.velocity, (state.angle[0], quarter), (state.rate[0], jnp.zeros(2)))
@@ -144,10 +144,10 @@ def test_frequency_about_the_equator_is_the_resolved_one():
 @pytest.mark.parametrize(
     ("build", "says"),
     [
-        (lambda: balls(own_radius=0.02), "loads.own_radius is 0.02 m, which is larger than the tube of 0.015 m"),
-        (lambda: balls(own_radius=0.015), r"which leaves no gap of 0.015 m radius.*balls\(\.\.\.\)"),
+        (lambda: balls(ball_radius=0.02), "loads.ball_radius is 0.02 m, which is larger than the tube of 0.015 m"),
+        (lambda: balls(ball_radius=0.015), r"which leaves no gap of 0.015 m radius.*balls\(\.\.\.\)"),
         (lambda: balls(tube=0.25), "loads.tube is 0.25 m; it must be less than the ring's radius"),
-        (lambda: balls(51), "loads.own_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m have room below"),
+        (lambda: balls(51), "loads.ball_radius is 0.0125 m; 51 side by side on a circle of 0.2025 m have room below"),
         (lambda: balls(mass=0.0), "loads.mass is 0 kg; it must be greater than 0"),
         (lambda: balls(radius="3 kg"), "loads.radius is '3 kg', which is not in m"),
         (lambda: jv.RollingFriction(-1e-5), "effects.rolling_friction.coefficient is -1e-05 m; it must be at least 0"),
@@ -161,7 +161,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
                 scene().drive,
                 (jv.RollingFriction(1e-5),),
             ),
-            "rolling_friction needs loads that roll, with an own_radius",
+            "rolling_friction needs loads that roll, with a ball_radius",
         ),
         (
             lambda: jv.Scene(
@@ -246,7 +246,7 @@ class Sliding(TorusBalls):
 
 def wide_scene(kind=TorusBalls):
     """A wide tube and heavy balls, so that everything acts on everything."""
-    loads = jv.torus_balls(count=2, mass=0.5, radius=0.3, tube=0.15, own_radius=0.05)
+    loads = jv.torus_balls(count=2, mass=0.5, radius=0.3, tube=0.15, ball_radius=0.05)
     loads = kind(**{field.name: getattr(loads, field.name) for field in dataclasses.fields(loads)})
     machine = jv.planar_rotor(mass=4.0, stiffness=6e3, damping=20.0)
     return jv.Scene(machine, loads, jv.ConstantSpeed(30.0), (jv.Gravity(along="axis"),))

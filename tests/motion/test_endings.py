@@ -113,7 +113,7 @@ def test_where_a_run_blew_up_is_said(stiffness):
 
 
 def test_loads_in_contact_start_in_their_order():
-    loads = jv.balls(count=3, mass=0.3, radius=0.1, drag=0.5, own_radius=0.02)
+    loads = jv.balls(count=3, mass=0.3, radius=0.1, drag=0.5, ball_radius=0.02)
     s = jv.Scene(scene("one_mass").machine, loads, jv.ConstantSpeed(60.0), (jv.LoadContact(stiffness=1e5),))
     for angles in ([0.0, 2.0, 1.0], [0.0, 3.0, -2.0], [0.0, 1.0, 7.0], [1.0, 1.0, 2.0]):
         start = eqx.tree_at(lambda y: y.angle, jv.initial_state(s), (jnp.asarray(angles),))

@@ -185,7 +185,7 @@ def test_loads_in_contact_keep_their_order_and_their_distance():
     diameter, stiffness = 0.03, 2e5
     s = jv.Scene(
         jv.planar_rotor(mass=5.0, stiffness=2e4, damping=40.0),
-        jv.balls(count=4, mass=0.1, radius=0.1, drag=0.3, own_radius=0.5 * diameter),
+        jv.balls(count=4, mass=0.1, radius=0.1, drag=0.3, ball_radius=0.5 * diameter),
         jv.ConstantSpeed(60.0),
         (jv.Gravity(), jv.LoadContact(stiffness=stiffness, damping=30.0)),
     )

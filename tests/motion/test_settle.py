@@ -53,7 +53,7 @@ def test_a_stretch_goes_on_where_the_last_one_ended():
 def test_balls_that_touch_settle_side_by_side():
     """They start beside each other, however large they are, and go on in their order: nothing presses them apart."""
     machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=300.0)
-    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, own_radius=0.03)
+    loads = jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5, ball_radius=0.03)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), effects=(jv.LoadContact(1e5, 200.0),))
     run = jv.settle(s, mode=1, drift=1e-3, periods=20, stretches=8)
     angle = np.asarray(run.window.state.angle[0])

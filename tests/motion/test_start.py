@@ -52,7 +52,7 @@ def test_touching_loads_start_a_jam_side_by_side():
     """A start in a jam lays touching loads side by side about the jam's angle."""
     s = jv.Scene(
         jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
-        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15, own_radius=0.005),
+        jv.balls(count=3, mass=0.2, radius=0.1, drag=0.15, ball_radius=0.005),
         jv.ConstantSpeed(60.0),
         (jv.LoadContact(stiffness=1e5),),
     )

@@ -14,7 +14,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import Coordinates, LoadInteraction, Term
-from jaxvib.machine.loads import CircularLoads, Loads, own_radius
+from jaxvib.machine.loads import CircularLoads, Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 from jaxvib.units.known import when_known
@@ -27,7 +27,7 @@ class LoadContact(Effect):
 
         force between centres = max(0, k (2 r - s) - c s'),    s the distance of the centres
 
-    r is the loads' `own_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
+    r is the loads' `ball_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
     follows load j, and load 1 follows the last one a turn later, so that N pairs are all there are. A state to start from has
     its angles in this order, less than a turn apart; the named ones lay loads that are together side by side. Loads with
     several coordinates meet in any pair, s = |p(u_i) - p(u_j)|, and may start where no two are nearer than 0.9 of 2 r.
@@ -43,7 +43,7 @@ class LoadContact(Effect):
     **Arguments**: `stiffness` k N/m; `damping` c N s/m, or in its place `restitution` e, above 0, up to 1.
 
     **Raises** `InputError` for values that are not allowed, for damping beside a restitution, and, by the scene, for loads
-    without an own radius, or with a restitution for loads that differ.
+    without a ball radius, or with a restitution for loads that differ.
 
     >>> import jaxvib as jv
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)
@@ -77,7 +77,7 @@ class LoadContact(Effect):
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads without a size, or at several stations."""
-        own_radius(loads, "effects.load_contact")
+        ball_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
         if not machine.mounting().at_one_point:
@@ -98,7 +98,7 @@ class LoadContact(Effect):
     def _require_apart(self, loads: Loads, u: tuple[Array, ...]) -> None:
         place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
-        wide = 2.0 * np.asarray(own_radius(loads)).reshape(-1, 1, 1)
+        wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
         apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
         if np.min(apart) < _NEAREST:
@@ -150,7 +150,7 @@ class LoadContact(Effect):
 
     def _reduced(self, loads: Loads) -> Array:
         """mu, of the lightest loads where they differ."""
-        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (own_radius(loads) / loads.arm()[0]) ** 2)
+        return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (ball_radius(loads) / loads.arm()[0]) ** 2)
 
 
 _NEAREST = 0.9
@@ -190,7 +190,7 @@ def _loss(ratio: Array) -> Array:
 def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
     """Distances surface to surface, negative where they overlap, between each load and the one so many further, for every such
     number: every pair once."""
-    own = own_radius(loads)
+    own = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u
         ahead = jnp.concatenate([phi[1:], phi[:1] + 2.0 * jnp.pi])

@@ -15,7 +15,7 @@ from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.friction import sliding_sign
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, Friction, Term
-from jaxvib.machine.loads import Loads, own_radius
+from jaxvib.machine.loads import Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
@@ -40,7 +40,7 @@ class RollingFriction(Effect):
 
     The sign of N is that of the motion without this friction.
 
-    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without an own radius.
+    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without a ball radius.
 
     >>> import jaxvib as jv
     >>> jv.RollingFriction("0.04 mm").direction
@@ -72,14 +72,14 @@ class RollingFriction(Effect):
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads that do not roll on a track."""
-        own_radius(loads, "effects.rolling_friction")
+        ball_radius(loads, "effects.rolling_friction")
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
         """Return -(k/r) J^T d and N."""
         normal_force = loads.normal_force(u, rate, g)
         assert normal_force is not None
         slip = (rate[0] - speed, *rate[1:])
-        scale = self.coefficient / own_radius(loads)
+        scale = self.coefficient / ball_radius(loads)
         if self.direction == "each":
             levers = [self._lever(loads, u, i, x) for i, x in enumerate(slip)]
         else:

@@ -11,7 +11,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.base import Effect, Typical
 from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease, Term
-from jaxvib.machine.loads import Loads, own_radius
+from jaxvib.machine.loads import Loads, ball_radius
 from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
@@ -81,7 +81,7 @@ class Sliding(Effect):
 
     **Arguments**: `coefficient` mu (about 0.1 for oiled steel on steel), above 0; `width` m/s.
 
-    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without an own radius and a motor.
+    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without a ball radius and a motor.
 
     >>> import jaxvib as jv
     >>> float(jv.Sliding(0.1).coefficient)
@@ -115,4 +115,4 @@ class Sliding(Effect):
 
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for loads that do not roll."""
-        own_radius(loads, "effects.sliding")
+        ball_radius(loads, "effects.sliding")

@@ -304,7 +304,7 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
     """
     loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
     known = np.isfinite(speeds)
-    if loads.own_radius is not None or has_term(scene.effects, ContactFriction):
+    if loads.ball_radius is not None or has_term(scene.effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     starts = np.where(known, speeds, float(scene.drive.speed))
     found = _growths(scene, jnp.asarray(starts))

@@ -195,7 +195,7 @@ def floquet(
         return jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype)[:, :, None], (size, size, lanes))
 
     loads = model.loads
-    parting = loads.alike and loads.count > 1 and loads.own_radius is None
+    parting = loads.alike and loads.count > 1 and loads.ball_radius is None
     fields, sizes = ((full, apart), (nd + count, 1)) if parting else ((full,), (nd + count,))
 
     def explicit_step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -65,7 +65,7 @@ def jam_orbit(
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
-    that share every number are collected at one point, or side by side where they have an `own_radius` (S is then
+    that share every number are collected at one point, or side by side where they have a `ball_radius` (S is then
     m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other, on the average of a period, the status is
     `held`). Loads that differ have a psi_j each: they take the places next to each other that their torques ask for.
     The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. Where friction

@@ -343,7 +343,7 @@ def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, har
     vibration that holds a jam presses the loads together at every instant.
     """
     loads = model.loads
-    if loads.own_radius is None or loads.count == 1:
+    if loads.ball_radius is None or loads.count == 1:
         return jnp.zeros_like(motion.omega)
     phi, rate = model.each_load(grid.theta[None] + motion.deviation, motion.omega * (1.0 + motion.deviation @ grid.first.T))
     acceleration = synthesized(harmonics.acceleration, grid.synthesis)

@@ -74,9 +74,9 @@ def _arm(scene: Scene) -> float:
     return float(np.mean(scene.loads.arm()))
 
 
-def _own_radius(scene: Scene) -> tuple[float, str] | None:
+def _ball_radius(scene: Scene) -> tuple[float, str] | None:
     """Radius of the loads, or of steel balls of their mass, and its origin; None for loads on bearings."""
-    own = getattr(scene.loads, "own_radius", None)
+    own = getattr(scene.loads, "ball_radius", None)
     if own is not None:
         return float(own), ""
     if scene.loads.has_bearing:
@@ -93,7 +93,7 @@ def _gravity(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
 
 
 def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None:
-    own, n = _own_radius(scene), scene.loads.count
+    own, n = _ball_radius(scene), scene.loads.count
     if own is None or n < 2 or not scene.loads.circular:
         return None
     ratio = own[0] / _arm(scene)
@@ -105,7 +105,7 @@ def _crowding(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
     if not own[1]:
         return None
     lost = 1.0 - math.sin(n * half) / (n * math.sin(half))
-    says = f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and carry this share less: give own_radius"
+    says = f"{own[1]}side by side they fill {100.0 * filled:.3g} % of the track and carry this share less: give ball_radius"
     return _row("loads side by side: 1 - sin(N a)/(N sin a)", lost, accuracy, says)
 
 
@@ -126,7 +126,7 @@ def _friction(scene: Scene, values: Values, accuracy: float) -> NumberRow | None
         lever, of = 0.5 * _BEARING * _BEARING_WIDTH * arm, f"mu2 = {_BEARING:g}, {1e3 * _BEARING_WIDTH * arm:.3g} mm wide"
         says, name = f"of a ball bearing ({of}): dry_friction", "bearing: mu2 (d/2) m R Omega^2 / drag torque"
     else:
-        own = _own_radius(scene)
+        own = _ball_radius(scene)
         assert own is not None
         lever, name = _ROLLING / own[0] * arm, "rolling: k (R/r) m R Omega^2 / drag torque"
         says = f"{own[1]}of steel on steel (k = {1e3 * _ROLLING:g} mm): rolling_friction, or more drag"

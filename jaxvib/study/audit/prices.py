@@ -68,9 +68,9 @@ def prices() -> list[PriceRow]:
     }
     sized = {"count": 1, "mass": 0.1, "radius": 0.2, "drag": 0.1}
     loads: dict[str, Loads] = {
-        "ball": balls(**sized, own_radius=0.02),
+        "ball": balls(**sized, ball_radius=0.02),
         "pendulum": pendulums(**sized),
-        "torus_ball": torus_balls(**sized, tube=0.05, own_radius=0.02),
+        "torus_ball": torus_balls(**sized, tube=0.05, ball_radius=0.02),
     }
     constant = ConstantSpeed(1.0)
 

@@ -234,7 +234,7 @@ def _read(scene: Scene, run: Run, fold: float) -> Values:
 
 
 def _closest(scene: Scene, run: Run) -> float:
-    own, n = getattr(scene.loads, "own_radius", None), scene.loads.count
+    own, n = getattr(scene.loads, "ball_radius", None), scene.loads.count
     if own is None or n < 2:
         return math.nan
     place = [np.asarray(x) for x in scene.loads.position(*run.window.state.angle)]

@@ -146,7 +146,7 @@ def thrown_state(scene: Scene, speed: Number, shift: Array | float = 0.0) -> Sta
     [0.1248, 70.0]
     """
     loads = in_torus(scene.loads, "thrown_state")
-    beside = 2.0 * jnp.arctan2(loads.own_radius, loads.radius)
+    beside = 2.0 * jnp.arctan2(loads.ball_radius, loads.radius)
     zero = jnp.zeros((loads.count,))
     still = jnp.zeros(scene.machine.structure().mass.shape[:1])
     turn = scene.drive.speed * (1.0 + jnp.asarray(speed))

@@ -44,9 +44,9 @@ def scenes() -> dict[str, jv.Scene]:
     one, two, network = (machines()[name] for name in ("one_mass", "two_mass", "network"))
     rotor, planar = jv.rotor(**ROTOR), jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     stations = jv.rotor(**ROTOR, stations=(0.28, 0.25, -0.25, -0.28))
-    equal, sized = jv.balls(**BALLS), jv.balls(**BALLS, own_radius=0.02)
+    equal, sized = jv.balls(**BALLS), jv.balls(**BALLS, ball_radius=0.02)
     pendulums = jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1)
-    torus = jv.torus_balls(count=2, mass=0.11, radius=0.2, tube=0.015, own_radius=0.0145)
+    torus = jv.torus_balls(count=2, mass=0.11, radius=0.2, tube=0.015, ball_radius=0.0145)
     flat = jv.Gravity(along="axis")
     rolling = jv.RollingFriction(3e-5)
     found = {

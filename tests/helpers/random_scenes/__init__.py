@@ -24,7 +24,7 @@ DIMENSIONS = {
     "damping": (0, 1, -1),
     "link_damping": (0, 1, -1),
     "radius": (1, 0, 0),
-    "own_radius": (1, 0, 0),
+    "ball_radius": (1, 0, 0),
     "drag": (0, 1, -1),
     "inertia": (2, 1, 0),
     "speed": (0, 0, -1),

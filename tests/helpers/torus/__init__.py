@@ -11,7 +11,7 @@ SPEED = 140.0
 
 
 def balls(count=2, drag=0.0, **change):
-    return jv.torus_balls(**(dict(count=count, mass=MASS, radius=RADIUS, tube=TUBE, own_radius=OWN, drag=drag) | change))
+    return jv.torus_balls(**(dict(count=count, mass=MASS, radius=RADIUS, tube=TUBE, ball_radius=OWN, drag=drag) | change))
 
 
 def scene(effects=(), count=2, drag=0.0, speed=SPEED, **change):

@@ -25,7 +25,7 @@ def two_balls(drag, speed, mass=0.5):
 
 
 def test_three_balls_balance_a_rotor_unless_at_one_angle():
-    s = three_balls(own_radius=0.011)
+    s = three_balls(ball_radius=0.011)
     apart, one_angle = (jv.simulate(s, 10.0, apart=a, save="window", estimate=False) for a in (None, 0.0))
     assert apart.regime.label == "balanced" and float(apart.foundation_force) < 1.0
     assert one_angle.status_name == "would_separate" and not bool(one_angle.settled) and bool(one_angle.finished)
@@ -49,7 +49,7 @@ def test_loads_start_one_degree_apart_at_rest(given, expected):
 
 
 def test_loads_of_known_size_start_side_by_side():
-    angle = np.asarray(jv.initial_state(three_balls(own_radius=0.011)).azimuth)
+    angle = np.asarray(jv.initial_state(three_balls(ball_radius=0.011)).azimuth)
     np.testing.assert_allclose(np.diff(angle), 2.0 * np.arcsin(0.11), rtol=1e-12)
     np.testing.assert_allclose(np.mean(angle), -np.pi / 2, rtol=1e-12)
 

@@ -340,7 +340,7 @@ def test_the_criterion_is_for_several_loads_that_nothing_pulls():
     machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)
 
     def asked(count, *effects):
-        loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=1.0, own_radius=0.01)
+        loads = jv.balls(count=count, mass=0.5, radius=0.1, drag=1.0, ball_radius=0.01)
         return jv.criterion(jv.Scene(machine, loads, jv.ConstantSpeed(100.0), effects))
 
     with pytest.raises(jv.InputError, match=r"loads\.count is 1; the criterion tells loads that gather"):

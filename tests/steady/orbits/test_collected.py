@@ -92,8 +92,8 @@ def test_gradient_with_gyroscopic_coupling_by_differences():
     np.testing.assert_allclose(jnp.vdot(f(flat)[1], direction), forward, rtol=1e-9)
 
 
-def side_by_side(own_radius=0.02, effects=(), **more):
-    numbers = dict(count=3, mass=0.5, radius=0.1, drag=0.7, own_radius=own_radius)
+def side_by_side(ball_radius=0.02, effects=(), **more):
+    numbers = dict(count=3, mass=0.5, radius=0.1, drag=0.7, ball_radius=ball_radius)
     loads = jv.balls(**{**numbers, **more})
     return jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=60.0), loads, jv.ConstantSpeed(50.0), effects)
 
@@ -146,9 +146,9 @@ def test_loads_side_by_side_in_leading_order_and_files():
     light = jax.tree.map(lambda x: x, eqx.tree_at(lambda s: (s.loads.mass, s.loads.drag), scene, (5e-6, 7e-11)))
     np.testing.assert_allclose(jv.jam_orbit(light, omega=26.0).rotor_speed, jam_rotor_speed(light, 26.0), rtol=1e-5)
     text = jv.scene_to_toml(scene)
-    assert "own_radius = 0.02" in text and "own_radius" not in jv.scene_to_toml(side_by_side(own_radius=None))
+    assert "ball_radius = 0.02" in text and "ball_radius" not in jv.scene_to_toml(side_by_side(ball_radius=None))
     assert eqx.tree_equal(jv.scene_from_toml(text), scene)
-    assert jv.jam_modes(scene).select(1).amplitude < jv.jam_modes(side_by_side(own_radius=None)).select(1).amplitude
+    assert jv.jam_modes(scene).select(1).amplitude < jv.jam_modes(side_by_side(ball_radius=None)).select(1).amplitude
 
 
 def test_loads_that_would_have_to_pull_are_not_stable():
@@ -175,12 +175,12 @@ def test_contact_forces_are_those_that_trailing_loads_need():
 
 
 def test_loads_side_by_side_need_room_and_one_size():
-    with pytest.raises(jv.InputError, match=r"own_radius is 0\.09 m; 3 side by side .* below 0\.0866025 m"):
-        side_by_side(own_radius=0.09)
+    with pytest.raises(jv.InputError, match=r"ball_radius is 0\.09 m; 3 side by side .* below 0\.0866025 m"):
+        side_by_side(ball_radius=0.09)
     with pytest.raises(jv.InputError, match="share every number"):
         side_by_side(mass=[0.5, 0.5, 0.6])
-    with pytest.raises(jv.InputError, match=r"own_radius"):
-        side_by_side(own_radius=-0.01)
+    with pytest.raises(jv.InputError, match=r"ball_radius"):
+        side_by_side(ball_radius=-0.01)
 
 
 def test_gyroscopic_modes_have_no_numbers():

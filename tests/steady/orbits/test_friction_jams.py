@@ -121,7 +121,7 @@ def test_gradient_by_the_coefficient_by_differences():
 
 def test_friction_of_loads_side_by_side_depends_on_their_place():
     """Each load for itself, at its own place on the arc; by differences of the sum."""
-    loads = jv.balls(count=3, mass=0.5, radius=0.1, drag=0.7, own_radius=0.02)
+    loads = jv.balls(count=3, mass=0.5, radius=0.1, drag=0.7, ball_radius=0.02)
     scene = scene_of(loads, RollingFriction(0.1, diameter=0.02), jv.Gravity())
     phi, rate, a, n = jnp.asarray([[0.3]]), jnp.asarray([[20.0]]), jnp.asarray([[40.0]]), jnp.asarray(50.0)
 

@@ -267,7 +267,7 @@ def test_numbers_are_those_of_the_equations():
     scene = jv.Scene(SCENE.machine, heavy, SCENE.drive)
     rows = {row.name.partition(":")[0]: row for row in dimensionless_numbers(scene, values, 0.01)}
     radius = (3.0 / (4.0 * np.pi * 7850.0)) ** (1.0 / 3.0)
-    sized = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5, own_radius=radius)
+    sized = jv.balls(count=5, mass=1.0, radius=0.1, drag=0.5, ball_radius=radius)
     np.testing.assert_allclose(rows["loads side by side"].value, 1.0 - sized.unbalance() / heavy.unbalance(), rtol=1e-9)
     assert rows["loads side by side"].advice == "perhaps needed" and "31.2 mm" in rows["loads side by side"].says
     rolling = jv.RollingFriction(3e-5)

@@ -62,7 +62,7 @@ def _contact(until: float, start: Start) -> Callable[[Scene], Reference]:
 
     def reference(scene: Scene) -> Reference:
         p, effect = reference_model(scene), next(e for e in scene.effects if e.kind == "load_contact")
-        own, radius = (number_of(scene.loads, name) for name in ("own_radius", "radius"))
+        own, radius = (number_of(scene.loads, name) for name in ("ball_radius", "radius"))
         k, c = number_of(effect, "stiffness"), number_of(effect, "damping")
 
         def gap(y: np.ndarray, pair: int) -> tuple[float, float, float]:
@@ -176,7 +176,7 @@ def _one(*effects: Effect, drive: Drive | None = None, drag: float = 0.5) -> Sce
 
 def _two_balls(stiffness: float, damping: float) -> Scene:
     machine = one_mass(mass=50.0, stiffness=4e4, damping=100.0)
-    loads = balls(count=2, mass=0.5, radius=0.1, drag=2.0, own_radius=0.02)
+    loads = balls(count=2, mass=0.5, radius=0.1, drag=2.0, ball_radius=0.02)
     return Scene(machine, loads, ConstantSpeed(20.0), (Gravity(), LoadContact(stiffness=stiffness, damping=damping)))
 
 

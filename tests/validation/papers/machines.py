@@ -87,7 +87,7 @@ def published_torus(
     body = mass - 2.0 * ball
     return Scene(
         planar_rotor(mass=body, stiffness=stiffness * mass * TORUS_SPEED**2, damping=damping * mass * TORUS_SPEED),
-        torus_balls(count=2, mass=ball, radius=RADIUS, tube=TUBE, own_radius=own),
+        torus_balls(count=2, mass=ball, radius=RADIUS, tube=TUBE, ball_radius=own),
         ConstantSpeed(TORUS_SPEED),
         (
             Gravity(0.5005 * ECCENTRICITY * TORUS_SPEED**2, along="axis"),

@@ -112,7 +112,8 @@ class PrintedTorus(eqx.Module):
         cos, sin = jnp.cos(w * t), jnp.sin(w * t)
         arm = r + gap * up
         whole = self.machine.mass + loads.count * m
-        pressed = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0) * self.friction / loads.own_radius
+        normal = jnp.maximum(self.gravity * across + r * turn**2 * up + gap * climb**2, 0.0)
+        pressed = normal * self.friction / loads.ball_radius
         slow = pressed * (r + loads.tube * up) / r**2 * jnp.tanh((turn - w) / (_TURN_WIDTH * w))
         stop = pressed * self.lever / gap**2 * jnp.tanh(gap * climb / (_CLIMB_WIDTH * ECCENTRICITY * w))
         lead_sin, lead_cos = s * cos - c * sin, c * cos + s * sin

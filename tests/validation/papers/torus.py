@@ -16,7 +16,7 @@ from jaxvib.equations.dynamics import Dynamics, State, vector_field
 from jaxvib.equations.forces import normal_force
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
-from jaxvib.machine.loads import balls, own_radius
+from jaxvib.machine.loads import ball_radius, balls
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.torus import in_torus
 from papers.machines import RADIUS, published_torus
@@ -48,13 +48,13 @@ def _up(field: Dynamics | PrintedTorus) -> float:
 
 
 def _angle_of_touching_balls() -> float:
-    own = float(in_torus(_SCENE.loads, "the paper").own_radius)
-    first, second = balls(count=2, mass=0.05, radius=RADIUS, drag=0.0, own_radius=own).offsets()
+    own = float(in_torus(_SCENE.loads, "the paper").ball_radius)
+    first, second = balls(count=2, mass=0.05, radius=RADIUS, drag=0.0, ball_radius=own).offsets()
     return float(second - first)
 
 
 def _half_angle(inverse: Callable[[float], float]) -> float:
-    return inverse(float(in_torus(_SCENE.loads, "the paper").own_radius) / RADIUS)
+    return inverse(float(in_torus(_SCENE.loads, "the paper").ball_radius) / RADIUS)
 
 
 def _pull(model: Callable[[Scene], PrintedTorus]) -> float:
@@ -70,7 +70,7 @@ def _own_pull() -> float:
 
 def _friction_ratio() -> float:
     friction = next(e for e in _SCENE.effects if isinstance(e, RollingFriction))
-    return float(friction.coefficient) / float(own_radius(_SCENE.loads))
+    return float(friction.coefficient) / float(ball_radius(_SCENE.loads))
 
 
 def _braking(model: Callable[[Scene], PrintedTorus]) -> float:

@@ -57,7 +57,7 @@ def _touching(run: _Runs) -> tuple[Scene, State]:
     scene, state = _alone(run)
     # At the paper's angle the balls would overlap by 0.2 % of their size.
     loads = in_torus(scene.loads, "the table")
-    ratio = loads.own_radius / loads.radius
+    ratio = loads.ball_radius / loads.radius
     apart = 2.0 * (jnp.arcsin(ratio) - jnp.arctan(ratio))
     state = eqx.tree_at(lambda s: s.angle[0], state, state.angle[0] + jnp.asarray([0.0, 1.0]) * apart)
     return Scene(scene.machine, scene.loads, scene.drive, (*scene.effects, CONTACT)), state
