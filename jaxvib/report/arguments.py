@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import re
 from collections.abc import Callable, Mapping
@@ -10,6 +9,7 @@ from typing import NamedTuple
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
+from jaxvib.machine.numbers import number_specs
 
 __all__ = ["GROUPS", "Argument", "arguments_of", "described", "units_of_fields"]
 
@@ -33,74 +33,29 @@ class Argument(NamedTuple):
     allowed: tuple[str, ...]
 
 
-class _Probe:
-    """A quantity that notes in which unit it is read."""
-
-    def __init__(self, value: float) -> None:
-        self.value = value
-        self.unit: str | None = None
-
-    def m_as(self, units: str, /) -> float:
-        self.unit = "" if units == "dimensionless" else units
-        return self.value
-
-    def unit_items(self) -> tuple[tuple[str, int], ...]:
-        return ()
-
-
 def arguments_of(build: Callable[..., object]) -> list[Argument]:
-    """The arguments of what builds a part of a scene, such as `jv.balls`.
+    """Return the arguments of the class or function that builds a part of a scene, such as `jv.balls`.
 
-    The units are those in which it reads them: it is given quantities that note what they are asked for.
+    Units are those of the part's fields of the same names.
 
     >>> import jaxvib as jv
     >>> [(a.name, a.unit, a.needed, a.default) for a in arguments_of(jv.Stop)][1:3]
     [('gap', 'm', True, None), ('damping', 'N s/m', False, '0.0')]
     """
-    parameters = inspect.signature(build).parameters
-    numeric = [name for name, p in parameters.items() if _numeric(str(p.annotation))]
-    needed = {name for name, p in parameters.items() if p.default is p.empty}
-    units: dict[str, str] = {}
-    works = 1  # how many numbers a list of those that are needed has
-    # Numbers that descend make parts whose sizes must; options are asked for one at a time, since some exclude each other.
-    for option in (None, *(name for name in numeric if name not in needed)):
-        for several in (1, 2, 3):
-            names = [name for name in numeric if name in needed or name == option]
-            probes = {
-                name: [
-                    _Probe(0.5 ** (k + 1) * (j + 1.0)) for j in range(several if name == option or option is None else works)
-                ]
-                for k, name in enumerate(names)
-            }
-            listed = {name: str(parameters[name].annotation).startswith("Sequence") for name in names}
-            given = {n: _example(p, several) for n, p in parameters.items() if n not in numeric}
-            given |= {n: each if listed[n] else each[0] for n, each in probes.items()}
-            # What these numbers make may be no machine; the units are read before that is seen.
-            with contextlib.suppress(InputError, TypeError, ValueError):
-                build(**given)
-            for name, each in probes.items():
-                read = list(dict.fromkeys(probe.unit for probe in each if probe.unit is not None))
-                if len(read) > len(units.get(name, "").split(", ")) or (read and name not in units):
-                    units[name] = ", ".join(read)
-            if option is None and all(name in units for name in names):
-                works = several
-                break
-    found = []
-    for name, parameter in parameters.items():
+    specs, found = number_specs(_part_of(build)), []
+    for name, parameter in inspect.signature(build).parameters.items():
         default = None if parameter.default in (parameter.empty, None) else _shown(parameter.default)
-        found.append(Argument(name, units.get(name, ""), name in needed, default, _choices(build, parameter)))
+        unit = specs[name].unit if name in specs else ""
+        found.append(Argument(name, unit, parameter.default is parameter.empty, default, _choices(build, parameter)))
     return found
 
 
-def _numeric(annotation: str) -> bool:
-    return re.search(r"\bNumbers?\b", annotation) is not None
-
-
-def _example(parameter: inspect.Parameter, several: int) -> object:
-    """A value that the part accepts, for an argument that is no number with a unit."""
-    if "Sequence[int]" in str(parameter.annotation):
-        return [(1, 2), (2, 3), (1, 3)] if several == 3 else []
-    return 2 if parameter.default is parameter.empty else parameter.default
+def _part_of(build: Callable[..., object]) -> type:
+    """Return the class of the part that a class or a function builds."""
+    if isinstance(build, type):
+        return build
+    function = inspect.unwrap(build)
+    return function.__globals__[function.__annotations__["return"]]
 
 
 def _choices(build: Callable[..., object], parameter: inspect.Parameter) -> tuple[str, ...]:

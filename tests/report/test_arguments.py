@@ -1,0 +1,72 @@
+"""Arguments of the parts of scene files, with their units written by hand."""
+
+import pytest
+
+import jaxvib as jv
+from jaxvib.report.arguments import GROUPS, arguments_of, described, units_of_fields
+
+PLATFORMS = {"mass": "kg", "stiffness": "N/m", "damping": "N s/m"}
+LINKED = PLATFORMS | {"link_stiffness": "N/m", "link_damping": "N s/m"}
+INERTIA = {"transverse_inertia": "kg m^2", "polar_inertia": "kg m^2"}
+TERMS = {"stiffness_terms": "N/m, N, N m", "damping_terms": "N s/m, N s, N m s"}
+LOADS = {"mass": "kg", "radius": "m", "drag": "N s/m"}
+UNITS = {
+    "machines": {
+        "one_mass": PLATFORMS,
+        "two_mass": LINKED,
+        "three_mass": LINKED,
+        "network": LINKED,
+        "planar_rotor": PLATFORMS,
+        "rotor": PLATFORMS | INERTIA | TERMS | {"position": "m", "stations": "m"},
+    },
+    "loads": {
+        "ball": LOADS | {"own_radius": "m"},
+        "roller": LOADS | {"own_radius": "m"},
+        "pendulum": LOADS | {"inertia": "kg m^2"},
+        "torus_ball": LOADS | {"tube": "m", "own_radius": "m"},
+    },
+    "drives": {
+        "constant_speed": {"speed": "rad/s"},
+        "spin_up": {"speed": "rad/s", "duration": "s"},
+        "run_up": {"speed": "rad/s", "acceleration": "rad/s^2"},
+        "dc_motor": {"speed": "rad/s", "stall_torque": "N m", "inertia": "kg m^2"},
+        "induction_motor": {"speed": "rad/s", "breakdown_torque": "N m", "inertia": "kg m^2"},
+    },
+    "effects": {
+        "gravity": {"g": "m/s^2"},
+        "static_imbalance": {"moment": "kg m", "angle": "rad"},
+        "moment_imbalance": {"moment": "kg m^2", "angle": "rad"},
+        "dry_friction": {"diameter": "m", "width": "rad/s"},
+        "rolling_friction": {"coefficient": "m", "width": "m/s"},
+        "cubic_support": {"stiffness": "N/m^3", "position": "m"},
+        "stop": {"stiffness": "N/m", "gap": "m", "damping": "N s/m", "position": "m"},
+        "load_contact": {"stiffness": "N/m", "damping": "N s/m"},
+        "free_spin": {},
+        "sliding": {"width": "m/s"},
+    },
+}
+
+
+@pytest.mark.parametrize(("group", "kind"), [(group, kind) for group, kinds in UNITS.items() for kind in kinds])
+def test_every_number_of_a_part_has_its_unit(group, kind):
+    listed = {argument.name: argument.unit for argument in arguments_of(described(group, kind)) if argument.unit}
+    assert listed == UNITS[group][kind]
+    section = {"machines": "machine", "loads": "loads", "drives": "drive", "effects": "effects"}[group]
+    assert {name: unit for name, unit in units_of_fields(section, kind).items() if unit} == listed
+
+
+def test_parts_are_those_of_the_list():
+    assert {group: set(kinds) for group, kinds in GROUPS.items()} == {group: set(kinds) for group, kinds in UNITS.items()}
+
+
+def test_needed_arguments_have_no_default():
+    by_name = {argument.name: argument for argument in arguments_of(described("effects", "stop"))}
+    assert [name for name, argument in by_name.items() if argument.needed] == ["stiffness", "gap"]
+    assert by_name["side"].default == "both" and by_name["position"].default is None
+
+
+@pytest.mark.parametrize(("group", "name", "field"), [("machine", "rotor", "group"), ("machines", "rotors", "name")])
+def test_an_unknown_part_is_refused(group, name, field):
+    with pytest.raises(jv.InputError, match=rf"^{field} is '.*'; did you mean '(machines|rotor)'"):
+        described(group, name)
+    assert units_of_fields("machine", "nothing") == {}
