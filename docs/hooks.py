@@ -55,7 +55,8 @@ def on_config(config):
 def on_files(files, config):
     """The pages of the reference, which are written nowhere else, and those that stand elsewhere."""
     for page, source in INCLUDED.items():
-        text = (ROOT / source).read_text(encoding="utf-8").replace("](jaxvib/ode/README.md)", "](engine.md)")
+        text = (ROOT / source).read_text(encoding="utf-8")
+        text = text.replace("](jaxvib/ode/README.md)", "](engine.md)").replace("](docs/", "](")
         files.append(File.generated(config, page, content=text))
     for name, content in _pictures().items():
         files.append(File.generated(config, f"made/{name}", content=content))
