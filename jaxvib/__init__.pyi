@@ -32,7 +32,8 @@ from jaxvib.machine.files import load_scene, save_scene, scene_from_toml, scene_
 from jaxvib.machine.scene import Scene
 
 # The equations
-from jaxvib.equations.dynamics import Spin, State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import Spin, State
 from jaxvib.equations.forces import energy, foundation_force, normal_force, power
 from jaxvib.equations.linear import natural_frequencies
 from jaxvib.motion.start import initial_state, with_spin

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import call_user, validated
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import jammed_loads, require_drag
+from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene

@@ -44,8 +44,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import LinearModel, linear_model, turning_loads
+from jaxvib.equations.state import State
 from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.terms import GravityField, LoadPotential
 from jaxvib.machine.loads import CircularLoads

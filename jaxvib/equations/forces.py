@@ -11,8 +11,10 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import Dynamics, State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.exciter import Exciter
 from jaxvib.equations.sliding import contact_force, dot, kinematics
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import terms_of, total_gravity
 from jaxvib.machine.effects.terms import (
@@ -125,7 +127,7 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
     taken = loads.resistance(state.angle, state.rate, speed)
     g = total_gravity(scene.effects)
     lost = [state.velocity @ carrier.damping @ state.velocity]
-    sliding, spun = _spin_power(field, state, change, at_load, speed)
+    sliding, spun = _spin_power(field.exciters[0], state, change, at_load, speed)
     for term in terms_of(scene.effects, ContactFriction):
         rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
         taken = (*(f + r for f, r in zip(taken, rubbing, strict=False)), *taken[len(rubbing) :])
@@ -147,11 +149,11 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
 
 
 def _spin_power(
-    field: Dynamics, state: State, change: State, at_load: Mapping[int, Array], speed: Array
+    exciter: Exciter, state: State, change: State, at_load: Mapping[int, Array], speed: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
     """The rates of the coordinates that a load's slip makes up for; what the rotor puts into loads that spin and slide, and
     what sliding takes, W, but for the friction of rolling."""
-    loads, spin, zero = field.loads, state.spin, jnp.zeros(())
+    loads, spin, zero = exciter.loads, state.spin, jnp.zeros(())
     if spin is None:
         return (), (zero, zero)
     u, rate = state.angle, state.rate
@@ -163,7 +165,7 @@ def _spin_power(
     if spin.slip is not None:
         found = kinematics(loads, u, rate)
         rates = tuple(c / size for c, size in zip(spin.slip, found.sizes, strict=True))
-        contact = contact_force(loads, found, change.rate, at_load, field.centre_forces(state, speed), 1.0)
+        contact = contact_force(loads, found, change.rate, at_load, exciter.centre_forces(state, speed), 1.0)
         lost = -jnp.sum(dot(contact, spin.slip))
         turning = loads.spin_force(u, rate, speed)
         if turning is not None:

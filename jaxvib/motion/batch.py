@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory
 from jaxvib.motion.analysis.regime import Regime, regime

@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import call_user, validated
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import total_gravity
 from jaxvib.machine.scene import Scene

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import Spin, State, vector_field
+from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.state import Spin, State
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction

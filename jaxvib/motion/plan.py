@@ -20,7 +20,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import call_user
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import allowed_unknowns, validate_scene

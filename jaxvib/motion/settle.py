@@ -10,8 +10,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import linear_model
+from jaxvib.equations.state import State
 from jaxvib.errors import ComputationError, InputError, quoted
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene

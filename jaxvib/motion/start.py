@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import Spin, State
 from jaxvib.equations.sliding import dot, kinematics
+from jaxvib.equations.state import Spin, State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.drive import SpinUp
 from jaxvib.machine.effects.base import has_term, terms_of

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import linear_model
 from jaxvib.equations.sliding import kinematics
+from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.numerics.linalg import hermitian_modes, relative_to

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.ode.dopri8 import UnrolledDopri8, ravel
 from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.ode.scalar_programs import fenced

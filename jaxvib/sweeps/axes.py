@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import suggest_name
 from jaxvib.machine.numbers.named import NamedNumber, find_number, put_numbers

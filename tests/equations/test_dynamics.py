@@ -11,7 +11,7 @@ from scenes import loads, machines, published, scene
 from stored_jit import stored_jit
 
 import jaxvib as jv
-from jaxvib.equations.dynamics import Dynamics
+from jaxvib.equations.exciter import Exciter
 from jaxvib.equations.sliding import kinematics
 
 
@@ -155,13 +155,13 @@ def test_scene_without_effects_traces_as_if_there_were_none(monkeypatch):
         return str(jax.make_jaxpr(lambda t, y: jv.vector_field(s)(t, y))(0.0, state))
 
     whole = program()
-    dynamics = Dynamics
-    monkeypatch.setattr(dynamics, "_friction", lambda self, state, speed: [])
-    monkeypatch.setattr(dynamics, "_throw", lambda self, t, state: None)
-    monkeypatch.setattr(dynamics, "_with_rotor", lambda self, part, throw, speed: (part.weight, part.reaction, None))
-    monkeypatch.setattr(dynamics, "_at_loads", lambda self, a: dict(zip(self.axes, a, strict=True)))
-    monkeypatch.setattr(dynamics, "_total", lambda self, values, *arms: jnp.sum(jnp.broadcast_to(values, (s.loads.count,))))
-    monkeypatch.setattr("jaxvib.equations.dynamics.terms_of", lambda effects, *kinds: [])
+    monkeypatch.setattr(Exciter, "_add_friction", lambda self, drag, contact: (drag, contact.force, [{}]))
+    monkeypatch.setattr(Exciter, "_imbalance", lambda self, t, state: None)
+    monkeypatch.setattr(Exciter, "_add_rotor", lambda self, motion, mass, reaction, drag, coupling: (mass, reaction, None))
+    monkeypatch.setattr(Exciter, "at_loads", lambda self, a: dict(zip(self.axes, a, strict=True)))
+    monkeypatch.setattr(Exciter, "_total", lambda self, values, *arms: jnp.sum(jnp.broadcast_to(values, (s.loads.count,))))
+    for module in ("dynamics", "exciter"):
+        monkeypatch.setattr(f"jaxvib.equations.{module}.terms_of", lambda effects, *kinds: [])
     assert program() == whole
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 from scenes import scene
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.motion.run import RunStatus
 from jaxvib.runtime.structure import Undescribable, describe, rebuild
 from jaxvib.steady.jams.folds import Pieces

@@ -8,7 +8,7 @@ from papers.machines import published_torus
 from papers.printed_torus import TABLES, cosine_torus, gap_torus, printed_torus
 from papers.torus_tables import published_tables
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.study.capture.refinement import steps_per_second
 
 

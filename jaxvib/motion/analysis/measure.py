@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.forces import foundation_force
+from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
 from jaxvib.ode.scalarize import scalarized_vmap

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import Spin, State
+from jaxvib.equations.state import Spin, State
 from jaxvib.machine.effects.base import has_term, terms_of
 from jaxvib.machine.effects.terms import DrillingSpinRelease, RotorImbalance, SlipRelease
 from jaxvib.machine.scene import Scene

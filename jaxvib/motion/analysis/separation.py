@@ -21,7 +21,8 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import expm
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import LoadInteraction
 from jaxvib.machine.scene import Scene

@@ -17,8 +17,8 @@ from jaxtyping import PyTree
 
 from jaxvib.boundary import validated
 from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_growth, averaged_loads
-from jaxvib.equations.dynamics import State
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import LoadPotential

@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
 from jaxvib.equations.linear import circular_loads, linear_model
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.drive import ConstantSpeed
 from jaxvib.machine.scene import Scene

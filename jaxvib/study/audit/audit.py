@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.scene import Scene

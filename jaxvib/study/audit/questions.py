@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvib.equations.collected import COLLECTED_TERMS, require_collected
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis import measure

@@ -13,7 +13,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import SlipRelease

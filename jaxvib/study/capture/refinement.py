@@ -16,7 +16,8 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.ensemble import Equations, field_of
 from jaxvib.motion.integrate import effects_rate

@@ -14,7 +14,7 @@ from jax import Array
 from hard_cases.case import Answer, Case, Reference
 from hard_cases.reference_integration import Outcome, run_out
 from hard_cases.reference_model import light_modes, light_speed, platforms, reference_model
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.run import Run
 from jaxvib.motion.simulate import simulate

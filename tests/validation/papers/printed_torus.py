@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import State
+from jaxvib.equations.state import State
 from jaxvib.machine.effects.base import Gravity, StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.rotor import PlanarRotor

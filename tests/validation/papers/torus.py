@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import Dynamics, State, vector_field
+from jaxvib.equations.dynamics import Dynamics, vector_field
 from jaxvib.equations.forces import normal_force
+from jaxvib.equations.state import State
 from jaxvib.machine.effects.base import StaticImbalance
 from jaxvib.machine.effects.rolling import RollingFriction
 from jaxvib.machine.loads import ball_radius, balls

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import State, vector_field
+from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.state import State
 from jaxvib.machine.effects.contact import LoadContact
 from jaxvib.machine.effects.spin import FreeSpin
 from jaxvib.machine.scene import Scene

@@ -1,0 +1,344 @@
+"""One exciter of a machine: its loads and its rotor, eliminated from the equations of motion.
+
+With J = p'(u), c = (dJ/dt) u', H = kappa m J^T J and r = Q_u - kappa m J^T c a load obeys u'' = H^-1 (r - E a), a the
+acceleration of the point that carries it. It pushes that point with -(W a + g), W = m 1 - m J H^-1 E, g = m (J H^-1 r + c).
+E is m J^T, less the part of a friction that is proportional to the normal force of the load. A motor's rotor that is out of
+balance is one more such body. The sums over all loads, with their levers on the rows of the mount, are the added mass and the
+reaction of the exciter: the machine feels nothing else of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.sliding import (
+    ContactSolution,
+    Kinematics,
+    contact_force,
+    dot,
+    kinematics,
+    resolve_contact,
+    slip_rates,
+    total,
+)
+from jaxvib.equations.state import Spin, State
+from jaxvib.errors import InputError
+from jaxvib.machine.drive import Drive
+from jaxvib.machine.effects.base import Effect, has_term, terms_of, total_gravity
+from jaxvib.machine.effects.terms import (
+    ContactFriction,
+    DrillingSpinRelease,
+    Friction,
+    LoadInteraction,
+    LoadPotential,
+    LoadResistance,
+    RotorImbalance,
+    SlipRelease,
+)
+from jaxvib.machine.loads import DrillingSpin, Loads
+from jaxvib.machine.mount import scaled
+from jaxvib.numerics.linalg import small_inverse
+
+__all__ = ["Eliminated", "Exciter", "ExciterRates", "Motion"]
+
+Axes = dict[int, Array]
+"""A vector (count,) for each axis, 0 across and 1 up."""
+
+
+class Motion(NamedTuple):
+    """Motion of an exciter as far as it is known before the accelerations.
+
+    **Attributes**: `state`; the rotor's `speed`; `kinematics` of the loads; `imbalance` of the rotor, see `Exciter._imbalance`;
+    `drag` (count,), the torque of the rotor; `rolling`, the forces on loads that all roll.
+    """
+
+    state: State
+    speed: Array
+    kinematics: Kinematics
+    imbalance: tuple[list[Array], list[Array]] | None
+    drag: Array
+    rolling: ContactSolution
+
+
+class Eliminated(NamedTuple):
+    """An exciter without the accelerations of its own parts; a are those of the rows of the mount.
+
+    **Attributes**: loads move with u'' = `rate_without_carrier` - `accelerance` . a_j, a_j at each load, by axis; the exciter
+    pushes the rows with -(`added_mass` a + `reaction`); the rotor of a motor moves with theta'' = `rotor`[0] - `rotor`[1] . a,
+    None under an ideal drive.
+    """
+
+    rate_without_carrier: tuple[Array, ...]
+    accelerance: dict[int, tuple[Array, ...]]
+    added_mass: Sequence[Sequence[Array | float]]
+    reaction: Sequence[Array | float]
+    rotor: tuple[Array, list[Array]] | None
+
+    def change(self, a: Axes) -> tuple[Array, ...]:
+        """Return u'' from the accelerations of the points that carry the loads."""
+        return tuple(
+            f - sum(self.accelerance[axis][i] * x for axis, x in a.items()) for i, f in enumerate(self.rate_without_carrier)
+        )
+
+
+class ExciterRates(NamedTuple):
+    """Time derivative of the exciter's part of a `State`, in the order of its fields."""
+
+    angle: tuple[Array, ...]
+    rate: tuple[Array, ...]
+    rotor: tuple[Array, Array] | None
+    spin: Spin | None
+
+
+class Exciter(eqx.Module):
+    """Loads, drive and effects of one exciter.
+
+    **Attributes**: `levers` of the loads and `rotor_levers`, see `Mount`; `effects`, prepared for the loads; `axes` of the
+    mount; `row_count`, the number of entries of the mount's rows that move loads or an unbalanced rotor.
+    """
+
+    levers: tuple[Array | None, ...]
+    rotor_levers: tuple[Array | None, ...]
+    loads: Loads
+    drive: Drive
+    effects: tuple[Effect, ...]
+    axes: tuple[int, ...] = eqx.field(static=True)
+    row_count: int = eqx.field(static=True)
+
+    @property
+    def can_slide(self) -> bool:
+        """True if an effect lets loads slide."""
+        return has_term(self.effects, SlipRelease)
+
+    def motion(self, t: Array, state: State, speed: Array) -> Motion:
+        """Return everything that is known before the accelerations, the rotor turning at `speed`."""
+        imbalance = self._imbalance(t, state)
+        found = kinematics(self.loads, state.angle, state.rate)
+        drag, force = self._forces(state, speed)
+        g = total_gravity(self.effects)
+        terms = terms_of(self.effects, ContactFriction)
+        rubbing = (term.friction(self.loads, state.angle, state.rate, speed, g) for term in terms)
+        friction = [each.signed({}) if each.normal is None else each for each in rubbing]
+        return Motion(state, speed, found, imbalance, drag, ContactSolution(self.loads.inertia_factor(), force, friction))
+
+    def eliminate(self, motion: Motion, contact: ContactSolution) -> Eliminated:
+        """Solve loads and rotor for their own accelerations. The friction of `contact` is linear in the accelerations."""
+        loads, axes, found = self.loads, self.axes, motion.kinematics
+        drag, force, coupling = self._add_friction(motion.drag, contact)
+        m = loads.mass
+        inertia = contact.kappa * m
+        solve = small_inverse([[inertia * g for g in row] for row in found.metric])
+        if found.turning is not None:
+            force = [f - inertia * turned for f, turned in zip(force, found.turning, strict=True)]
+        free = solve(tuple(force))
+        rows = {axis: [m * column[axis] for column in found.columns] for axis in axes}
+        rows = {axis: [r - p[axis] if p else r for r, p in zip(row, coupling, strict=True)] for axis, row in rows.items()}
+        accelerance = {axis: solve(tuple(row)) for axis, row in rows.items()}
+        added_mass, reaction = self._felt_by_mount(found, free, accelerance)
+        added_mass, reaction, rotor = self._add_rotor(motion, added_mass, reaction, drag, coupling[0])
+        return Eliminated(free, accelerance, added_mass, reaction, rotor)
+
+    def at_loads(self, a: Sequence[Array]) -> Axes:
+        """Return the accelerations of the points that carry the loads, from those of the mount's rows."""
+        n = len(self.axes)
+        moved = (a[k : k + n] for k in range(0, len(a), n))
+        terms = [[scaled(lever, x) for x in row] for lever, row in zip(self.levers, moved, strict=False)]
+        return {axis: total(row[k] for row in terms) for k, axis in enumerate(self.axes)}
+
+    def slide(self, motion: Motion, contact: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ContactSolution:
+        """Decide which loads slide, by the forces that their contacts need in the motion in which all of them roll."""
+        slip, state = self._slip(motion.state), motion.state
+        if slip is None:
+            return contact
+        at_loads = self.at_loads(a)
+        change = part.change(at_loads)
+        normal_force = self.loads.normal_force(state.angle, state.rate, total_gravity(self.effects))
+        assert normal_force is not None
+        centre = self.centre_forces(state, motion.speed)
+        needed = contact_force(self.loads, motion.kinematics, change, at_loads, centre, 1.0)
+        (limit,) = terms_of(self.effects, SlipRelease)
+        return resolve_contact(
+            self.loads, motion.kinematics, slip, limit, normal_force, at_loads, needed, contact.force, centre, contact.friction
+        )
+
+    def rates(self, motion: Motion, rolling: ContactSolution, part: Eliminated, a: Sequence[Array]) -> ExciterRates:
+        """Return the time derivative of the exciter's state, from the accelerations of the mount's rows.
+
+        `rolling`, the forces on loads that all roll, says how the slip of each load changes.
+        """
+        state, speed = motion.state, motion.speed
+        rotor = None if part.rotor is None else (speed, part.rotor[0] - dot(part.rotor[1], a))
+        at_loads = self.at_loads(a)
+        change = part.change(at_loads)
+        slip = self._slip(state)
+        slip_change = None if slip is None else self._slip_change(motion, slip, rolling, change, at_loads)
+        drilling = self._drilling_spin(state, speed)
+        spin = None if drilling is None and slip is None else Spin(None if drilling is None else drilling.rate, slip_change)
+        return ExciterRates(state.rate, change, rotor, spin)
+
+    def centre_forces(self, state: State, speed: Array) -> list[Array]:
+        """Return the generalised forces at the centres of the loads, without those of their contacts, N m of an angle."""
+        return self._forces(state, speed, rotation=False)[1]
+
+    def _forces(self, state: State, speed: Array, *, rotation: bool = True) -> tuple[Array, list[Array]]:
+        """Return the torque of the drag, and the generalised forces on the loads except friction.
+
+        Without `rotation` the forces that turn a load about its own centre are left out.
+        """
+        loads = self.loads
+        torque = loads.resistance(state.angle, state.rate, speed)
+        force = list(torque)
+        turning = loads.spin_force(state.angle, state.rate, speed) if rotation else None
+        if turning is not None:
+            force = [f + s for f, s in zip(force, turning, strict=True)]
+        drilling = self._drilling_spin(state, speed) if rotation else None
+        if drilling is not None:
+            assert state.spin is not None and state.spin.drilling is not None
+            force = [f + state.spin.drilling * s for f, s in zip(force, drilling.force, strict=True)]
+        for term in terms_of(self.effects, LoadPotential, LoadResistance, LoadInteraction):
+            for extra in term.forces(loads, state.angle, state.rate):
+                force = [f + e for f, e in zip(force, extra, strict=True)]
+        return torque[0], force
+
+    def _add_friction(self, drag: Array, contact: ContactSolution) -> tuple[Array, list[Array], list[Axes]]:
+        """Return drag and forces with the friction that does not depend on accelerations, and for each coordinate of a load
+        the friction per acceleration, by axis; {} if there is none."""
+        force, coupling = list(contact.force), [dict[int, Array]() for _ in contact.force]
+        for each in contact.friction:
+            rubs = [lever * each.reaction for lever in (each.lever, *each.others)]
+            drag = drag + rubs[0]
+            for i, (rub, lever) in enumerate(zip(rubs, (each.lever, *each.others), strict=True)):
+                force[i] = force[i] + rub
+                if each.normal is not None:
+                    coupling[i] = {axis: lever * each.normal[axis] + coupling[i].get(axis, 0.0) for axis in self.axes}
+        return drag, force, coupling
+
+    def _felt_by_mount(
+        self, found: Kinematics, free: tuple[Array, ...], accelerance: Mapping[int, tuple[Array, ...]]
+    ) -> tuple[list[list[Array | float]], list[Array | float]]:
+        """Return added mass and reaction of the loads. A row of the mount feels each load by the lever of the load there; rows
+        that move no load feel none."""
+        m, axes, levers = self.loads.mass, self.axes, self.levers
+        across = {axis: [column[axis] for column in found.columns] for axis in axes}
+        own = {(i, k): m * (1.0 if i == k else 0.0) - m * dot(across[i], accelerance[k]) for i in axes for k in axes}
+        moments = {
+            (i, k, low, high): self._total(own[i, k], levers[low], levers[high])
+            for i, k in own
+            for low in range(len(levers))
+            for high in range(low, len(levers))
+        }
+        rows = [(row, axis) for row in range(self.row_count) for axis in axes]
+        added_mass = [[moments.get((i, k, min(one, two), max(one, two)), 0.0) for two, k in rows] for one, i in rows]
+        push = {i: m * (dot(across[i], free) + found.curvature[i]) for i in axes}
+        return added_mass, [self._total(push[i], levers[row]) if row < len(levers) else 0.0 for row, i in rows]
+
+    def _add_rotor(
+        self,
+        motion: Motion,
+        added_mass: list[list[Array | float]],
+        reaction: list[Array | float],
+        drag: Array,
+        coupling: Axes,
+    ) -> tuple[list[list[Array | float]], list[Array | float], tuple[Array, list[Array]] | None]:
+        """Return added mass and reaction with the rotor's imbalance, and the rotor's own acceleration as in `Eliminated`."""
+        motor = self.drive.torque_and_inertia(motion.speed)
+        if motor is None:
+            if motion.imbalance is not None:
+                reaction = [g + b for g, b in zip(reaction, motion.imbalance[1], strict=True)]
+            return added_mass, reaction, None
+        torque, inertia = motor
+        free = (torque - self._total(drag)) / inertia
+        row = [jnp.zeros_like(free)] * len(reaction)
+        if coupling:
+            by_loads = [self._total(coupling[i], lever) / inertia for lever in self.levers for i in self.axes]
+            row = by_loads + row[len(by_loads) :]
+        if motion.imbalance is None:
+            return added_mass, reaction, (free, row)
+        along, bend = motion.imbalance
+        row = [r + d / inertia for r, d in zip(row, along, strict=True)]
+        added_mass = [[w - d * r for w, r in zip(line, row, strict=True)] for line, d in zip(added_mass, along, strict=True)]
+        reaction = [g + b + d * free for g, b, d in zip(reaction, bend, along, strict=True)]
+        return added_mass, reaction, (free, row)
+
+    def _imbalance(self, t: Array, state: State) -> tuple[list[Array], list[Array]] | None:
+        """Return d' and, under a motor d'' theta'^2, under an ideal drive d''/dt^2: d(theta) is the imbalance on each row."""
+        terms = terms_of(self.effects, RotorImbalance)
+        if not terms:
+            return None
+        turn, rate = self.drive.rotor_angle(t, state.rotor), self.drive.rotor_speed(t, state.rotor)
+
+        def imbalance(angle: Array) -> tuple[Array, ...]:
+            found = [term.at(angle) for term in terms]
+            static = tuple(total(each.static[axis] for each in found) for axis in self.axes)
+            if self.row_count == 1:
+                return static
+            moment = tuple(total(each.moment[axis] for each in found) for axis in self.axes)
+            for lever in self.rotor_levers[1:]:
+                moment = tuple(x + scaled(lever, y) for x, y in zip(moment, static, strict=True))
+            return (*static, *moment)
+
+        def slope(angle: Array) -> tuple[Array, ...]:
+            return jax.jvp(imbalance, (angle,), (jnp.ones_like(angle),))[1]
+
+        along, bend = jax.jvp(slope, (turn,), (jnp.ones_like(turn),))
+        push = [b * rate**2 for b in bend]
+        change = self.drive.rotor_acceleration(t)
+        if change is not None:
+            push = [p + d * change for p, d in zip(push, along, strict=True)]
+        return list(along), push
+
+    def _slip_change(
+        self, motion: Motion, slip: tuple[Array, ...], rolling: ContactSolution, change: tuple[Array, ...], at_loads: Axes
+    ) -> tuple[Array, ...]:
+        """Return the rate of each slip: the force that rolling lacks over the inertia of a load's rotation."""
+        force, state, loads = list(rolling.force), motion.state, self.loads
+        for each in rolling.friction:
+            for i, f in enumerate(each.linear(at_loads)):
+                force[i] = force[i] + f
+        lacking = contact_force(loads, motion.kinematics, change, at_loads, force, rolling.kappa)
+        inertia = (rolling.kappa - 1.0) * loads.mass
+        return slip_rates(loads, state.angle, state.rate, slip, [f / inertia for f in lacking])
+
+    def _slip(self, state: State) -> tuple[Array, ...] | None:
+        if not self.can_slide:
+            return None
+        if state.spin is None or state.spin.slip is None:
+            raise InputError("state.spin", "has no slip, which an effect of the scene releases; see with_spin(scene, state)")
+        return state.spin.slip
+
+    def _drilling_spin(self, state: State, speed: Array) -> DrillingSpin | None:
+        if not has_term(self.effects, DrillingSpinRelease):
+            return None
+        if state.spin is None or state.spin.drilling is None:
+            raise InputError(
+                "state.spin", "has no drilling spin, which an effect of the scene releases; see with_spin(scene, state)"
+            )
+        return self.loads.drilling_spin(state.angle, state.rate, speed, state.spin.slip)
+
+    def _total(self, values: Array, *levers: Array | None) -> Array:
+        """Return the sum over all loads."""
+        for lever in levers:
+            values = scaled(lever, values)
+        return jnp.sum(jnp.broadcast_to(values, (self.loads.count,)))
+
+
+def depends_on_acceleration(contact: ContactSolution) -> bool:
+    """True if a friction follows a normal force that depends on the accelerations."""
+    return any(each.normal is not None for each in contact.friction)
+
+
+def without_coupling(contact: ContactSolution) -> ContactSolution:
+    """Leave out friction that depends on the accelerations."""
+    return contact._replace(friction=[each for each in contact.friction if each.normal is None])
+
+
+def signed(contact: ContactSolution, at_loads: Axes) -> ContactSolution:
+    """Make friction linear in the accelerations: its normal force has the sign that it has at `at_loads`."""
+    found: list[Friction] = [each if each.normal is None else each.signed(at_loads) for each in contact.friction]
+    return contact._replace(friction=found)
