@@ -41,6 +41,16 @@ def test_ten_periods_of_large_swings_hold_mu1(degrees):
     assert sum(each.low < true < each.high for each, true in zip(found, mu1, strict=True)) >= 43
 
 
+def test_beyond_90_degrees_no_interval_is_stated():
+    """25 samples a second and weak friction; the value is 0.6 % off, three times the interval that noise alone would give."""
+    t = np.arange(0.0, 20.0, 0.04)
+    record = jv.Record(t, noisy(scipy_swing(ROD, t, np.deg2rad(120.0), 0.0, 3e-4)[0], 5e-4, 0))
+    found = jv.ten_periods(ROD, record).viscous
+    assert abs(found.value / 3e-4 - 1.0) < 0.02 and (found.low, found.high) == (0.0, np.inf)
+    fitted = jv.identify(ROD, record)
+    assert fitted.viscous.low < 3e-4 < fitted.viscous.high < 3.1e-4 and "± inf" in fitted.summary()
+
+
 def test_instruments_widen_the_interval():
     t = np.arange(0.0, 15.0, 0.04)
     record = jv.Record(t, scipy_swing(ROD, t, 0.05, 0.0, 1.5e-3)[0])
