@@ -81,7 +81,7 @@ def validated(function: F) -> F:
             checks.update(_annotations(function, signature))
         try:
             bound = signature.bind(*args, **kwargs)
-        except TypeError:  # the function itself says it, or knows the name as a former one
+        except TypeError:  # the function itself raises it
             return function(*args, **kwargs)
         for name, value in bound.arguments.items():
             kind = checks[name]

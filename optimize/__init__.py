@@ -9,7 +9,6 @@ watch(sys.modules[__name__])  # before all other imports, which it then watches 
 
 from optimize.files import Design, load_design
 from optimize.pareto import Front, pareto
-from optimize.quantities.aims import maximize, minimize, negative
 from optimize.quantities.cases import expected, quantile, under, worst
 from optimize.quantities.jams import (
     amplitude,
@@ -47,9 +46,6 @@ __all__ = [
     "largest_multiplier",
     "least",
     "load_design",
-    "maximize",
-    "minimize",
-    "negative",
     "pareto",
     "peak_force",
     "phase",

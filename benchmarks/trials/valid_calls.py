@@ -289,8 +289,6 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("total", field="machine.mass")
     yield call("static_deflection", of=1)
     yield call("spring_cost", prices=[(1e4, 10.0), (1e5, 20.0)], unit="EUR")
-    for name in ("maximize", "minimize", "negative"):
-        yield call(name, quantity=force)
     for name in ("expected", "worst"):
         yield call(name, quantity=force, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)
     yield call("quantile", quantity=force, level=0.9, tolerances={"machine.stiffness": 0.05}, samples=4, seed=0)

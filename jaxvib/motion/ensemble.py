@@ -25,7 +25,7 @@ from jaxvib.motion.analysis.scaled_error import error_scale, estimated_error, na
 from jaxvib.motion.batch import BATCH_SIZE, advance, pack_batch, stretches
 from jaxvib.motion.integrate import is_finite, wrap_angles
 from jaxvib.motion.plan import ENSEMBLE_PARTS, plan_ensemble
-from jaxvib.motion.steps import FORMER, EqualSteps, refuse_former
+from jaxvib.motion.steps import EqualSteps
 from jaxvib.motion.stiffness import is_unresolved
 from jaxvib.ode.types import Y
 from jaxvib.results.fields import in_unit, part
@@ -127,7 +127,6 @@ class Ensemble(Result):
 
 
 @validated
-@refuse_former(steps=FORMER["steps"])
 def ensemble(
     make: Callable[..., Scene | tuple[Scene, State]],
     values: PyTree[Array],

@@ -20,7 +20,7 @@ from jaxvib.motion.integrate import frequency_bounds, whole_turns
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, simulate
 from jaxvib.motion.start import APART, Start, initial_state, validate_state
-from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
+from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
 from jaxvib.runtime.programs import cached
@@ -54,7 +54,6 @@ _FALLS = -3.0
 
 
 @validated
-@refuse_former(tolerance=FORMER["tolerance"])
 def settle(
     scene: Scene,
     *,

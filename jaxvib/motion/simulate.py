@@ -23,7 +23,7 @@ from jaxvib.motion.integrate import IntegrationPlan, StepControl, integrate, who
 from jaxvib.motion.plan import MAX_STEPS, Control, RunPlan, plan_run
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.start import Start
-from jaxvib.motion.steps import FORMER, StepChoice, refuse_former
+from jaxvib.motion.steps import StepChoice
 from jaxvib.motion.stiffness import advice
 from jaxvib.results.status import status_name
 from jaxvib.runtime.devices import known, on_device
@@ -36,7 +36,6 @@ __all__ = ["last_state", "simulate"]
 
 
 @validated
-@refuse_former(**FORMER)
 def simulate(
     scene: Scene,
     until: Number,

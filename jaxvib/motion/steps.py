@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
 
 import diffrax
 import jax.numpy as jnp
@@ -15,18 +12,13 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.units import require_real
 
 __all__ = [
-    "FORMER",
     "Accuracy",
     "EqualSteps",
     "StepChoice",
     "Tolerance",
-    "refuse_former",
     "require",
     "small_number",
 ]
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -105,28 +97,3 @@ def small_number(value: float, name: str, time: Array, least: float) -> float:
             + ("; for smaller ones switch JAX to float64" if precision > 1e-10 else ""),
         )
     return value
-
-
-def refuse_former(**now: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Makes a function say the present spelling of keywords that it had in version 0.1: `now` names it for each."""
-
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        @functools.wraps(function)
-        def checked(*args: P.args, **kwargs: P.kwargs) -> T:
-            for name in kwargs.keys() & now.keys():
-                raise InputError(name, f"is no argument of {function.__name__} any more; write {now[name]}")
-            return function(*args, **kwargs)
-
-        return checked
-
-    return decorate
-
-
-FORMER = {
-    "tolerance": "stepsize_controller=jv.Tolerance(1e-8)",
-    "accuracy": "stepsize_controller=jv.Accuracy(1e-4)",
-    "steps": "stepsize_controller=jv.EqualSteps(2000)",
-    "controller": "stepsize_controller=controller",
-    "progress": "progress_meter=diffrax.TextProgressMeter()",
-}
-"""Keywords of version 0.1 and what they are now."""

@@ -75,10 +75,6 @@ def test_an_accuracy_that_is_not_reached_is_said(monkeypatch):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        (dict(tolerance=1e-6), "tolerance is no argument of simulate any more; write stepsize_controller=jv.Tolerance"),
-        (dict(steps=100), "steps is no argument of simulate any more; write stepsize_controller=jv.EqualSteps"),
-        (dict(accuracy=1e-4), "accuracy is no argument of simulate any more; write stepsize_controller=jv.Accuracy"),
-        (dict(progress=True), "progress is no argument of simulate any more; write progress_meter="),
         (dict(stepsize_controller=1e-6), "stepsize_controller is 1e-06; it must be a Tolerance"),
         (dict(stepsize_controller=jv.Accuracy(1e-14)), "accuracy is 1e-14; in float64 it must be at least 2.3e-13"),
         (dict(stepsize_controller=jv.EqualSteps(0)), "steps is 0"),

@@ -30,7 +30,7 @@ from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
 from jaxvib.motion.integrate import is_finite
 from jaxvib.motion.start import Start, initial_state, validate_state, with_spin_up_drive
-from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require, small_number
+from jaxvib.motion.steps import Tolerance, require, small_number
 from jaxvib.numerics.linalg import magnitude
 from jaxvib.ode.control import Decision, WrappedController, moved_on
 from jaxvib.ode.replay import solve
@@ -122,7 +122,6 @@ class _Units(eqx.Module):
 
 
 @validated
-@refuse_former(tolerance=FORMER["tolerance"], controller=FORMER["controller"])
 def envelope(
     scene: Scene,
     until: Number,

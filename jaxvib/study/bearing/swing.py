@@ -15,7 +15,7 @@ from jax import Array
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.friction import dry_lever
-from jaxvib.motion.steps import FORMER, Tolerance, refuse_former, require
+from jaxvib.motion.steps import Tolerance, require
 from jaxvib.ode.types import RealScalarLike
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
@@ -126,7 +126,6 @@ class Swing(Result):
 
 
 @validated
-@refuse_former(tolerance=FORMER["tolerance"])
 def swing(
     pendulum: BearingPendulum,
     time: Numbers,

@@ -97,13 +97,6 @@ class Capture(Result):
         share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
         return np.sqrt(share * (1.0 - share) / (n + 4.0))
 
-    @property
-    def islands(self) -> int:
-        """Number of speeds, in ascending order, at which captures change to failures again: 0 where there is one clean
-        threshold."""
-        all_of_them = np.all(self.captured, axis=1)
-        return int(np.sum(np.any(self.captured, axis=1)[:-1] & ~all_of_them[1:]))
-
     def summary(self) -> str:
         """The threshold with its uncertainty, and what stands below it, for a person to read."""
         n = self.captured.shape[1]

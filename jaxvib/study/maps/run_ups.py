@@ -23,7 +23,7 @@ from jaxvib.motion.integrate import frequency_bounds
 from jaxvib.motion.plan import enough_steps
 from jaxvib.motion.simulate import simulate
 from jaxvib.motion.start import initial_state, require_start
-from jaxvib.motion.steps import FORMER, StepChoice, Tolerance, refuse_former
+from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
@@ -102,7 +102,6 @@ def _span(values: np.ndarray) -> str:
 
 
 @validated
-@refuse_former(tolerance=FORMER["tolerance"])
 def run_ups(
     scene: Scene,
     until: Number,
