@@ -21,16 +21,16 @@ __all__ = ["Carrier", "Machine"]
 
 
 class Carrier(eqx.Module):
-    """The linear structure of a machine.
+    """Linear structure of a machine.
 
-        M q'' + C q' + K q = forces,        force on the bed = T_K q + T_C q'
+        M q'' + C q' + K q = forces,        force on the foundation = T_K q + T_C q'
 
     The mass of the loads is not part of `mass`: each load brings its own at its place, see `Mount`.
 
-    **Attributes** (nd coordinates, nb directions of the force on the bed)
+    **Attributes** (nd coordinates, nb directions of the force on the foundation)
 
     - `mass` M (nd, nd), kg or kg m^2; `damping` C (nd, nd), N s/m; `stiffness` K (nd, nd), N/m
-    - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): ties to the bed, N/m and N s/m
+    - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): supports on the foundation, N/m and N s/m
     - `coordinates`: a name for each coordinate; `coordinate_units`: the unit of each, "m" or "rad", None where all are "m"
 
     Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for rotors
@@ -47,7 +47,7 @@ class Carrier(eqx.Module):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The unit of each coordinate, "m" or "rad".
+        """Unit of each coordinate, "m" or "rad".
 
         >>> import jaxvib as jv
         >>> jv.planar_rotor(mass=37.0, stiffness="1160 N/mm", damping=840.0).structure().units
@@ -57,19 +57,19 @@ class Carrier(eqx.Module):
 
     @property
     def bed_directions(self) -> tuple[str, ...]:
-        """A name for each direction of the force on the bed: "up", or "across" and "up"."""
+        """Names of the directions of the force on the foundation: "up", or "across" and "up"."""
         return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
 
     def bed_force(self, displacement: Array, velocity: Array) -> Array:
-        """Force on the bed (nb,) N, T_K q + T_C q', also of complex amplitudes; without supports that are effects."""
+        """Return the force on the foundation (nb,) N, T_K q + T_C q', also of complex amplitudes, without effects."""
         return self.bed_stiffness @ displacement + self.bed_damping @ velocity
 
 
 class Machine(eqx.Module):
-    """A machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
+    """Machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
 
-    `places` says how places on it are named, for effects that have one and for drawings: "platform" by number, "shaft" by the
-    distance along a rotor's axis, "point" on a machine that only has its exciter's.
+    `places` is the kind of its places, for effects and drawings: "platform" by number, "shaft" by the distance along a rotor's
+    axis, "point" if the exciter's place is the only one.
     """
 
     kind: eqx.AbstractVar[str]
@@ -77,16 +77,16 @@ class Machine(eqx.Module):
 
     @abc.abstractmethod
     def carrier(self) -> Carrier:
-        """The machine as a linear structure, see `Carrier`."""
+        """Return the linear structure, see `Carrier`."""
 
     @abc.abstractmethod
     def mount(self) -> Mount:
-        """The place of the exciter, see `Mount`."""
+        """Return the mount of the exciter, see `Mount`."""
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Rows (np, nd): the point at a `place` moves by rows q. Exciters, supports, stops and pictures all ask here.
+        """Return rows (np, nd): the point at a `place` moves by rows q. Exciters, supports, stops and drawings use this method.
 
-        **Arguments**: `place`, None for the usual one; its `name` in messages.
+        **Arguments**: `place`, None for the default; its `name` in messages.
 
         **Raises** `InputError` for a place that the machine does not have.
 
@@ -97,13 +97,15 @@ class Machine(eqx.Module):
         [[0.0, 1.0]]
         """
         if place is not None:
-            problem = f"names a place on a machine of kind {quoted(self.kind)}, which moves alike everywhere; leave it out"
+            problem = f"names a place on a machine of kind {quoted(self.kind)}, all points of which move alike; leave it out"
             raise InputError(name, problem)
         return self.mount().rows[0]
 
     def supports(self) -> list[tuple[float, float, float]] | None:
-        """Supports along a rotor's axis, for a drawing: distance from the mass centre m, stiffness N/m, damping N s/m; None if
-        the matrices say all there is to draw."""
+        """Supports along a rotor's axis, for a drawing: distance from the mass centre m, stiffness N/m, damping N s/m.
+
+        None if the matrices contain everything for a drawing.
+        """
         return None
 
     def structure(self) -> Carrier:
@@ -121,7 +123,7 @@ def _shapes(machine: Machine) -> tuple[Carrier, Mount]:
 
 
 def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and dtype, which an array says without any rules of promotion."""
+    """Return shape and dtype without rules of promotion."""
     known = leaf if isinstance(leaf, (jax.Array, np.ndarray)) else jnp.asarray(leaf)
     return known.shape, known.dtype
 
@@ -130,6 +132,6 @@ def _kind(leaf: ArrayLike) -> tuple[tuple[int, ...], np.dtype]:
 def _structure(
     rest: Hashable, kinds: tuple[tuple[tuple[int, ...], np.dtype], ...], precision: np.dtype
 ) -> tuple[Carrier, Mount]:
-    """Traced once for all machines of a form, in the `precision` in force: a trace takes longer than many a run."""
+    """Trace once for all machines of a structure and the current `precision`: a trace takes longer than many runs."""
     machine = jax.tree.unflatten(rest, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in kinds])
     return eqx.filter_eval_shape(lambda machine: (machine.carrier(), machine.mount()), machine)

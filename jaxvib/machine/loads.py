@@ -40,7 +40,7 @@ BALL_RADIUS = unit("m", low=0.0, open_low=True, words="ball radius of each {load
 
 
 class NormalForce(NamedTuple):
-    """The force N = `reaction` + `normal` . a with which each load presses on its track, a the acceleration of its carrier.
+    """Normal force N = `reaction` + `normal` . a of each load on its track, a the acceleration of the point that carries it.
 
     `reaction` (count,) N; `normal` (across, up) in kg, (count,) each.
     """
@@ -49,7 +49,7 @@ class NormalForce(NamedTuple):
     normal: tuple[Array, Array]
 
     def at(self, a: Mapping[int, Array]) -> Array:
-        """N (count,) where the loads' carriers have the acceleration `a`, by axis."""
+        """Return N (count,) if the points that carry the loads have the acceleration `a`, by axis."""
         return self.reaction + sum(self.normal[axis] * x for axis, x in a.items())
 
 
@@ -69,9 +69,9 @@ class DrillingSpin(NamedTuple):
 
 
 class Loads(eqx.Module):
-    """Loads that move on the carrier. A new kind of load is a new subclass with its own position function.
+    """Loads that move on the machine. A new kind of load is a subclass with its own position function.
 
-    All arrays are one entry a load, or one scalar that all loads share; functions act elementwise on (count,) arrays.
+    Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
     A load has one or several coordinates u; the first is its angle about the rotor's axis, rad, and its generalised force the
     torque that the load takes off the rotor.
@@ -165,7 +165,7 @@ class CircularLoads(Loads):
     **Attributes** (scalar: shared by all loads; or (count,)): `mass` m kg; `radius` R m of the circle of the mass centres;
     `drag` b_W N s/m at that radius; `inertia` J_C kg m^2 about the mass centre (pendulums; None for the others);
     `count` N; `kind` "ball", "roller" or "pendulum"; `ball_radius` r m of a ball or roller (scalar), None for loads that can
-    all be at one point. With it, collected loads lie side by side on an arc, 2 arcsin(r/R) apart.
+    all be at one point. With it, gathered loads lie side by side on an arc, 2 arcsin(r/R) apart.
 
     Source: the antiphase paper, equations (1), (2), (6).
     """
@@ -281,12 +281,12 @@ def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
 
 
 def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
-    """Balls that roll in an annular track, kappa = 7/5.
+    """Return balls that roll in an annular track, kappa = 7/5.
 
     **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
-    all, or N of them; `ball_radius` r m of a ball, for balls in one track, which cannot all be at one point: where jams and
-    the criterion take them as collected, they lie side by side and carry the unbalance m R sin(N arcsin(r/R)) / (r/R) in
-    place of N m R. In time only the effect `LoadContact` sees it: without that nothing keeps loads from passing each other.
+    all, or N of them; `ball_radius` r m of a ball, for balls in one track, which cannot all be at one point: in jams and
+    in the criterion, gathered balls lie side by side and have the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of N m R.
+    In time integration only the effect `LoadContact` uses it; without that effect loads pass through each other.
 
     **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, a mass or radius that is not
     positive, a negative drag (0 is allowed), balls that have no room side by side.
@@ -303,7 +303,7 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 
 
 def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
-    """Cylindrical rollers that roll in an annular track, kappa = 3/2.
+    """Return cylindrical rollers in an annular track, kappa = 3/2.
 
     **Arguments**: as `balls`.
 
@@ -319,10 +319,11 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
 
 
 def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:
-    """Pendulums hung on the shaft, kappa = 1 + J_C/(m R^2).
+    """Return pendulums on the shaft, kappa = 1 + J_C/(m R^2).
 
     **Arguments**: as `balls`, with `radius` the distance of the mass centre from the axis, and `inertia` J_C kg m^2 about
-    the mass centre (0: a point mass). `drag` acts at that radius: a bearing's viscous coefficient mu (N m s) is b_W = mu/R^2.
+    the mass centre (0: a point mass). `drag` acts at that radius: a bearing with the viscous coefficient mu (N m s) has
+    b_W = mu/R^2.
 
     **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
 

@@ -1,4 +1,4 @@
-"""Mount: how the points of an exciter move with the coordinates of the machine that carries it."""
+"""Mount of an exciter: the motion of its points with the coordinates of the machine."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from jax import Array
 __all__ = ["Mount", "Place", "scaled"]
 
 Place = int | float | Array | None
-"""A place on a machine: the number of a platform, or the distance along a rotor's axis from its mass centre, m; None is the
-machine's usual one."""
+"""Place on a machine: the number of a platform, or the distance along a rotor's axis from its mass centre, m; None is the
+default place of the machine."""
 
 
 class Mount(eqx.Module):
-    """The place of an exciter on a machine with nd coordinates q; its points move in np directions.
+    """Mount of an exciter on a machine with nd coordinates q, whose points move in np directions.
 
         load j moves by sum_l levers[l][j] rows[l] q,      the rotor's mass centre by sum_l rotor_levers[l] rows[l] q
 
@@ -60,8 +60,10 @@ class Mount(eqx.Module):
         return jax.vmap(lambda levers: _combined(levers, self.rows))(self.levers)
 
     def load_rates(self, rate: Array) -> dict[int, Array]:
-        """Velocities (accelerations) of the loads' points by axis, from those of the coordinates `rate` (nd,): a number each if
-        all loads run at one point, otherwise (count,)."""
+        """Velocities (accelerations) of the loads' points by axis, from those of the coordinates, `rate` (nd,).
+
+        Each is a number if all loads run at one point, otherwise (count,).
+        """
         if self.at_one_point:
             return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
         levers = [None if lever is None else lever[None, :] for lever in self.levers]
@@ -80,7 +82,7 @@ class Mount(eqx.Module):
 
 
 def scaled(lever: Array | None, value: Array) -> Array:
-    """A value times a lever, where None is 1."""
+    """Return a value times a lever; None is 1."""
     return value if lever is None else lever * value
 
 

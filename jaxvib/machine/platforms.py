@@ -1,4 +1,4 @@
-"""Machines of platforms that move up and down: one, two, three masses, or any network of them."""
+"""Machines of vertically moving platforms: one, two, three masses, or a network."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = ["Platforms", "network", "one_mass", "three_mass", "two_mass"]
 
 
 class Platforms(Machine):
-    """Platforms that translate vertically, on supports to the bed and links to each other.
+    """Platforms that translate vertically, on supports and with links between them.
 
-        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [b_ij (y_i' - y_j') + k_ij (y_i - y_j)] = loads' force on the exciter's platform
+        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [b_ij (y_i' - y_j') + k_ij (y_i - y_j)] = force of loads on platform `exciter`
 
-    y_i is counted upward from static equilibrium, in m. Build one with `one_mass`, `two_mass`, `three_mass` or `network`.
+    y_i is the upward displacement from static equilibrium, m. Constructors: `one_mass`, `two_mass`, `three_mass`, `network`.
 
     **Attributes** (n platforms, L links)
 
     - `mass` (n,) kg: of the platforms; the exciter's platform includes the auto-balancer's body, not its loads
     - `stiffness` (n,) N/m, `damping` (n,) N s/m: of the supports
     - `link_stiffness` (L,) N/m, `link_damping` (L,) N s/m
-    - `links`: the pair of platforms each link joins; platforms are numbered from 1
+    - `links`: the pair of platforms that each link joins, numbered from 1
     - `exciter`: the platform that carries the auto-balancer
 
     Source: Filimonikhin et al. 2022, equations (1)-(39) for one, two and three masses.
@@ -48,9 +48,9 @@ class Platforms(Machine):
     places = "platform"
 
     def carrier(self) -> Carrier:
-        """The matrices of the platforms."""
+        """Return the matrices of the platforms."""
         n = self.mass.shape[0]
-        # A row for each support, whose other end is the bed, and for each link.
+        # A row for each support, whose other end is the foundation, and for each link.
         ends = np.concatenate([np.eye(n), np.zeros((len(self.links), n))]).astype(self.mass.dtype)
         for row, (i, j) in enumerate(self.links, n):
             ends[row, i - 1], ends[row, j - 1] = 1.0, -1.0
@@ -68,11 +68,11 @@ class Platforms(Machine):
         )
 
     def mount(self) -> Mount:
-        """The exciter's platform, which moves up."""
+        """Return the vertical motion of the exciter's platform."""
         return Mount(rows=(self.rows_at(self.exciter),), axes=(1,))
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """The coordinate of a platform; that of the first one for None."""
+        """Return the row of a platform's coordinate; of the first platform for None."""
         n, which = self.mass.shape[0], 1 if place is None else place
         if not isinstance(which, int):
             raise InputError(name, f"is a distance along a rotor's axis; name a platform instead, 1 to {n}")
@@ -125,7 +125,7 @@ def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...
 
 
 def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
-    """One platform on a support; it carries the exciter.
+    """Return one platform on a support, with the exciter.
 
     **Arguments**: `mass` kg (loads not counted), `stiffness` N/m, `damping` N s/m; one number each.
 
@@ -149,10 +149,10 @@ def two_mass(
     link_damping: Number,
     exciter: int = 2,
 ) -> Platforms:
-    """Two platforms on supports, joined by a link.
+    """Return two platforms on supports, joined by a link.
 
     **Arguments**: `mass` (2,) kg, `stiffness` (2,) N/m and `damping` (2,) N s/m of the supports, `link_stiffness` N/m,
-    `link_damping` N s/m, `exciter` the platform with the auto-balancer (2 unless said otherwise).
+    `link_damping` N s/m, `exciter` the platform with the auto-balancer (default: 2).
 
     **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, units, masses not positive, negative coefficients.
 
@@ -176,10 +176,10 @@ def three_mass(
     link_damping: Sequence[Number],
     exciter: int = 2,
 ) -> Platforms:
-    """Three platforms on supports, every two joined by a link.
+    """Return three platforms on supports, every two joined by a link.
 
     **Arguments**: `mass` (3,) kg, `stiffness` (3,) N/m and `damping` (3,) N s/m of the supports; `link_stiffness` (3,) N/m
-    and `link_damping` (3,) N s/m of the links 1-2, 1-3, 2-3 (0 where there is none); `exciter` the platform with the
+    and `link_damping` (3,) N s/m of the links 1-2, 1-3, 2-3 (0 for an absent link); `exciter` the platform with the
     auto-balancer.
 
     **Returns** `Platforms`. **Raises** `InputError` as `two_mass`.
@@ -189,7 +189,7 @@ def three_mass(
     ...               link_stiffness=(1e4, 0.0, 1e4), link_damping=(5.0, 0.0, 5.0), exciter=3).links
     ((1, 2), (1, 3), (2, 3))
 
-    Source: Filimonikhin et al. 2022, equation (39) with the third platform's misprint mended.
+    Source: Filimonikhin et al. 2022, equation (39), with the misprint for the third platform corrected.
     """
     links = ((1, 2), (1, 3), (2, 3))
     return _platforms("three_mass", 3, mass, stiffness, damping, links, link_stiffness, link_damping, exciter)
@@ -205,13 +205,13 @@ def network(
     link_damping: Sequence[Number] = (),
     exciter: int,
 ) -> Platforms:
-    """Any number of platforms, supports and links, the exciter on any platform.
+    """Return a machine of any number of platforms, supports and links.
 
-    **Arguments**: `mass` (n,) kg, `stiffness` (n,) N/m, `damping` (n,) N s/m (0 where a platform has no support); `links`
+    **Arguments**: `mass` (n,) kg, `stiffness` (n,) N/m, `damping` (n,) N s/m (0 for a platform without a support); `links`
     pairs of platforms numbered from 1, with `link_stiffness` (L,) N/m and `link_damping` (L,) N s/m; `exciter` the
     platform with the auto-balancer.
 
-    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`, and for a link to a platform that is not there.
+    **Returns** `Platforms`. **Raises** `InputError` as `two_mass`, and for a link to a platform that does not exist.
 
     >>> import jaxvib as jv
     >>> chain = jv.network(mass=[5.0] * 4, stiffness=[1e4, 0, 0, 1e4], damping=[5, 0, 0, 5], links=[(1, 2), (2, 3), (3, 4)],
@@ -219,7 +219,7 @@ def network(
     >>> chain.carrier().mass.shape
     (4, 4)
 
-    Source: Filimonikhin et al. 2022, equations (1)-(39) for one to three platforms, for any number of them.
+    Source: Filimonikhin et al. 2022, equations (1)-(39) for one to three platforms, extended to any number.
     """
     masses = read_numbers(Platforms, "machine", mass=mass)["mass"]
     n = 1 if masses.ndim == 0 else masses.shape[0]

@@ -1,4 +1,4 @@
-"""A rigid rotor on two elastic supports that moves across, up, and tilts both ways."""
+"""Rigid rotors: on two elastic supports with tilts, and on one support without."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _MASS = unit("kg", low=0.0, open_low=True, words="mass of the rotor")
 
 
 class Rotor(Machine):
-    """A rigid rotor on two isotropic supports; q = (y, z, theta, psi): its mass centre across and up, the tilts of its axis.
+    """Rigid rotor on two isotropic supports; q = (y, z, theta, psi): its mass centre across and up, the tilts of its axis.
 
         M y'' + b1 y' + b2 theta' + c1 y + c2 theta = f_y
         M z'' + b1 z' + b2 psi' + c1 z + c2 psi = f_z
         A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = m_y
         A psi'' - C w theta' + b2 z' + b3 psi' + c2 z + c3 psi = m_z
 
-    w is the rotor's speed; a point at the distance s along the axis moves by (y + s theta, z + s psi). A load at the station
-    s_j pushes there. z is counted from static equilibrium.
+    w is the rotor speed. A point at the distance s along the axis moves by (y + s theta, z + s psi). A load acts at its station
+    s_j. z is the displacement from static equilibrium.
 
     **Attributes**
 
     - `mass` M kg; `transverse_inertia` A and `polar_inertia` C kg m^2, of the rotor without loads
     - `stiffness` k (2,) N/m, `damping` (2,) N s/m and `position` L (2,) m along the axis, of the two supports
     - `stations` s of the loads along the axis, m: one for all (scalar) or (count,)
-    - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s): in place of those the supports
-      make, c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2 and b alike; or None
+    - `stiffness_terms` (c1 N/m, c2 N, c3 N m), `damping_terms` (b1 N s/m, b2 N s, b3 N m s), or None for those of
+      the supports, c1 = k_1 + k_2, c2 = k_1 L_1 + k_2 L_2, c3 = k_1 L_1^2 + k_2 L_2^2, and the same for b
 
     Source: Artyunin 2013, equation (1), with L_2 counted negative.
     """
@@ -58,7 +58,7 @@ class Rotor(Machine):
     places = "shaft"
 
     def carrier(self) -> Carrier:
-        """The matrices of the four coordinates."""
+        """Return the matrices of the four coordinates."""
 
         def terms(support: Array, given: Array | None) -> tuple[Array, Array, Array]:
             if given is not None:
@@ -84,7 +84,7 @@ class Rotor(Machine):
         )
 
     def mount(self) -> Mount:
-        """The station that all loads share, or the mass centre with a lever for each load; and the axis's tilt."""
+        """Return the common station of the loads, or the mass centre with a lever for each load, and the tilt of the axis."""
         skew = np.zeros((4, 4))
         skew[2, 3], skew[3, 2] = 1.0, -1.0
         shared = self.stations.ndim == 0
@@ -97,8 +97,10 @@ class Rotor(Machine):
         )
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """The point of the axis at a distance from the mass centre, m; for None the loads' common station, or the mass centre
-        if each load has its own."""
+        """Return the rows of the point of the axis at a distance from the mass centre, m.
+
+        None is the common station of the loads, or the mass centre if each load has its own.
+        """
         if isinstance(place, int):
             raise InputError(name, f"is {place}, which numbers a platform; on a rotor give a position, m from the mass centre")
         across, tilt = self._directions()
@@ -107,11 +109,11 @@ class Rotor(Machine):
         return across if distance is None else across + distance * tilt
 
     def _directions(self) -> tuple[Array, Array]:
-        """Rows (2, 4) of the mass centre, and of the axis's tilt."""
+        """Return rows (2, 4) of the mass centre, and of the tilt of the axis."""
         return jnp.eye(2, 4, dtype=self.mass.dtype), jnp.eye(2, 4, 2, dtype=self.mass.dtype)
 
     def supports(self) -> list[tuple[float, float, float]]:
-        """The two supports."""
+        """Return the two supports."""
         return list(zip(self.position.tolist(), self.stiffness.tolist(), self.damping.tolist(), strict=True))
 
 
@@ -127,15 +129,15 @@ def rotor(
     stiffness_terms: Sequence[Number] | None = None,
     damping_terms: Sequence[Number] | None = None,
 ) -> Rotor:
-    """A rigid rotor on two supports, with the loads at one station or at several.
+    """Return a rigid rotor on two supports, with the loads at one station or at several.
 
     **Arguments**: `mass` kg, `transverse_inertia` A and `polar_inertia` C kg m^2 without loads; `stiffness` N/m, `damping`
     N s/m and `position` m (along the axis from the mass centre, one side negative) of the two supports; `stations` m of the
     loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3), lists of three,
-    where they are not what the supports make, see `Rotor`.
+    instead of those of the supports, see `Rotor`.
 
-    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports that are both at
-    one place, for a polar inertia above twice the transverse one, and for terms that no supports can have (negative ones, or
+    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports at one
+    place, for a polar inertia above twice the transverse one, and for terms that no supports can have (negative ones, or
     c2^2 > c1 c3).
 
     >>> import jaxvib as jv
@@ -182,7 +184,7 @@ def _require_passive(field: str, one: float, two: float, three: float) -> None:
 
 def _require_two_places(places: np.ndarray) -> None:
     if places[0] == places[1]:
-        problem = "where nothing holds the rotor's tilt; give two places, such as [0.165, -0.155]"
+        problem = "which leaves the tilt of the rotor free; give two places, such as [0.165, -0.155]"
         raise InputError("machine.position", f"puts both supports at {places[0]:g} m, {problem}")
 
 
@@ -193,7 +195,7 @@ def _require_body(across: float, along: float) -> None:
 
 
 class PlanarRotor(Machine):
-    """A rotor on one isotropic support that moves across and up without tilting: M y'' + b y' + k y = f_y, z alike.
+    """Rotor on one isotropic support, which moves across and up without tilt: M y'' + b y' + k y = f_y, and the same for z.
 
     **Attributes**: `mass` M kg without loads, `stiffness` k N/m, `damping` b N s/m.
 
@@ -206,7 +208,7 @@ class PlanarRotor(Machine):
     kind: str = eqx.field(static=True)
 
     def carrier(self) -> Carrier:
-        """The matrices of the two coordinates."""
+        """Return the matrices of the two coordinates."""
         eye = jnp.eye(2, dtype=self.mass.dtype)
         return Carrier(
             mass=self.mass * eye,
@@ -218,12 +220,12 @@ class PlanarRotor(Machine):
         )
 
     def mount(self) -> Mount:
-        """The rotor, which moves across and up."""
+        """Return the motion of the rotor across and up."""
         return Mount(rows=(jnp.eye(2, dtype=self.mass.dtype),), axes=(0, 1))
 
 
 def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
-    """A rotor that moves across and up on one isotropic support.
+    """Return a rotor that moves across and up on one isotropic support.
 
     **Arguments**: `mass` kg without loads, `stiffness` N/m, `damping` N s/m.
 
@@ -253,7 +255,7 @@ kind = "run_up"             # constant_speed, spin_up, run_up, dc_motor, inducti
 speed = "460 rad/s"
 acceleration = 230.0        # rad/s^2
 
-[effects]                   # only what the scene calls for; an empty table is the usual case
+[effects]                   # only those of the scene; an empty table is the usual case
 gravity = true              # gravity on the loads
 static_imbalance = { moment = "8 g m" }
 # moment_imbalance = { moment = 1e-4 }    # kg m^2
@@ -265,7 +267,7 @@ static_imbalance = { moment = "8 g m" }
 """
 
 TEMPLATES = {
-    "planar_rotor": """# A rotor on one support that is alike across and up; it does not tilt.
+    "planar_rotor": """# A rotor on one isotropic support; it does not tilt.
 # Numbers are SI; text may carry any unit of the same dimension.
 [machine]
 kind = "planar_rotor"
@@ -284,8 +286,8 @@ polar_inertia = 0.093                     # kg m^2, about the axis of rotation
 stiffness = ["604 N/mm", "555 N/mm"]      # of the two supports
 damping = [439.0, 404.0]                  # N s/m
 position = [0.165, -0.155]                # m, of the supports
-stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number where all run in one plane
-# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m in place of what the supports make
+stations = [0.28, 0.25, -0.25, -0.28]     # m, of the loads; one number if all run in one plane
+# stiffness_terms = [1.159e6, 0.0, 2.98e4]  # c1 N/m, c2 N, c3 N m instead of those of the supports
 """
     + _ROTOR,
 }

@@ -1,4 +1,4 @@
-"""A scene: a machine, its loads, its drive and the effects it calls for."""
+"""Scene: a machine with its loads, drive and effects."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from jaxvib.units.known import when_known
 
 __all__ = ["Scene", "require_comparable"]
 
-_LEAST = 1e-15
-"""Share of another number below which double precision does not feel one beside it."""
+_MIN_RATIO = 1e-15
+"""Ratio of two numbers below which double precision loses the smaller one in a sum."""
 
 
 class Scene(eqx.Module):
-    """Everything that is needed to ask how a machine moves; a frozen pytree of SI numbers.
+    """Complete description of a machine in motion; a frozen pytree of SI numbers.
 
-    `jax.grad`, `jax.vmap` and `jax.jit` go through every number in it; `equinox.tree_at` replaces one.
+    `jax.grad`, `jax.vmap` and `jax.jit` apply to every number in it; `equinox.tree_at` replaces one.
 
     **Arguments**: `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor`, `rotor`; `loads` from
-    `balls`, `rollers`, `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, only those the scene calls
-    for, once each; `CubicSupport` and `Stop` as often as the machine has such supports.
+    `balls`, `rollers`, `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, once
+    each; `CubicSupport` and `Stop` once for each such support.
 
-    **Raises** `InputError` where a part is not of its kind, an effect is named twice that may be named once, a machine's
-    stations are not as many as the loads, or an effect does not go with this machine or these loads.
+    **Raises** `InputError` for a part of the wrong type, an effect that occurs twice and may occur once, a number of stations
+    other than that of the loads, and an effect that cannot act on this machine or these loads.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
@@ -70,20 +70,22 @@ class Scene(eqx.Module):
         for effect in effects:
             effect.validate(machine, loads)
             if not drive.ideal and has_term([effect], DrillingSpinRelease, SlipRelease):
-                problem = f"goes with a drive of given speed (property ideal), not with {drive.kind!r}; use ConstantSpeed"
+                problem = f"needs a drive of given speed (property ideal), not {drive.kind!r}; use ConstantSpeed"
                 raise InputError(f"effects.{effect.kind}", problem)
         require_comparable(machine, loads, drive)
         self.machine = machine
         self.loads = loads
         self.drive = drive
-        # The order has no meaning; it is the one in which a scene file names them.
+        # The order has no meaning; it is that of scene files.
         first = {effect.kind: index for index, effect in reversed(list(enumerate(effects)))}
         self.effects = tuple(sorted(effects, key=lambda effect: (not effect.repeatable, first[effect.kind])))
 
 
 def require_comparable(machine: Machine, loads: Loads, drive: Drive) -> None:
-    """**Raises** `InputError` for known numbers of which one is lost in the rounding of another: loads too heavy or too light
-    beside the machine, drag too weak beside their inertia."""
+    """**Raises** `InputError` if rounding loses one of two numbers that are known.
+
+    This happens for loads too heavy or too light for the machine, and for drag too weak for their inertia.
+    """
     parts = getattr(machine, "mass", None), loads.mass, getattr(loads, "drag", None), drive.speed
     when_known(partial(_require_comparable, loads.count), *parts)
 
@@ -95,17 +97,17 @@ def _require_comparable(
     each = np.broadcast_to(np.asarray(mass, dtype=float), (count,))
     if platforms is not None:
         whole, total = float(np.sum(platforms)), float(np.sum(each))
-        if not _LEAST <= total / whole <= 1.0 / _LEAST:
+        if not _MIN_RATIO <= total / whole <= 1.0 / _MIN_RATIO:
             raise InputError(
                 "loads.mass",
                 f"makes {total:.3g} kg in all on a machine of {whole:.3g} kg, so that rounding loses one beside the other; "
-                f"loads may have {_LEAST:g} to {1.0 / _LEAST:g} times the machine's mass",
+                f"loads may have {_MIN_RATIO:g} to {1.0 / _MIN_RATIO:g} times the machine's mass",
             )
     if drag is not None:
         share = np.asarray(drag, dtype=float) / (each * speed)
-        lost = (share > 0.0) & (share < _LEAST)
+        lost = (share > 0.0) & (share < _MIN_RATIO)
         if np.any(lost):
-            least = _LEAST * float(np.max(each[lost])) * speed
+            least = _MIN_RATIO * float(np.max(each[lost])) * speed
             raise InputError(
                 "loads.drag",
                 f"takes {float(np.min(share[lost])):.1e} of a load's speed while the rotor turns by a radian, which is lost in "

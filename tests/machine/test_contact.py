@@ -83,7 +83,7 @@ def test_restitution_is_read_from_files_and_checked():
     for arguments, says in (
         (dict(restitution=1.2), "restitution is 1.2; it must be greater than 0 and at most 1"),
         (dict(restitution=0.0), "restitution is 0; it must be greater than 0"),
-        (dict(restitution=0.5, damping=3.0), "goes without damping, which it stands for"),
+        (dict(restitution=0.5, damping=3.0), "excludes damping, which it determines"),
     ):
         with pytest.raises(jv.InputError, match=says):
             jv.LoadContact(1e5, **arguments)

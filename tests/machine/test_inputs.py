@@ -174,9 +174,9 @@ WRONG_ROTORS = {
     ),
     "supports at one place": (
         lambda: jv.rotor(**{**ROTOR, "position": 0.165}),
-        r"machine\.position puts both supports at 0\.165 m, where nothing holds the rotor's tilt",
+        r"machine\.position puts both supports at 0\.165 m, which leaves the tilt of the rotor free",
     ),
-    "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"goes with a rotor that can tilt"),
+    "leaning platforms": (lambda: rotor_scene(two(), None, (jv.MomentImbalance(1e-3),)), r"needs a rotor that can tilt"),
     "far platform": (
         lambda: rotor_scene(two(), None, (jv.Stop(1e6, gap=0.0, platform=3),)),
         r"is 3; the machine has platforms 1",

@@ -206,7 +206,7 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
         ),
         (
             lambda: jv.Scene(HEAVY, balls(), jv.DCMotor(140.0, stall_torque=2.0, inertia=0.1), (jv.FreeSpin(),)),
-            r"effects.free_spin goes with a drive of given speed \(property ideal\), not with 'dc_motor'",
+            r"effects.free_spin needs a drive of given speed \(property ideal\), not 'dc_motor'",
         ),
         (lambda: jv.with_spin(scene(BOTH), some_state(), "asleep"), "turning is 'asleep'; it must be 'rolling' or 'still'"),
         (

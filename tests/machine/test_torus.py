@@ -167,7 +167,7 @@ def test_frequency_about_the_equator_is_the_resolved_one():
             lambda: jv.Scene(
                 scene().machine, jv.balls(count=1, mass=1.0, radius=0.1, drag=0.0), scene().drive, (jv.Gravity(along="axis"),)
             ),
-            "effects.gravity.along is 'axis'; it goes with loads that move along the rotor's axis",
+            "effects.gravity.along is 'axis'; it needs loads that move along the rotor's axis",
         ),
     ],
 )

@@ -112,7 +112,7 @@ def test_arrays_that_no_memory_holds_are_refused():
 
 def test_the_same_numbers_are_looked_at_once(monkeypatch):
     looked = []
-    monkeypatch.setattr(module, "rebuilt", lambda part, section: looked.append(section))
+    monkeypatch.setattr(module, "rebuild_part", lambda part, section: looked.append(section))
     module._require_valid.cache_clear()
 
     for _ in range(3):

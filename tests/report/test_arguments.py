@@ -20,10 +20,10 @@ UNITS = {
         "rotor": PLATFORMS | INERTIA | TERMS | {"position": "m", "stations": "m"},
     },
     "loads": {
-        "ball": LOADS | {"own_radius": "m"},
-        "roller": LOADS | {"own_radius": "m"},
+        "ball": LOADS | {"ball_radius": "m"},
+        "roller": LOADS | {"ball_radius": "m"},
         "pendulum": LOADS | {"inertia": "kg m^2"},
-        "torus_ball": LOADS | {"tube": "m", "own_radius": "m"},
+        "torus_ball": LOADS | {"tube": "m", "ball_radius": "m"},
     },
     "drives": {
         "constant_speed": {"speed": "rad/s"},

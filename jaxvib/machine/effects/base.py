@@ -1,4 +1,4 @@
-"""Effects that a scene may call for. An effect that is not in the scene is not in the traced program."""
+"""Effects, gravity, and imbalances. An effect that is not in the scene is not in the traced program."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
 T = TypeVar("T", bound=Term)
 
 BALANCE_GRADE = 6.3e-3
-"""Eccentricity times speed of a rotor of an ordinary machine, m/s: grade G6.3 of ISO 21940-11."""
+"""Eccentricity times speed of an ordinary rotor, m/s: grade G6.3 of ISO 21940-11."""
 
 
 _AXES = {"up": 1, "axis": 2}
@@ -42,7 +42,7 @@ _AXES = {"up": 1, "axis": 2}
 
 
 class Typical(NamedTuple):
-    """An `effect` with usual numbers, for a scene that leaves it out, and what `says` which numbers these are."""
+    """Effect with usual numbers, for a scene without it; `says` describes these numbers."""
 
     effect: Effect
     says: str
@@ -116,15 +116,15 @@ class Effect(eqx.Module):
 
 
 class Gravity(Effect):
-    """Gravity on the loads: V = m g p_up(u), so a load on a circle feels the torque - m g R cos phi.
+    """Gravity on the loads: V = m g p_up(u), the torque - m g R cos phi on a load on a circle.
 
-    Platforms are counted from static equilibrium, loads' weight included, so that gravity adds nothing there.
+    Coordinates of platforms start at static equilibrium with the weight of the loads, so gravity adds nothing there.
 
-    **Arguments**: `g` m/s^2; `along` "up", in the plane in which the rotor turns, or "axis", along a vertical rotor's axis, for
-    loads that move along it: V = m g p_axis(u).
+    **Arguments**: `g` m/s^2; `along` "up", in the plane of rotation, or "axis", along the axis of a vertical rotor, for loads
+    that move in that direction: V = m g p_axis(u).
 
-    **Raises** `InputError` for a wrong unit, a negative value or another direction, and, by the scene, for loads that do not
-    move along the axis where gravity does.
+    **Raises** `InputError` for a wrong unit, a negative value or another direction, and, by the scene, for gravity along an
+    axis in whose direction the loads do not move.
 
     >>> import jaxvib as jv
     >>> float(jv.Gravity().g)
@@ -145,17 +145,17 @@ class Gravity(Effect):
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
         """Gravity in the rotor's plane, or along the axis if loads move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) > _AXES["axis"]:
-            return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, where that is vertical")
-        return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, where the axis lies level")
+            return Typical(cls(along="axis"), "g = 9.81 m/s^2 along the axis, if it is vertical")
+        return Typical(cls(), "g = 9.81 m/s^2 in the rotor's plane, if the axis is horizontal")
 
     def terms(self) -> tuple[Term, ...]:
         """Return the field and the loads' potential energy in it."""
         return GravityField(_AXES[self.along], self.g), LoadPotential(self.energy, is_smooth=True)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for loads that do not move along the axis, where gravity does."""
+        """**Raises** `InputError` for gravity along the axis if the loads do not move in that direction."""
         if len(jax.eval_shape(loads.position, *loads.rest())) <= _AXES[self.along]:
-            problem = f"goes with loads that move along the rotor's axis, which {loads.kind!r} do not; leave gravity out"
+            problem = f"needs loads that move along the rotor's axis, which {loads.kind!r} do not; leave gravity out"
             raise InputError("effects.gravity.along", f"is {quoted(self.along)}; it {problem}")
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:
@@ -164,11 +164,11 @@ class Gravity(Effect):
 
 
 class StaticImbalance(Effect):
-    """The rotor's mass centre lies off its axis, by e (cos(theta + angle), sin(theta + angle)) at the rotor's angle theta.
+    """Static imbalance: the rotor's mass centre lies at e (cos(theta + angle), sin(theta + angle)) off its axis.
 
-    The force on the carrier, where the rotor sits, is - M e d^2/dt^2 of that direction.
+    theta is the rotor's angle. The force on the machine at the rotor is - M e d^2/dt^2 of that direction.
 
-    **Arguments**: `moment` M e, kg m, not negative; `angle` rad, of the heavy side when the rotor's angle is 0.
+    **Arguments**: `moment` M e, kg m, not negative; `angle` rad, of the heavy side at the rotor's angle 0.
 
     **Raises** `InputError` for a wrong unit or a negative moment.
 
@@ -190,8 +190,8 @@ class StaticImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """`BALANCE_GRADE` of all the mass that the rotor moves."""
-        moment = _carried(machine)[0] * BALANCE_GRADE / speed
+        """Return `BALANCE_GRADE` of all the mass that moves with the rotor."""
+        moment = _moved_inertia(machine)[0] * BALANCE_GRADE / speed
         return Typical(cls(moment), f"{1e3 * float(moment):.3g} g m, grade G6.3 of all the mass that moves with the rotor")
 
     def terms(self) -> tuple[Term, ...]:
@@ -200,9 +200,9 @@ class StaticImbalance(Effect):
 
 
 class MomentImbalance(Effect):
-    """The rotor's principal axis leans by a small angle delta to its axis of rotation.
+    """Moment imbalance: the rotor's principal axis is inclined to its axis of rotation by a small angle delta.
 
-    It turns the carrier about its tilts with the moment - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
+    The moment about the tilts of the machine is - (A - C) delta d^2/dt^2 (cos(theta + angle), sin(theta + angle)).
 
     **Arguments**: `moment` (A - C) delta, kg m^2, of either sign; `angle` rad (- gamma in the paper).
 
@@ -226,8 +226,8 @@ class MomentImbalance(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """`BALANCE_GRADE` at the radius of gyration on either side, where the machine can tilt."""
-        mass, inertia = _carried(machine)
+        """Return `BALANCE_GRADE` at the radius of gyration on either side; None if the machine cannot tilt."""
+        mass, inertia = _moved_inertia(machine)
         if inertia is None:
             return None
         moment = jnp.sqrt(mass * inertia) * BALANCE_GRADE / speed
@@ -240,14 +240,14 @@ class MomentImbalance(Effect):
     def validate(self, machine: Machine, loads: Loads) -> None:
         """**Raises** `InputError` for a machine that cannot tilt."""
         if machine.mounting().tilt is None:
-            raise InputError("effects.moment_imbalance", f"goes with a rotor that can tilt, not with {quoted(machine.kind)}")
+            raise InputError("effects.moment_imbalance", f"needs a rotor that can tilt, not {quoted(machine.kind)}")
 
 
-def _carried(machine: Machine) -> tuple[Array, Array | None]:
-    """The mass (kg) that a force on the exciter meets, and the inertia (kg m^2) that a moment meets; None without a tilt."""
+def _moved_inertia(machine: Machine) -> tuple[Array, Array | None]:
+    """Return the mass (kg) that a force on the exciter moves, and the inertia (kg m^2) that a moment moves, or None."""
     mass, mount = machine.carrier().mass, machine.mount()
 
-    def met(rows: Array) -> Array:
+    def moved(rows: Array) -> Array:
         return 1.0 / (rows @ jnp.linalg.solve(mass, rows.T))[0, 0]
 
-    return met(mount.rows[0]), None if mount.tilt is None else met(mount.tilt)
+    return moved(mount.rows[0]), None if mount.tilt is None else moved(mount.tilt)

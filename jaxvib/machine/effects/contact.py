@@ -1,4 +1,4 @@
-"""Loads that touch each other on their track."""
+"""Contact between loads on one track."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ __all__ = ["LoadContact", "damping_ratio"]
 
 
 class LoadContact(Effect):
-    """Loads that have a size press against each other where they would overlap.
+    """Contact forces between loads with a size, while they overlap.
 
         force between centres = max(0, k (2 r - s) - c s'),    s the distance of the centres
 
     r is the loads' `ball_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
-    follows load j, and load 1 follows the last one a turn later, so that N pairs are all there are. A state to start from has
-    its angles in this order, less than a turn apart; the named ones lay loads that are together side by side. Loads with
-    several coordinates meet in any pair, s = |p(u_i) - p(u_j)|, and may start where no two are nearer than 0.9 of 2 r.
+    follows load j, and load 1 follows the last one a turn later, so there are N pairs. A start has its angles in this order,
+    less than a turn apart; named starts place coincident loads side by side. With several coordinates each pair can touch,
+    s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 of 2 r.
 
-    Two loads that meet on a track that does not give way part with the share e of the speed with which they met,
+    Two loads on a track at rest separate with the share e of their approach speed, the restitution
 
         e = exp(-(pi - 2 beta) tan beta),    sin beta = zeta = c / (2 sqrt(k mu)),    mu = kappa m / (2 (1 - (r/R)^2)),
 
-    in cosh gamma = zeta > 1: e = exp(-2 gamma coth gamma), and lose the share 1 - e^2 of the energy of their relative motion.
-    What they were rolling with is counted in, friction between the loads is not. A contact lasts about pi sqrt(mu/k), which
-    steps must resolve: equal steps need ten for each, and `ensemble` and `capture` take as many unless told.
+    if zeta <= 1, otherwise e = exp(-2 gamma coth gamma) with cosh gamma = zeta. They lose the share 1 - e^2 of the energy of
+    their relative motion, rolling included; friction between loads is neglected. A contact lasts about pi sqrt(mu/k), which
+    steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
 
-    **Arguments**: `stiffness` k N/m; `damping` c N s/m, or in its place `restitution` e, above 0, up to 1.
+    **Arguments**: `stiffness` k N/m; `damping` c N s/m, or instead `restitution` e, above 0, up to 1.
 
     **Raises** `InputError` for values that are not allowed, for damping beside a restitution, and, by the scene, for loads
     without a ball radius, or with a restitution for loads that differ.
@@ -49,8 +49,7 @@ class LoadContact(Effect):
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)
     1000000.0
 
-    Source: asked for by Strautmanis et al. 2018; a linear spring and damper between the centres, let go where they would pull
-    (Schwager and Poeschel 2007).
+    Source: a linear spring and damper between the centres that never pull (Schwager and Poeschel 2007).
     """
 
     stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, open_low=True, words="stiffness of contacts between loads"))
@@ -67,7 +66,7 @@ class LoadContact(Effect):
         if restitution is not None:
             self.restitution = read(restitution=restitution)["restitution"]
             if when_known(lambda damping: damping == 0.0, self.damping) is not True:
-                problem = "goes without damping, which it stands for; leave one of them out"
+                problem = "excludes damping, which it determines; leave one of them out"
                 raise InputError("effects.load_contact.restitution", problem)
         self.kind = "load_contact"
 
@@ -86,22 +85,24 @@ class LoadContact(Effect):
     def validate_start(self, loads: Loads, u: Coordinates) -> None:
         """**Raises** `InputError` if loads on a circle are not in order within a turn, or if others overlap."""
         if not loads.circular:
-            self._require_apart(loads, u)
+            self._require_distances(loads, u)
             return
         phi = np.asarray(u[0])
         wrong = ~np.all(np.diff(phi, axis=-1) > 0.0, axis=-1) | ~(phi[..., -1] - phi[..., 0] < 2.0 * np.pi)
         if np.any(wrong):
             which = np.round(phi[wrong][0] if phi.ndim > 1 else phi, 4).tolist()
             problem = "loads in contact never pass each other: each angle must be above the one before, all within one turn"
-            raise InputError("start.angle", f"is {which} rad; {problem} (add 2 pi where a load is a turn behind, or sort them)")
+            raise InputError(
+                "start.angle", f"is {which} rad; {problem} (add 2 pi to loads that are a turn behind, or sort them)"
+            )
 
-    def _require_apart(self, loads: Loads, u: tuple[Array, ...]) -> None:
+    def _require_distances(self, loads: Loads, u: tuple[Array, ...]) -> None:
         place = loads.position(*u) if np.ndim(u[0]) == 1 else jax.vmap(lambda each, v: each.position(*v))(loads, u)
         points = np.stack([np.asarray(x) for x in place], axis=-1).reshape(-1, loads.count, len(place))
         wide = 2.0 * np.asarray(ball_radius(loads)).reshape(-1, 1, 1)
         apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1) / wide
         apart = np.where(np.eye(loads.count, dtype=bool), np.inf, apart)
-        if np.min(apart) < _NEAREST:
+        if np.min(apart) < _MIN_START_DISTANCE:
             run, i, j = np.unravel_index(np.argmin(apart), apart.shape)
             size = float(np.broadcast_to(wide, (apart.shape[0], 1, 1))[run, 0, 0])
             problem = f"puts loads {i + 1} and {j + 1} inside each other, {round(apart[run, i, j], 6) * size:.4g} m apart"
@@ -109,7 +110,7 @@ class LoadContact(Effect):
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
         """Return sqrt(k / mu), the natural frequency of a contact."""
-        return jnp.sqrt(self.stiffness / self._reduced(loads))
+        return jnp.sqrt(self.stiffness / self._reduced_mass(loads))
 
     def prepare(self, loads: Loads) -> LoadContact:
         """Return the contact with the damping that gives its restitution."""
@@ -143,41 +144,43 @@ class LoadContact(Effect):
         )
 
     def _damping(self, loads: Loads) -> Array:
-        """c, as it is given or as the restitution asks for."""
+        """Return c, from the restitution if that is set."""
         if self.restitution is None:
             return self.damping
-        return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * self._reduced(loads))
+        return 2.0 * damping_ratio(self.restitution) * jnp.sqrt(self.stiffness * self._reduced_mass(loads))
 
-    def _reduced(self, loads: Loads) -> Array:
-        """mu, of the lightest loads where they differ."""
+    def _reduced_mass(self, loads: Loads) -> Array:
+        """Return mu, for the lightest loads if they differ."""
         return 0.5 * loads.inertia_factor() * jnp.min(loads.mass) / (1.0 - (ball_radius(loads) / loads.arm()[0]) ** 2)
 
 
-_NEAREST = 0.9
-"""Loads may start so near to each other, in their diameters: those of a run that is gone on with may be pressed together."""
+_MIN_START_DISTANCE = 0.9
+"""Least distance of loads at a start, in their diameters: another run may start while loads press on each other."""
 
 
 def damping_ratio(restitution: Array) -> Array:
-    """zeta = c / (2 sqrt(k mu)) of a spring and damper that never pull, after whose contact the share `restitution` is left.
+    """Return zeta = c / (2 sqrt(k mu)) of a spring and damper that never pull, from the `restitution`.
 
     >>> import jax.numpy as jnp
     >>> [round(float(damping_ratio(jnp.asarray(e))), 6) for e in (0.9, 0.5, 0.1)]
     [0.034265, 0.255276, 1.243188]
     """
-    wanted = -jnp.log(restitution)
-    # Newton's method from a fit that is right at both ends and good to 2 % between them.
-    ratio = jnp.where(wanted < 2.0, wanted / jnp.sqrt(jnp.pi**2 + wanted * (wanted - 4.93)), jnp.cosh(0.5 * (wanted - 2.0)))
-    for _ in range(_NEWTON):
+    exponent = -jnp.log(restitution)
+    # Newton's method from a fit that is exact at both ends and accurate to 2 % between them.
+    ratio = jnp.where(
+        exponent < 2.0, exponent / jnp.sqrt(jnp.pi**2 + exponent * (exponent - 4.93)), jnp.cosh(0.5 * (exponent - 2.0))
+    )
+    for _ in range(_NEWTON_STEPS):
         loss, slope = jax.jvp(_loss, (ratio,), (jnp.ones_like(ratio),))
-        ratio = ratio + (wanted - loss) / slope
+        ratio = ratio + (exponent - loss) / slope
     return ratio
 
 
-_NEWTON = 5
+_NEWTON_STEPS = 5
 
 
 def _loss(ratio: Array) -> Array:
-    """-log e: (pi - 2 beta) tan beta, sin beta = zeta; 2 gamma coth gamma, cosh gamma = zeta."""
+    """Return -log e: (pi - 2 beta) tan beta, sin beta = zeta; 2 gamma coth gamma, cosh gamma = zeta."""
     near = ratio - 1.0
     middle = jnp.abs(near) < 1e-3
     under, over = jnp.where(ratio < 0.999, ratio, 0.5), jnp.where(ratio > 1.001, ratio, 2.0)
@@ -188,8 +191,7 @@ def _loss(ratio: Array) -> Array:
 
 
 def _clearances(loads: Loads, u: tuple[Array, ...]) -> list[Array]:
-    """Distances surface to surface, negative where they overlap, between each load and the one so many further, for every such
-    number: every pair once."""
+    """Return distances between surfaces, negative for an overlap: of each load and the k-th next, each pair once."""
     own = ball_radius(loads)
     if isinstance(loads, CircularLoads):
         (phi,) = u

@@ -1,4 +1,4 @@
-"""Supports that are not linear: hardening springs and stops."""
+"""Nonlinear supports: cubic springs and stops."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["CubicSupport", "Stop"]
 
 
 class _Support(Effect):
-    """A support to the bed at a platform, or around a rotor's axis at a distance from its mass centre."""
+    """Support on the foundation at a platform, or around a rotor's axis at a distance from its mass centre."""
 
     repeatable = True
     platform: eqx.AbstractVar[int | None]
@@ -35,7 +35,9 @@ class _Support(Effect):
         return machine.rows_at(self.position, f"effects.{self.kind}.position")
 
 
-def _where(part: type[_Support], kind: str, platform: int | None, position: Number | None) -> tuple[int | None, Array | None]:
+def _read_place(
+    part: type[_Support], kind: str, platform: int | None, position: Number | None
+) -> tuple[int | None, Array | None]:
     if platform is not None and position is not None:
         raise InputError(f"effects.{kind}", "names a platform and a position; a support has one place")
     if platform is not None and (isinstance(platform, bool) or not isinstance(platform, int) or platform < 1):
@@ -44,10 +46,10 @@ def _where(part: type[_Support], kind: str, platform: int | None, position: Numb
 
 
 class CubicSupport(_Support):
-    """A support that hardens (or softens): force k3 r^2 x on the bed, r the distance from the rest position.
+    """Hardening (or softening) support: force k3 r^2 x on the foundation, r the distance from the rest position.
 
-    **Arguments**: `stiffness` k3 N/m^3, negative where the support softens; `platform` that it stands under (1 unless said
-    otherwise), or `position` along a rotor's axis, m from the rotor's mass centre.
+    **Arguments**: `stiffness` k3 N/m^3, negative for a softening support; `platform` above it (default: 1), or `position` along
+    a rotor's axis, m from the rotor's mass centre.
 
     **Raises** `InputError` for values that are not allowed, and, by the scene, for a place that the machine does not have.
 
@@ -64,12 +66,14 @@ class CubicSupport(_Support):
     def __init__(self, stiffness: Number, platform: int | None = None, position: Number | None = None):
         self.kind = "cubic_support"
         self.stiffness = read_numbers(CubicSupport, "effects.cubic_support", stiffness=stiffness)["stiffness"]
-        self.platform, self.position = _where(CubicSupport, self.kind, platform, position)
+        self.platform, self.position = _read_place(CubicSupport, self.kind, platform, position)
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """At the platform, or around the rotor's axis, that moves most of those on supports: 1 % stiffer at its amplitude in
-        the mean of a swing, (3/4) k3 a^2 = 0.01 k."""
+        """Return a support that is 1 % stiffer at the amplitude a in the mean of a swing, (3/4) k3 a^2 = 0.01 k.
+
+        It is at the supported platform with the largest motion, or around the rotor's axis.
+        """
         carrier = machine.carrier()
         length = jnp.asarray([unit == "m" for unit in carrier.units])
         moved = jnp.where(jnp.any(carrier.bed_stiffness != 0.0, axis=0) & length, jnp.abs(amplitude), 0.0)
@@ -92,9 +96,9 @@ class CubicSupport(_Support):
 
 
 class Stop(_Support):
-    """A stop that the machine meets after a gap: force k (x - gap) + c x' while it presses, never pulling.
+    """Stop beyond a gap: force k (x - gap) + c x' on the foundation while it presses; it never pulls.
 
-    Under a platform it stops the motion on the sides named; around a rotor's axis it is a ring of radius `gap`.
+    Under a platform it acts on the chosen sides; around a rotor's axis it is a ring of radius `gap`.
 
     **Arguments**: `stiffness` k N/m; `gap` m; `damping` c N s/m; `side` "above", "below" or "both" (platforms only);
     `platform` or `position` as `CubicSupport`.
@@ -128,10 +132,10 @@ class Stop(_Support):
         self.stiffness, self.gap, self.damping = given.values()
         require_one_of(side, ("above", "below", "both"), "effects.stop.side")
         self.side = side
-        self.platform, self.position = _where(Stop, self.kind, platform, position)
+        self.platform, self.position = _read_place(Stop, self.kind, platform, position)
 
-    def _beyond(self, displacement: Array) -> tuple[Array, Array]:
-        """Distance of the motion beyond the gap (negative: free), and the direction (k,) in which it presses."""
+    def _penetration(self, displacement: Array) -> tuple[Array, Array]:
+        """Return the penetration beyond the gap (negative: free), and its direction (k,)."""
         if displacement.shape[0] == 1:
             x = displacement[0]
             sign = {"above": jnp.ones_like(x), "below": -jnp.ones_like(x)}.get(self.side, jnp.where(x < 0.0, -1.0, 1.0))
@@ -153,11 +157,11 @@ class Stop(_Support):
 
     def energy(self, displacement: Array) -> Array:
         """Return k (x - gap)^2 / 2 beyond the gap, J."""
-        beyond, _ = self._beyond(displacement)
-        return 0.5 * self.stiffness * jnp.maximum(beyond, 0.0) ** 2
+        penetration, _ = self._penetration(displacement)
+        return 0.5 * self.stiffness * jnp.maximum(penetration, 0.0) ** 2
 
     def resistance(self, displacement: Array, velocity: Array) -> Array:
         """Return c x' while the stop presses, (k,) N; a stop never pulls."""
-        beyond, direction = self._beyond(displacement)
+        penetration, direction = self._penetration(displacement)
         closing = self.damping * jnp.sum(direction * velocity)
-        return jnp.where(beyond > 0.0, jnp.maximum(closing, -self.stiffness * beyond), 0.0) * direction
+        return jnp.where(penetration > 0.0, jnp.maximum(closing, -self.stiffness * penetration), 0.0) * direction
