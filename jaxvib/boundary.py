@@ -195,10 +195,10 @@ def is_whole(value: object) -> bool:
 
 def _require(value: Any, kind: Any, field: str) -> None:
     """**Raises** `InputError` for a value that is not of that kind."""
-    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    kinds = _alternatives(kind)
     if any(_is_number_with_unit(each) for each in kinds):
         return
-    if any(set(typing.get_args(alike)) <= set(kinds) for alike in (np_typing.ArrayLike, jax_typing.ArrayLike)):
+    if any(set(_alternatives(alike)) <= set(kinds) for alike in (np_typing.ArrayLike, jax_typing.ArrayLike)):
         problem = _problem_of_array(value)
         if problem is not None and not (value is None and type(None) in kinds):
             raise InputError(field, f"is {quoted(value)}; it must be {problem}")
@@ -222,6 +222,14 @@ def _require(value: Any, kind: Any, field: str) -> None:
     words = [problem for problem in problems if problem != "None"] or ["None"]
     example = f", {_EXAMPLES[field]}" if field in _EXAMPLES else ""
     raise InputError(field, f"is {quoted(value)}; it must be {' or '.join(dict.fromkeys(words))}{example}")
+
+
+def _alternatives(kind: Any) -> tuple[Any, ...]:
+    """Return the members of a union, or the annotation itself; NumPy 2.5 defines `ArrayLike` by `type`, an alias of a union."""
+    kind = getattr(kind, "__value__", kind)
+    if typing.get_origin(kind) in (Union, types.UnionType):
+        return tuple(each for member in typing.get_args(kind) for each in _alternatives(member))
+    return (kind,)
 
 
 def _other_classes(kinds: Sequence[Any]) -> tuple[type, ...]:
@@ -288,14 +296,14 @@ def _is_traced(value: Any) -> bool:
 
 def _has_array(kind: Any) -> bool:
     """Return True if an array is the only list of numbers that is allowed."""
-    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    kinds = _alternatives(kind)
     others = any(typing.get_origin(each) is not None or _is_number_with_unit(each) for each in kinds)
     return any(map(_is_array, kinds)) and not others
 
 
 def _is_list(kind: Any) -> bool:
     """Return True if lists and tuples are allowed and arrays are not."""
-    kinds = typing.get_args(kind) if typing.get_origin(kind) in (Union, types.UnionType) else (kind,)
+    kinds = _alternatives(kind)
     origins = [typing.get_origin(each) for each in kinds]
     lists = any(isinstance(each, type) and issubclass(each, (Sequence, list, tuple)) for each in origins)
     inner = [each for one in kinds for each in typing.get_args(one) or (one,)]

@@ -3,7 +3,7 @@
 import decimal
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, Union
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.boundary import call_user, is_real, is_whole, validated
+from jaxvib.boundary import _alternatives, call_user, is_real, is_whole, validated
 from jaxvib.errors import require_path
 from jaxvib.units import Number
 
@@ -169,3 +169,13 @@ def test_choices_of_steps_hold_numbers_only(choice):
     for wrong in ("small", True, 1j, None, b"12", np.ma.masked):
         with pytest.raises(jv.InputError, match=r"^(tolerance|error|steps) (is .*, which is not a number|has masked values)"):
             choice(wrong)
+
+
+def test_named_aliases_of_unions_are_resolved():
+    """`type ArrayLike = ...` of newer NumPy, which Python 3.11 cannot write."""
+
+    class Alias:
+        __value__ = int | Sequence[float]
+
+    assert _alternatives(Alias) == (int, Sequence[float])
+    assert _alternatives(Union[Alias, None]) == (int, Sequence[float], type(None))  # noqa: UP007

@@ -126,7 +126,8 @@ def number(
     >>> float(number("2 t", "kg", "machine.mass"))
     2000.0
     """
-    return jnp.asarray(_number(value, unit, field, Bounds(low, open_low, high, open_high)))
+    # With a dtype JAX moves NumPy's array to the device; without, it compiles a program for each shape.
+    return jnp.asarray(_number(value, unit, field, Bounds(low, open_low, high, open_high)), dtype=float)
 
 
 def known_number(value: Number, unit: str, field: str, *, low: float = -math.inf, open_low: bool = False) -> Any:
@@ -197,7 +198,7 @@ def numbers(
 
 
 def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array:
-    return jnp.asarray(_converted(value, unit, field, shape, bounds))
+    return jnp.asarray(_converted(value, unit, field, shape, bounds), dtype=float)  # as in `number`
 
 
 def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
