@@ -39,12 +39,12 @@ def describe(group: str | None, name: str | None, output: Output) -> None:
                     argument["name"],
                     argument["unit"],
                     "needed" if argument["needed"] else argument["default"] or "none",
-                    ", ".join(argument["allowed"]),
+                    ", ".join(argument["allowed"]) or argument["bounds"],
                 ]
                 for argument in part["arguments"]
             ]
             parts.append(f"{part['kind']}: {part['about']}")
-            parts.append(table("", ["argument", "unit", "default", "one of"], rows))
+            parts.append(table("", ["argument", "unit", "default", "allowed"], rows))
         if name is not None:
             parts.append(_manual(kinds[name]))
         return "\n".join(parts)

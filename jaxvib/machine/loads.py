@@ -36,7 +36,7 @@ __all__ = [
 
 MASS = unit("kg", low=0.0, open_low=True, each="load")
 DRAG = unit("N s/m", low=0.0, each="load")
-BALL_RADIUS = unit("m", low=0.0, open_low=True, words="ball radius of each {load}")
+BALL_RADIUS = unit("m", low=0.0, open_low=True, words="radius of each {load}")
 
 
 class NormalForce(NamedTuple):

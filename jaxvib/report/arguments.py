@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import EFFECTS, SECTIONS, suggest_name
-from jaxvib.machine.numbers import number_specs
+from jaxvib.machine.numbers import PLAIN, number_specs
 
-__all__ = ["GROUPS", "Argument", "arguments_of", "described", "units_of_fields"]
+__all__ = ["GROUPS", "Argument", "arguments_of", "described", "part_of"]
 
 GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
     "machines": SECTIONS["machine"],
@@ -24,33 +24,35 @@ GROUPS: Mapping[str, Mapping[str, Callable[..., object]]] = {
 
 class Argument(NamedTuple):
     """One argument of a part: its `name`; its `unit`, "" for none; whether it must be given, `needed`; its `default` as text,
-    None where there is none; the `allowed` texts, where it is one of several."""
+    None where there is none; the `allowed` texts, where it is one of several; the `bounds` of a number in words."""
 
     name: str
     unit: str
     needed: bool
     default: str | None
     allowed: tuple[str, ...]
+    bounds: str
 
 
 def arguments_of(build: Callable[..., object]) -> list[Argument]:
     """Return the arguments of the class or function that builds a part of a scene, such as `jv.balls`.
 
-    Units are those of the part's fields of the same names.
+    Units and bounds are those of the part's fields of the same names.
 
     >>> import jaxvib as jv
-    >>> [(a.name, a.unit, a.needed, a.default) for a in arguments_of(jv.Stop)][1:3]
-    [('gap', 'm', True, None), ('damping', 'N s/m', False, '0.0')]
+    >>> [(a.name, a.unit, a.needed, a.default, a.bounds) for a in arguments_of(jv.Stop)][1:3]
+    [('gap', 'm', True, None, 'at least 0'), ('damping', 'N s/m', False, '0.0', 'at least 0')]
     """
-    specs, found = number_specs(_part_of(build)), []
+    found, specs = [], number_specs(part_of(build))
     for name, parameter in inspect.signature(build).parameters.items():
         default = None if parameter.default in (parameter.empty, None) else _shown(parameter.default)
-        unit = specs[name].unit if name in specs else ""
-        found.append(Argument(name, unit, parameter.default is parameter.empty, default, _choices(build, parameter)))
+        spec = specs.get(name, PLAIN)
+        needed = parameter.default is parameter.empty
+        found.append(Argument(name, spec.unit, needed, default, _choices(build, parameter), spec.bounds.words))
     return found
 
 
-def _part_of(build: Callable[..., object]) -> type:
+def part_of(build: Callable[..., object]) -> type:
     """Return the class of the part that a class or a function builds."""
     if isinstance(build, type):
         return build
@@ -78,9 +80,3 @@ def described(group: str, name: str) -> Callable[..., object]:
     if name not in GROUPS[group]:
         raise InputError("name", f"is {quoted(name)}; {suggest_name(name, list(GROUPS[group]))}")
     return GROUPS[group][name]
-
-
-def units_of_fields(section: str, kind: str) -> dict[str, str]:
-    """Units of the fields of a table of a scene file, such as ("machine", "two_mass"), or of ("effects", an effect)."""
-    kinds = EFFECTS if section == "effects" else SECTIONS[section]
-    return {argument.name: argument.unit for argument in arguments_of(kinds[kind])} if kind in kinds else {}

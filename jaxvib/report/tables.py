@@ -7,9 +7,9 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias, TypeGuard
 
-from jaxvib.machine.files import scene_to_toml
+from jaxvib.machine.files import EFFECTS, scene_to_toml
+from jaxvib.machine.numbers import number_specs
 from jaxvib.machine.scene import Scene
-from jaxvib.report.arguments import units_of_fields
 from jaxvib.results.fields import Plain
 
 __all__ = ["Units", "escaped", "parameters", "results", "worth"]
@@ -70,11 +70,15 @@ def parameters(scene: Scene) -> str:
     parts = []
     for section in ("machine", "loads", "drive"):
         kind = str(tables[section].pop("kind"))
-        parts.append((f"{section}: {_words(kind)}", tables[section], units_of_fields(section, kind)))
+        parts.append((f"{section}: {_words(kind)}", tables[section], _units(type(getattr(scene, section)))))
     for name, value in tables["effects"].items():
         for each in value if isinstance(value, list) else [value]:
-            parts.append((f"effect: {_words(name)}", each, units_of_fields("effects", name)))
+            parts.append((f"effect: {_words(name)}", each, _units(EFFECTS[name])))
     return "".join(f"<h3>{escaped(title)}</h3>{_pairs(list(table.items()), units)}" for title, table, units in parts)
+
+
+def _units(part: type) -> Units:
+    return {name: spec.unit for name, spec in number_specs(part).items()}
 
 
 def _entries(value: Plain) -> TypeGuard[list[Mapping[str, Plain]]]:

@@ -1,14 +1,25 @@
 """Numbers of scenes by name: where they stand, what a designer calls them, in which unit they are shown."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from plugins.drive import Turbine
+from programs.golden import scenes as golden_scenes
 from rotors import machine as rotor_machine
-from scenes import scene
+from scenes import BALLS, machines, scene
+from scenes import ROTOR as ROTOR_NUMBERS
 
 import jaxvib as jv
-from jaxvib.machine.numbers.named import find_number, put_numbers, read_value
+from jaxvib.machine.files import EFFECTS, SECTIONS
+from jaxvib.machine.numbers import number_specs
+from jaxvib.machine.numbers.named import find_number, numbers_of, put_numbers, read_value
+from jaxvib.report.arguments import GROUPS, arguments_of, part_of
+from jaxvib.sweeps.axes import axis_of
 from jaxvib.units import shown_unit
+from optimize import DesignSpace
 
 
 @pytest.mark.parametrize(
@@ -112,3 +123,122 @@ def test_values_of_names_have_their_unit_and_range():
     ):
         with pytest.raises(jv.InputError):
             read_value(name, value)
+
+
+def every_scene():
+    """The golden scenes, which have every part, and what their parts leave out."""
+    terms = jv.rotor(**ROTOR_NUMBERS, stiffness_terms=(1e6, 0.0, 3e4), damping_terms=(800.0, 1.0, 20.0))
+    sized = jv.balls(**BALLS, ball_radius=0.02)
+    supports = (jv.CubicSupport(1e9, position=0.1), jv.Stop(1e6, gap=0.01, position=0.1), jv.Stop(1e6, gap=0.02, position=-0.1))
+    speed = jv.ConstantSpeed(120.0)
+    return golden_scenes() | {
+        "rotor with terms": jv.Scene(terms, sized, speed, supports),
+        "restitution": jv.Scene(machines()["one_mass"], sized, speed, (jv.LoadContact(1e5, restitution=0.5),)),
+    }
+
+
+SCENES = every_scene()
+PART_CLASSES = {
+    **{kind: part_of(build) for section in SECTIONS.values() for kind, build in section.items()},
+    **EFFECTS,
+}
+
+
+def single_numbers(of):
+    return [one for number in numbers_of(of).values() for one in number.single(of)]
+
+
+def free_numbers(of):
+    """Without the damping of contacts that have a restitution in its place."""
+    replaced = any(getattr(effect, "restitution", None) is not None for effect in of.effects)
+    return [n for n in single_numbers(of) if not (replaced and n.name == "effects.load_contact.damping")]
+
+
+def moved(number, of):
+    """A value near that of a number, and itself."""
+    value = float(number.read(of)[0])
+    return value, value * 1.001 if value else 1e-3 * (number.spec.typical or 1.0)
+
+
+@pytest.mark.parametrize("kind", PART_CLASSES)
+def test_every_array_of_a_part_has_a_unit(kind):
+    arrays = [f.name for f in dataclasses.fields(PART_CLASSES[kind]) if "Array" in str(f.type)]
+    specs = number_specs(PART_CLASSES[kind])
+    assert list(specs) == arrays
+    assert all(spec.bounds.low == 0.0 or spec.typical for spec in specs.values())
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_number_of_a_scene_has_one_name(name):
+    of = SCENES[name]
+    every = single_numbers(of)
+    assert len(every) == sum(np.size(leaf) for leaf in jax.tree.leaves(of)) == len({next(iter(one.entries)) for one in every})
+    for number in every:
+        found = find_number(of, number.name, "free")
+        assert found == number and len(found.words(of)) == 1 and "{" not in found.words(of)[0]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_number_is_changed_by_its_name_alone(name):
+    of = SCENES[name]
+    every = single_numbers(of)
+    before = np.concatenate([number.read(of) for number in every])
+    for k, number in enumerate(every):
+        value, new = moved(number, of)
+        after = put_numbers(of, (number,), jnp.asarray([new]))
+        expected = before.copy()
+        expected[k] = new
+        np.testing.assert_array_equal(np.concatenate([one.read(after) for one in every]), expected)
+        assert jax.tree.structure(after) == jax.tree.structure(of) and value == before[k]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_number_stands_in_the_scene_file(name):
+    of = SCENES[name]
+    for number in free_numbers(of):
+        after = put_numbers(of, (number,), jnp.asarray([moved(number, of)[1]]))
+        again = jv.scene_from_toml(jv.scene_to_toml(after))
+        np.testing.assert_array_equal(number.read(again), number.read(after))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_number_is_swept_and_freed(name):
+    of = SCENES[name]
+    for number in free_numbers(of):
+        low, high = sorted(moved(number, of))
+        axis = axis_of(of, number.name, [low, high])
+        assert axis.unit == number.unit and axis.values.tolist() == [low, high]
+        space = DesignSpace(of, {number.name: (low, high)})
+        np.testing.assert_allclose(number.read(space.at(jnp.array([0.5]))), [0.5 * (low + high)], rtol=1e-12)
+        with pytest.raises(jv.InputError, match="give the bounds as"):
+            DesignSpace(of, {number.name: None})
+        if number.spec.bounds.low == 0.0:
+            with pytest.raises(jv.InputError, match="is -1"):
+                DesignSpace(of, {number.name: (-1.0, 1.0)})
+            with pytest.raises(jv.InputError, match="is -1"):
+                axis_of(of, number.name, [-1.0])
+
+
+def test_described_units_and_bounds_are_those_of_fields():
+    for kinds in GROUPS.values():
+        for kind, build in kinds.items():
+            for argument in arguments_of(build):
+                spec = number_specs(PART_CLASSES[kind]).get(argument.name)
+                assert (argument.unit, argument.bounds) == (spec.unit, spec.bounds.words) if spec else argument.unit == ""
+
+
+def test_zero_is_absent_only_where_it_means_that():
+    middle = rotor_machine(stations=(0.0, 0.1), stiffness=(0.0, 5e5))
+    of = jv.Scene(middle, jv.balls(count=2, mass=0.2, radius=0.08, drag=[0.0, 5.0]), jv.ConstantSpeed(460.0))
+    sizes = {
+        name: DesignSpace(of, {name: bounds}).size
+        for name, bounds in (("machine.stations", (-0.1, 0.1)), ("machine.stiffness", (1e5, 1e6)), ("loads.drag", (1.0, 9.0)))
+    }
+    assert sizes == {"machine.stations": 2, "machine.stiffness": 1, "loads.drag": 1}
+
+
+def test_numbers_of_own_parts_are_named_without_metadata():
+    of = jv.Scene(machines()["two_mass"], jv.balls(**BALLS), Turbine(160.0, stall_torque=3.0, inertia=0.02))
+    torque = find_number(of, "drive.stall_torque", "axes")
+    assert torque.unit == "" and torque.words(of) == ["stall torque"]
+    assert float(put_numbers(of, (torque,), jnp.array([4.0])).drive.stall_torque) == 4.0

@@ -3,7 +3,7 @@
 import pytest
 
 import jaxvib as jv
-from jaxvib.report.arguments import GROUPS, arguments_of, described, units_of_fields
+from jaxvib.report.arguments import GROUPS, arguments_of, described
 
 PLATFORMS = {"mass": "kg", "stiffness": "N/m", "damping": "N s/m"}
 LINKED = PLATFORMS | {"link_stiffness": "N/m", "link_damping": "N s/m"}
@@ -51,8 +51,6 @@ UNITS = {
 def test_every_number_of_a_part_has_its_unit(group, kind):
     listed = {argument.name: argument.unit for argument in arguments_of(described(group, kind)) if argument.unit}
     assert listed == UNITS[group][kind]
-    section = {"machines": "machine", "loads": "loads", "drives": "drive", "effects": "effects"}[group]
-    assert {name: unit for name, unit in units_of_fields(section, kind).items() if unit} == listed
 
 
 def test_parts_are_those_of_the_list():
@@ -69,4 +67,3 @@ def test_needed_arguments_have_no_default():
 def test_an_unknown_part_is_refused(group, name, field):
     with pytest.raises(jv.InputError, match=rf"^{field} is '.*'; did you mean '(machines|rotor)'"):
         described(group, name)
-    assert units_of_fields("machine", "nothing") == {}

@@ -191,7 +191,7 @@ def _why_unnamed(scene: Scene, name: str) -> str:
     return "has entries of different units" if _is_continuous(value) else f"is {quoted(value)}, which is no continuous number"
 
 
-def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array) -> Scene:
+def put_numbers(scene: Scene, found: Sequence[NamedNumber], values: Array | np.ndarray) -> Scene:
     """The scene with these values (sum of the sizes,), SI, one after the other."""
     leaves: dict[_Path, Array] = {}
     start = 0

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 
 from jaxvib.boundary import call_user, is_real, validated
 from jaxvib.errors import ComputationError, InputError, quoted
+from jaxvib.machine.numbers.named import NamedNumber, find_number, numbers_of, put_numbers
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit
@@ -67,11 +68,12 @@ class ImplicitRoute(NamedTuple):
 class GradientCheck(Result):
     """Derivatives of a quantity by the numbers p of a scene, route by route, against finite differences.
 
-    All derivatives are p dq/dp, what a relative change of the number changes, in the quantity's own unit. **Attributes**
+    All derivatives are p dq/dp, the change per relative change of the number, in the quantity's own unit; of a number that is
+    0, p is its typical size (an angle's is 1 rad, a position's 0.1 m). **Attributes**
     (n numbers, r routes, k steps): `value` of the quantity; `numbers`: their names (n,), `at` their values (n,) in SI;
     `routes`: their names (r,); `gradient` (r, n); `difference` (n,) by finite differences, `noise` (n,) what these may be off,
     `step` (n,) relative, the best one; `error` (r, n) of each route against them, relative; `steps` (k,) of the sweep and
-    `sweep` (n, k) the central differences at each; `tolerance`; `left_out`: numbers that are 0, of which no relative step can
+    `sweep` (n, k) the central differences at each; `tolerance`; `left_out`: numbers so near to a bound that no step can
     be made.
     """
 
@@ -101,7 +103,7 @@ class GradientCheck(Result):
             floor = f"finite differences good to {self.noise[i] / scale[i]:.1e} at a step of {self.step[i]:.1e}"
             lines.append(f"  {self.numbers[i]}: {self.difference[i]:.9g}; {found}; {floor}")
         if self.left_out:
-            lines.append(f"  not asked, they are 0: {', '.join(self.left_out)}")
+            lines.append(f"  left out, at a bound: {', '.join(self.left_out)}")
         return "\n".join(lines)
 
     def require(self) -> GradientCheck:
@@ -150,8 +152,9 @@ def check_gradients(
     **Arguments**
 
     - `quantity`: a function of a `Scene` that gives one number, such as `lambda s: jv.jam_modes(s).select(3).foundation_force`
-    - `free`: names of the numbers, such as "machine.stiffness" or "loads.drag": all their entries; unless said otherwise all
-      numbers of the scene. Those that are 0 are left out
+    - `free`: names of the numbers, such as "machine.stiffness", "loads.drag" or "effects.stop[0].gap": all their entries;
+      default: all numbers of the scene. A number that is 0 is moved by steps of its typical size; one at a bound, such as a
+      damping of 0, is left out
     - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
       it is given `diffrax.ForwardMode()`, and then forward)
     - `implicit`: a third route for a quantity that reads off what solves an equation, see `ImplicitRoute`
@@ -178,11 +181,14 @@ def check_gradients(
         raise InputError("routes", f"are {quoted(list(routes))}; name some of {', '.join(_MODES)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise InputError("tolerance", f"is {quoted(tolerance)}; it must be a number between 0 and 1, such as 1e-5")
-    numbers, left_out, put = _numbers(scene, free)
-    at = np.asarray([float(each.value) for each in numbers])
+    numbers, scales, left_out = _movable(scene, free)
+    at = np.asarray([float(each.read(scene)[0]) for each in numbers])
+
+    def put(shares: Array) -> Scene:
+        return put_numbers(scene, numbers, at + shares * scales)
 
     def by(shares: Array) -> Array:
-        """The quantity where each number is moved by that share of itself."""
+        """The quantity with each number moved by that share of its size."""
         given = call_user(quantity, "quantity", put(shares))
         if not is_real(given):
             raise InputError("quantity", f"gives {quoted(given)}; it must give one real number")
@@ -221,40 +227,22 @@ def check_gradients(
 _MODES: dict[str, Callable[[Callable[[Array], Array]], Callable[[Array], Array]]] = {"forward": jax.jacfwd, "reverse": jax.grad}
 
 
-class _Number(NamedTuple):
-    """One entry of a scene: its `name`, the `leaf` it is in, its `place` in that leaf, flat, and its `value`."""
-
-    name: str
-    leaf: int
-    place: int
-    value: float
-
-
-def _numbers(scene: Scene, free: Sequence[str] | None) -> tuple[list[_Number], tuple[str, ...], Callable[[Array], Scene]]:
-    """The numbers that are asked for, those that are 0, and what gives the scene with each moved by a share (n,) of itself."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(scene)
-    names = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
-    for name in free or ():
-        if name not in names:
-            raise InputError("free", f"names {quoted(name)}; this scene has: {', '.join(names)}")
-    found, zero = [], []
-    for k, (name, (_, leaf)) in enumerate(zip(names, leaves, strict=True)):
-        if free is not None and name not in free:
-            continue
-        for place, value in enumerate(np.ravel(np.asarray(leaf))):
-            each = _Number(name if leaf.ndim == 0 else f"{name}[{place}]", k, place, float(value))
-            (found if value != 0.0 else zero).append(each)
+def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber], np.ndarray, tuple[str, ...]]:
+    """The numbers that are checked, the size that their steps are relative to, and the names of those at a bound."""
+    found, scales, left_out = [], [], []
+    for name in numbers_of(scene) if free is None else free:
+        for each in find_number(scene, name, "free").single(scene):
+            value = float(each.read(scene)[0])
+            scale = value or each.spec.typical or 0.0
+            ends = value + _STEPS[0] * scale * np.asarray([-1.0, 1.0])
+            if scale and np.all(each.spec.bounds.allow(ends)):
+                found.append(each)
+                scales.append(scale)
+            else:
+                left_out.append(each.name)
     if not found:
-        raise InputError("free", "names no number that is not 0; name others")
-
-    def put(shares: Array) -> Scene:
-        flat = [jnp.ravel(leaf) for _, leaf in leaves]
-        for i, each in enumerate(found):
-            flat[each.leaf] = flat[each.leaf].at[each.place].multiply(1.0 + shares[i])
-        shaped = [new.reshape(leaf.shape) for new, (_, leaf) in zip(flat, leaves, strict=True)]
-        return jax.tree.unflatten(structure, shaped)
-
-    return found, tuple(each.name for each in zero), put
+        raise InputError("free", "names no number that can be moved both ways; name numbers that are not at their bounds")
+    return found, np.asarray(scales), tuple(left_out)
 
 
 def _central(by: Callable[[Array], Array], n: int, i: int, step: float) -> float:
