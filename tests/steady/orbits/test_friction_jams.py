@@ -25,7 +25,7 @@ def dry(coefficient=0.1, **more):
 class RollingFriction(jv.DryFriction):
     """The same law for loads that roll, from outside the package."""
 
-    def check(self, machine, loads):
+    def validate(self, machine, loads):
         pass
 
 
