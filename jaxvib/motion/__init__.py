@@ -1,1 +1,1 @@
-"""How it moves in time."""
+"""Time integration and analysis of runs."""

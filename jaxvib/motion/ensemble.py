@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["Ensemble", "EnsembleStatus", "ensemble"]
 
 _Ends: TypeAlias = tuple[State, Array, Array, Array, Array, Array]
-"""What `_run` returns, of one run or of many."""
+"""Results of `_run`, for one run or for many."""
 
 Equations = Callable[[Scene], Callable[[Array, State], State]]
 
@@ -59,7 +59,7 @@ def field_of(equations: Equations, scene: Scene) -> Callable[[Array, State], Sta
 
 
 class EnsembleStatus(eqx.Enumeration):
-    """How a run of an ensemble ended; the members are the sentences a user reads."""
+    """Outcomes of a run of an ensemble; the members are the sentences a user reads."""
 
     done = "the run reached its end"
     detached = "the run reached its end, but on the way a load did not press on its track and was kept on it all the same"
@@ -69,7 +69,7 @@ class EnsembleStatus(eqx.Enumeration):
 
 
 class Ensemble(Result):
-    """Where many runs ended.
+    """Ends of many runs.
 
     **Attributes** (B runs): `state` a `State` whose arrays have a leading axis over the runs, at the end, in single precision
     with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
@@ -94,7 +94,7 @@ class Ensemble(Result):
 
     @property
     def status(self) -> EnsembleStatus:
-        """How each run ended, an `EnsembleStatus` for each."""
+        """Outcome of each run, an `EnsembleStatus` for each."""
 
         def one(allowed: Array, finite: Array, detached: Array, resolved: Array) -> EnsembleStatus:
             ended = EnsembleStatus.where(jnp.any(detached), EnsembleStatus.detached, EnsembleStatus.done)
@@ -104,7 +104,7 @@ class Ensemble(Result):
         return jax.vmap(one)(self.allowed, self.finite, self.detached, self.resolved)
 
     def summary(self) -> str:
-        """How the runs ended, at which speeds of their loads, with which errors, for a person to read."""
+        """Text of the outcomes, the load speeds and the errors of the runs."""
         finite = np.asarray(self.finite)
         head = f"{self.message}; {int(self.steps)} steps each, {float(self.seconds):.3g} s in all"
         if not np.any(finite):

@@ -47,11 +47,11 @@ PER_TURN = 16
 """Fewest samples in a turn of the rotor: the interpolant between them is then good to 1e-7."""
 
 _UNBOUNDED = 1e8
-"""So many times its start, or its natural units, no motion reaches that has bounds."""
+"""Factor of the start, or of the natural units, that no bounded motion reaches."""
 
 
 class StepControl(eqx.Module):
-    """How steps are chosen: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
+    """Choice of steps: to `tolerance`, `max_steps` of them at most, or `steps` of them, all equal (scalars)."""
 
     tolerance: Array | np.ndarray | None = None
     steps: Array | np.ndarray | None = None
@@ -117,7 +117,8 @@ def frequency_bounds(scene: Scene) -> tuple[Array, Array]:
 
 
 def wrap_angles(scene: Scene, dtype: Any) -> tuple[bool, bool]:
-    """Whether angles are kept within a turn, and all loads' by the same turns: single precision, loads that touch."""
+    """True if angles are kept within a turn, and True if all loads' are so by the same turns: single precision, loads that
+    touch."""
     return jnp.dtype(dtype).itemsize < 8, has_term(scene.effects, LoadInteraction)
 
 
@@ -227,13 +228,13 @@ def _steps(
 
 
 def _is_together(angle: Array) -> Array:
-    """Whether several loads have one angle (..., count) all the time, but for what rounding may have grown to."""
+    """True if several loads have one angle (..., count) all the time, up to the growth of rounding errors."""
     apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
     return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)
 
 
 def _diverged(unit: State, first: State, last: State) -> Array:
-    """Whether the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
+    """True if the carrier moves so far beyond its start and its natural units that only an unbounded motion does."""
     pairs = ((first.displacement, last.displacement, unit.displacement), (first.velocity, last.velocity, unit.velocity))
     beyond = [jnp.max(jnp.abs(b)) > _UNBOUNDED * jnp.maximum(jnp.max(jnp.abs(a)), one) for a, b, one in pairs]
     return beyond[0] | beyond[1] | ~is_finite(last)

@@ -44,7 +44,7 @@ def _detached(scene: Scene, kept: Trajectory) -> Array:
 
 
 class RunStatus(eqx.Enumeration):
-    """How a run ended; the members are the sentences a user reads."""
+    """Outcomes of a run; the members are the sentences a user reads."""
 
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
@@ -101,7 +101,7 @@ class Run(AbstractMeasured, Result):
         return functools.reduce(operator.or_, (self.status == end for end in ends))
 
     def summary(self) -> str:
-        """What happened, for a person to read; amplitudes zero to peak."""
+        """Text of the run; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
@@ -136,7 +136,7 @@ class Run(AbstractMeasured, Result):
 
     @property
     def regime(self) -> Regime:
-        """What kind of motion the run has come to, see `Regime`."""
+        """Kind of motion at the end of the run, see `Regime`."""
         return regime(self.scene, self.window)
 
     @property
@@ -172,8 +172,8 @@ class Run(AbstractMeasured, Result):
 
     @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
-        """Which frequencies the motion holds: over the window, or from piece to piece over `parts` pieces of the whole run,
-        each of which shares its halves with its neighbours.
+        """Frequencies of the motion: over the window, or from piece to piece over `parts` pieces of the whole run, each of
+        which shares its halves with its neighbours.
 
         **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked. **Raises** `InputError` for
         more parts than there are samples for, and for several where the run kept its window only.

@@ -194,7 +194,7 @@ def _distance(drifts: Sequence[float], run: Run, decay: float, stretch: float) -
 
 
 def _steady_in_the_mean(seen: np.ndarray) -> bool:
-    """Whether stretches (4 n, 3 + nd), each with its drift first, scatter about means that do not move, and go on to do so.
+    """True if stretches (4 n, 3 + nd), each with its drift first, scatter about means that do not move, and go on to do so.
 
     What moves by less than half the drift, which is told, is not seen in it.
     """
@@ -226,7 +226,7 @@ def _is_creeping(regimes: Sequence[Regime]) -> bool:
 
 
 def _require_mode(scene: Scene, run: Run, mode: int) -> None:
-    """Whether the loads still turn at the speed of the jam mode they started in, and not at that of another one."""
+    """Check that the loads still turn at the speed of the jam mode in which they started, and not at that of another one."""
     modes = jam_modes(scene)
     speeds = np.asarray(modes.omega)
     away = {k: abs(float(speeds[modes.row(k)]) - float(run.omega)) for k in modes.mode_numbers()}

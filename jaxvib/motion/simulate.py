@@ -292,7 +292,8 @@ def _estimated(
 
 
 def last_state(scene: Scene, run: Run) -> State:
-    """Where a run under a constant speed ended, as a state to go on from: angles within a turn keep their digits."""
+    """State at the end of a run under a constant speed, from which the run can go on: angles within a turn keep their
+    digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
     _, together = wrap_angles(scene, last.displacement.dtype)
     first = np.ravel(last.azimuth)[0]
@@ -304,7 +305,7 @@ _FAILURES = ("max_steps_reached", "not_finite", "no_step", "not_accurate", "no_s
 
 
 def _hint(plan: RunPlan, run: Run, name: str) -> str:
-    """Where a run failed, and the change that may help."""
+    """Place of a failure, and the change that may help."""
     hint, kept = "", run.window if run.trajectory is None else run.trajectory
     times, finite = np.asarray(kept.time), np.all(np.isfinite(np.asarray(kept.state.displacement)), axis=1)
     if not bool(np.all(finite)) and bool(np.any(finite)):

@@ -36,7 +36,7 @@ APART = math.radians(1.0)
 one angle, stable or not."""
 
 Turning = Literal["rolling", "still"]
-"""How loads turn by themselves at the start: they roll on their track, or not at all in space."""
+"""Rotation of the loads themselves at the start: rolling on their track, or none in space."""
 
 
 @validated

@@ -1,4 +1,4 @@
-"""How the steps of a time integration are chosen."""
+"""Choice of the steps of a time integration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class EqualSteps:
-    """So many steps, all equally long.
+    """A number of steps of equal length.
 
     >>> import jaxvib as jv
     >>> jv.EqualSteps(2000)

@@ -26,16 +26,16 @@ from jaxvib.runtime.compat import ClosedJaxpr, jaxpr_as_fun
 __all__ = ["PackedSystem"]
 
 Held: TypeAlias = PyTree[Array]
-"""What the integrator holds: the numbers of a state; where angles are wrapped a pair, those and the turns done."""
+"""State as the integrator holds it: the numbers of a state; where angles are wrapped a pair, those and the turns done."""
 
 _TURN = 2.0 * math.pi
 
-_LONG = 4
-"""With so many entries in an array of the state, derivatives take less time on arrays than on its numbers, and all compiles
-sooner; runs take as long, from 8 entries on two thirds of it."""
+_LONG_ARRAY = 4
+"""Number of entries in an array of the state from which on derivatives take less time on arrays than on numbers, and all
+compiles sooner; runs take as long, from 8 entries on two thirds of it."""
 
 _MOST_WRITTEN = 8
-"""With more numbers in a state, the method's stages written out one after another take too long to compile as well."""
+"""Largest number of numbers in a state for which the stages of the method are written out one after another."""
 
 
 class PackedSystem(eqx.Module):
@@ -84,7 +84,7 @@ class PackedSystem(eqx.Module):
         self.args, given = field, (jnp.zeros((), leaves[0].dtype), state, field)
         is_written = self.size <= _MOST_WRITTEN if solver is None else isinstance(solver, UnrolledDopri8)
         # Across the angles of many loads vectors are as full as across runs.
-        is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG)
+        is_small = self.size <= MAX_SCALARS and (batch or max(leaf.size for leaf in leaves) < _LONG_ARRAY)
         program = scalarized_program(_rates_of, *given) if is_small else None
         self.is_scalarized = program is not None
         self.program = arrays_program(_rates_of, *given) if program is None else program
@@ -133,7 +133,7 @@ class PackedSystem(eqx.Module):
         return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
     def _angles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the numbers are angles, and which of these the loads'."""
+        """Masks of the numbers that are angles, and of those that are angles of loads."""
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         places = jax.tree.unflatten(
             self.like, [np.arange(end - math.prod(s), end) for end, s in zip(ends, self.shapes, strict=True)]

@@ -25,7 +25,7 @@ _COEFFICIENTS = _hermite()
 
 
 def locate_extrema(x: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Where an evenly sampled motion is least and greatest, over its first half, its second and all of it.
+    """Locate the extrema of an evenly sampled motion over its first half, its second half and all of it.
 
     Between two samples it is the polynomial p of degree 7 through values and slopes of four samples, those two in their
     middle (at the ends the outermost four), whose error there is

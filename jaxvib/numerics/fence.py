@@ -1,4 +1,4 @@
-"""What keeps a compiler from computing a value anew for each use of it.
+"""Fences that keep a compiler from computing a value anew for each use.
 
 XLA's fusion on a CPU computes a value anew for each use of it, and what it is made of with it: where shared parts are made of
 shared parts, that grows without bounds. It does not do so to the result of a division, which it takes to be dear. So a value

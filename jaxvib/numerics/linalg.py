@@ -41,7 +41,7 @@ _compiled = functools.partial(jax.jit, inline=True)
 """Asked for outside a program, a loop would be traced and compiled at every call; within one, nothing changes."""
 
 _Entry: TypeAlias = Array | float
-"""Of a matrix: a number, or an array of those of many matrices."""
+"""Entry of a matrix: a number, or an array of those of many matrices."""
 
 
 def times(matrix: Array, vector: Array) -> Array:
@@ -269,8 +269,8 @@ def _solved_in_turn(size: int, is_mapped: list[bool], a: Array, b: Array) -> tup
 
 @custom_vmap
 def eigenvalues_in_turn(matrix: Array) -> Array:
-    """Of a matrix (n, n), (n,) complex; values alone. The library is called for one of a batch after the other, see
-    `solve_in_turn`."""
+    """Eigenvalues of a matrix (n, n), (n,) complex, without vectors. The library is called for one of a batch after the other,
+    see `solve_in_turn`."""
     return jnp.linalg.eigvals(matrix)
 
 

@@ -69,7 +69,7 @@ def known_root(f: Callable[[Array], Array], root: Array) -> Array:
 
 
 def _by_slope(g: Callable[[Array], Array], y: Array) -> Array:
-    """Where the linear function `g` is y."""
+    """Solution of g(x) = y for a linear function `g`."""
     return y / _nonzero(g(jnp.ones_like(y)))
 
 
@@ -80,7 +80,8 @@ def next_share(
     before: tuple[Numbers, Numbers],
     tolerance: float | np.floating,
 ) -> Numbers:
-    """Where to look next for a root between `newest` and `other`, as a share of the way; `before` is the point before these.
+    """Next point of the search for a root between `newest` and `other`, as a fraction of the way; `before` is the point before
+    these.
 
     Points are (x, f(x)), numbers or arrays of the library `xp`, numpy or jax.numpy; `tolerance` relative.
     """

@@ -31,7 +31,7 @@ _PI = Fraction(
 )
 
 _TERMS = {np.dtype(np.float64): 8, np.dtype(np.float32): 5}
-"""So many of the polynomial beside the angle itself."""
+"""Number of terms of the polynomial beside the angle itself."""
 
 
 def _parts(dtype: np.dtype) -> tuple[float, float, float]:

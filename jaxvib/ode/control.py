@@ -18,11 +18,11 @@ from jaxvib.ode.types import VF, Args, BoolScalarLike, IntScalarLike, Norm, Real
 __all__ = ["Decision", "PIController", "WrappedController"]
 
 Decision: TypeAlias = tuple[BoolScalarLike, RealScalarLike, RealScalarLike, BoolScalarLike, PyTree[Array], diffrax.RESULTS]
-"""Whether a step is accepted, where the next one begins and ends, whether the field jumps there, the controller's new state,
-whether the run can go on."""
+"""Acceptance of a step, beginning and end of the next one, True if the field jumps there, new state of the controller, True if
+the run can go on."""
 
 _State: TypeAlias = tuple[Array, Array | None]
-"""Of `PIController`: the 32nd root of the last accepted step's error, the steps that are left where they are limited."""
+"""State of `PIController`: the 32nd root of the last accepted step's error, and the remaining steps if they are limited."""
 
 
 class PIController(diffrax.AbstractAdaptiveStepSizeController):
@@ -63,12 +63,12 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def atol(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As `rtol`."""
+        """Absolute tolerance of implicit solvers, see `rtol`."""
         return self.tolerance
 
     @property
     def norm(self) -> Norm:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
-        """As `rtol`."""
+        """Norm of implicit solvers, see `rtol`."""
         return optimistix.rms_norm
 
     def wrap(self, direction: IntScalarLike) -> PIController:
@@ -100,7 +100,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
         error_order: RealScalarLike,
         controller_state: _State,
     ) -> Decision:
-        """Whether the step is accepted, where the next one begins and ends, and the controller's new state."""
+        """Acceptance of the step, beginning and end of the next one, and state of the controller."""
         root_before, left = controller_state
 
         def ratio(error: Array, a: Array, b: Array, unit: Array, relative: Array) -> Array:
@@ -128,7 +128,7 @@ class PIController(diffrax.AbstractAdaptiveStepSizeController):
 
 
 def moved_on(accept: BoolScalarLike, start: RealScalarLike, before: RealScalarLike, end: RealScalarLike) -> diffrax.RESULTS:
-    """Whether the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
+    """True if the run can go on: a rejected step from `start` to `before` must be followed by a shorter one, to `end`."""
     shorter = (end > start) & (end < before)
     return diffrax.RESULTS.where(accept | shorter, diffrax.RESULTS.successful, diffrax.RESULTS.dt_min_reached)
 
@@ -145,10 +145,10 @@ class WrappedController(diffrax.AbstractAdaptiveStepSizeController):
 
     @property
     def atol(self) -> RealScalarLike:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As `rtol`."""
+        """Absolute tolerance of implicit solvers, see `rtol`."""
         return getattr(self.controller, "atol", 0.0)
 
     @property
     def norm(self) -> Norm:  # pyright: ignore[reportIncompatibleVariableOverride, reportIncompatibleMethodOverride]
-        """As `rtol`."""
+        """Norm of implicit solvers, see `rtol`."""
         return getattr(self.controller, "norm", optimistix.rms_norm)

@@ -53,7 +53,7 @@ _POLYNOMIALS = np.array(
         [20.300692582210083, -53.90207774663854, 50.255836422617605, -19.008209934160803, 2.3537586759714983, 0.0],
     ]
 )
-"""Of each stage that states within a step are made of, the polynomial in the share of the step, highest power first.
+"""Polynomials of the stages that form states within a step, in the fraction of the step, highest power first.
 
 Source: P. Kidger's diffrax 0.7 (Apache 2.0), `diffrax/_solver/dopri8.py`, without the stages whose polynomials are 0.
 """
@@ -62,10 +62,10 @@ NODES = np.asarray(_TABLEAU.c)
 """At which share of the step each stage but the first is."""
 
 ROWS = np.stack([np.concatenate([row, np.zeros(len(NODES) - len(row))]) for row in _TABLEAU.a_lower])
-"""With what weights those before make each stage but the first; the last stage is the end of the step."""
+"""Weights of earlier stages in each stage but the first; the last stage is the end of the step."""
 
 ERROR = np.asarray(_TABLEAU.b_error)
-"""With what weights stages make the error of the step."""
+"""Weights of the stages in the error of the step."""
 
 
 def ravel(tree: PyTree[Array], directions: int = 0) -> Array:
@@ -85,7 +85,7 @@ def unravel(flat: Array, like: Tree) -> Tree:
 
 
 def dense_stages(stages: Array) -> Array:
-    """Those stages that states within a step are made of, (10, ...): the first, and from the sixth on all."""
+    """Stages that form states within a step, (10, ...): the first, and from the sixth on all."""
     return jnp.concatenate([stages[:1], stages[_LATE:]])
 
 
@@ -119,7 +119,7 @@ class Dopri8Interpolation(StepInterpolation):
 
 
 class AbstractDopri8(diffrax.AbstractAdaptiveSolver):
-    """What the forms of Dormand and Prince's pair share: all but how stages are computed, and what finds states within."""
+    """Common part of the forms of Dormand and Prince's pair: all but the computation of stages and of states within a step."""
 
     wrap: Callable[[Y], Y] | None = None
     tableau: ClassVar[diffrax.ButcherTableau] = _TABLEAU

@@ -34,14 +34,14 @@ _Known: TypeAlias = "tuple[Array, Array] | None"
 None where each step computes all of its stages."""
 
 _Inputs: TypeAlias = tuple[RealScalarLike, Array, Y, _Known, Args, Terms]
-"""Of a step: the time at its start, its length, the state, what is known of its rates, the arguments of the equations, the
-equations."""
+"""Inputs of a step: the time at its start, its length, the state, what is known of its rates, the arguments of the equations,
+the equations."""
 
 _Step: TypeAlias = tuple[Y, Array, Y]
 """The state at the end of a step, the rates of its stages (stages, n), the error of the state."""
 
 _ROWS = np.concatenate([np.zeros((1, ROWS.shape[1])), ROWS])
-"""With what weights those before make each stage (stages, stages - 1)."""
+"""Weights of earlier stages in each stage (stages, stages - 1)."""
 
 _NODES = np.concatenate([np.zeros(1), NODES])
 """At which share of the step each stage is."""
@@ -121,12 +121,12 @@ def _linear_combination_batched(inputs: tuple[Array, Array], mapped: tuple[bool,
 
 
 class _BatchedInterpolation(Dopri8Interpolation):
-    """As `Dopri8Interpolation`, with derivatives and batches of its own kind."""
+    """`Dopri8Interpolation` with derivatives and batches of its own kind."""
 
     combine: Callable[[tuple[Array, Array]], Array] = eqx.field(static=True)
 
     def from_weights(self, weights: Array) -> Y:
-        """As `Dopri8Interpolation.from_weights`."""
+        """Interpolation from the weights of stages, see `Dopri8Interpolation.from_weights`."""
         return jax.tree.map(lambda y, more: y + more, self.y0, unravel(self.combine((weights, self.stages)), self.y0))
 
 

@@ -18,10 +18,10 @@ from jaxvib.runtime.compat import fast_diffrax_loop_end, no_host_checks
 __all__ = ["solve"]
 
 _Inputs: TypeAlias = tuple[Array, Array | None, Y, Args, diffrax.SaveAt, diffrax.ODETerm]
-"""What is differentiated: the end, the first step, the state at the start, the arguments, what is saved, the equations."""
+"""Differentiated arguments: the end, the first step, the initial state, the arguments, the saved times, the equations."""
 
 _Rest: TypeAlias = tuple[diffrax.AbstractSolver, int, diffrax.AbstractProgressMeter]
-"""What is not: the method, the largest number of steps, the progress meter."""
+"""Other arguments: the method, the largest number of steps, the progress meter."""
 
 
 def solve(
@@ -99,7 +99,7 @@ def _with_replay(inputs: _Inputs, controller: diffrax.AbstractStepSizeController
 
 
 class _Notes(NamedTuple):
-    """Of a run: how many steps it took, when the next one begins after each (max_steps,), the state after every so many."""
+    """Record of a run: its number of steps, the end of each step (max_steps,), the state after every so many."""
 
     steps: Array
     starts: Array
@@ -248,7 +248,7 @@ def _with_tolerances(solver: diffrax.AbstractSolver, controller: diffrax.Abstrac
 
 
 def _share_of_end(controller: diffrax.AbstractStepSizeController, count: Array, j: Array) -> Array:
-    """How far the start of step j of `count` moves with the end of the run: constant steps fill the time that the first one
+    """Derivative of the start of step j of `count` by the end of the run: constant steps fill the time that the first one
     leaves, those that a controller chose stay where they are."""
     if isinstance(controller, diffrax.ConstantStepSize):
         return jnp.where((j > 1) | (count == 1), j / count, 0.0)
@@ -265,7 +265,7 @@ def _end_before(controller: diffrax.AbstractStepSizeController, start: Array) ->
 
 
 class _Saved(NamedTuple):
-    """Of all states that are saved: times, ascending, and slopes by the states then; slopes by the state at the end; and at
+    """Derivatives of all saved states: times, ascending, and slopes by the states then; slopes by the state at the end; and at
     which place of all lists of times, one after the other, each time stands."""
 
     times: Array

@@ -121,12 +121,12 @@ def _commutative() -> set[Primitive]:
 
 
 def is_floating(x: Any) -> bool:
-    """Whether a variable of a program is a number of single or double precision, of which `jaxvib.numerics` has the sines."""
+    """True if a variable of a program is a number of single or double precision, for which `jaxvib.numerics` has the sines."""
     return x.aval.dtype in (np.float32, np.float64)
 
 
 def _variables(atoms: Iterable[Var | Literal]) -> list[Var]:
-    """Those of the atoms that are no numbers, each once, in order."""
+    """Variables among the atoms, each once, in order."""
     return list(dict.fromkeys(atom for atom in atoms if isinstance(atom, Var)))
 
 

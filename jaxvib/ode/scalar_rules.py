@@ -1,4 +1,4 @@
-"""How each operation of JAX acts on object arrays of scalars: the table that `jaxvib.ode.scalarize` goes by."""
+"""Rules by which operations of JAX act on object arrays of scalars, the table of `jaxvib.ode.scalarize`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Scalar: TypeAlias = Any
 """A traced scalar, a NumPy scalar, or a `ComplexParts`: one entry of `Scalars`, as far as a type can say."""
 
 Rule: TypeAlias = Callable[..., Scalars | list[Scalars]]
-"""From the `Scalars` of an operation's arguments, and its parameters as keywords, to those of its results."""
+"""Function from the `Scalars` of an operation's arguments, and its parameters as keywords, to those of its results."""
 
 _Axes: TypeAlias = tuple[Sequence[int], Sequence[int]]
 _Function: TypeAlias = Callable[..., PyTree[Array]]
@@ -58,12 +58,12 @@ def to_scalars(value: ArrayLike) -> Scalars:
 
 
 def is_known(x: Scalar) -> bool:
-    """Whether `x` is a constant of the program."""
+    """True if `x` is a constant of the program."""
     return isinstance(x, (np.generic, int, float, bool))
 
 
 def _is_zero(x: Scalar) -> bool:
-    """Whether `x` is a 0 of the program itself, such as an entry of an identity matrix or of a direction of a derivative.
+    """True if `x` is a 0 of the program itself, such as an entry of an identity matrix or of a direction of a derivative.
 
     What is multiplied by it is not there, and no operation is left of it, even where it is infinite or not a number, and the
     program on arrays would give NaN. The zeros of a scene's parameters and states are traced, and are multiplied out.

@@ -60,13 +60,14 @@ Shared = TypeVar("Shared")
 Out = TypeVar("Out")
 
 _Sines: TypeAlias = dict[int, tuple[Scalar, tuple[Array, Array]]]
-"""By the `id` of an angle: the angle, which keeps the id its own, its sine and cosine."""
+"""Sines by the `id` of an angle: the angle, which keeps the id its own, its sine and cosine."""
 
 MAX_SCALARS, _MAX_OPERATIONS = 32, 1200
-"""With more numbers in a state, or operations on them, equations on scalars take too long to compile for what they save."""
+"""Largest numbers of entries of a state and of operations on them for which compiling equations on scalars pays."""
 
 _BLOCK = 4096
-"""So many entries of a batch go through a program on scalars together: it may hold a thousand values of each in memory."""
+"""Number of entries of a batch that go through a program on scalars together: it may hold a thousand values of each in
+memory."""
 
 
 def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> Callable[..., PyTree[Scalars]]:

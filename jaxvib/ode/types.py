@@ -1,4 +1,4 @@
-"""What diffrax hands its methods and controllers, and what it takes from them, by the names that it has for them itself."""
+"""Types of diffrax's methods and controllers, by the names of diffrax."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ VF: TypeAlias = PyTree[Array]
 """The rates of a state: a tree like it."""
 
 Args: TypeAlias = PyTree
-"""What a vector field takes beside the time and the state: whatever its term was written for."""
+"""Arguments of a vector field beside the time and the state."""
 
 Terms: TypeAlias = PyTree[diffrax.AbstractTerm]
 """The equations; all methods here take a single term."""
 
 DenseInfo: TypeAlias = dict[str, PyTree[Array]]
-"""What the interpolation of a step is made of, by the names of its attributes."""
+"""Data of the interpolation of a step, by the names of its attributes."""
 
 StepResult: TypeAlias = tuple[Y, Y, DenseInfo, VF | None, diffrax.RESULTS]
 """The state at the end of a step, its error, its interpolation, the method's own state, whether the step succeeded."""

@@ -1,1 +1,1 @@
-"""How it settles."""
+"""Steady states: jams, periodic orbits, balanced motion, whirl."""

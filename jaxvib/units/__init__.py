@@ -202,7 +202,7 @@ def _array(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], boun
 
 
 def _converted(value: ArrayLike, unit: str, field: str, shape: tuple[int, ...], bounds: Bounds) -> Array | np.ndarray:
-    """What JAX does not hold yet NumPy converts: no program need be compiled for it."""
+    """Value in SI; an array that JAX does not hold yet is converted by NumPy, so that no program need be compiled for it."""
     try:
         if isinstance(value, jax.Array):
             array = jnp.asarray(value, dtype=float)
