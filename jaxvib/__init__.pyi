@@ -49,7 +49,7 @@ from jaxvib.steady.shapes import ModeShapes, mode_shapes
 # Exact jams
 from jaxvib.steady.orbits.diagram import ExactBranches
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus
+from jaxvib.steady.orbits.describe import Orbit, OrbitStatus
 from jaxvib.study.maps.stability_onset import stability_map, stability_onset
 
 # Auto-balancing, whirl

@@ -21,8 +21,8 @@ from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.results.status import failure
 from jaxvib.runtime.devices import on_device
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import count
 from optimize.quantities.evaluation import Evaluation
 from optimize.quantities.jams import amplitude, between, force_per_amplitude, foundation_force, jam_frequency

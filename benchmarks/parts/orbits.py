@@ -25,8 +25,8 @@ from jaxvib.equations.linear import jammed_model, steady_displacement
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed, rotor_speed_at
-from jaxvib.steady.orbits.collocation import harmonics_of, periodic_motion
-from jaxvib.steady.orbits.floquet import floquet, steps_for
+from jaxvib.steady.orbits.solve import harmonics_of, periodic_motion
+from jaxvib.steady.orbits.stability import floquet, steps_for
 
 GROUP = "exact orbits, each"
 

@@ -32,7 +32,7 @@ from jaxvib.ode.dopri8_loop import LoopDopri8
 from jaxvib.runtime.programs import cached
 from jaxvib.runtime.structure import Skeleton
 from jaxvib.steady.outcome import unknown_is_positive
-from jaxvib.units import Number, count, known_number, number
+from jaxvib.units import Number, count, known_number
 from jaxvib.units.known import is_known, when_known
 
 __all__ = [
@@ -255,10 +255,11 @@ def plan_ensemble(
     if len(sizes) != 1 or sizes & {(), (0,)}:
         raise InputError("values", f"has leading axes {sorted(sizes)}; all need one and the same, with 1 run at least")
     ((runs,),) = sizes
-    end = number(until, "s", "until", low=0.0, open_low=True)
+    known_end = known_number(until, "s", "until", low=0.0, open_low=True)
+    end = jnp.asarray(known_end, dtype=float)
     batch = min(count(batch, "batch"), runs)
     scenes, states, allowed = _made(make, values)
-    if (is_positive := unknown_is_positive(end)) is not None:
+    if (is_positive := unknown_is_positive(known_end)) is not None:
         allowed = allowed & is_positive
     require_start(scenes, states.angle)
     known = is_known(scenes, states, end)

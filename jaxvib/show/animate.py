@@ -22,7 +22,7 @@ from jaxvib.show.motion import Stretch, of_orbit, of_run
 from jaxvib.show.sketch import checked_scene, fit
 from jaxvib.show.views import view_of
 from jaxvib.show.wheel import Pose
-from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.units import Number, number
 
 __all__ = ["animate"]

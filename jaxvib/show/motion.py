@@ -12,7 +12,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Trajectory
 from jaxvib.motion.run import Run
-from jaxvib.steady.orbits.orbit import Orbit
+from jaxvib.steady.orbits.describe import Orbit
 
 __all__ = ["Stretch", "of_orbit", "of_run"]
 

@@ -19,8 +19,8 @@ from jaxvib.motion.simulate import simulate
 from jaxvib.runtime.devices import known
 from jaxvib.steady.jams.follow import follow_fold, follow_jam
 from jaxvib.steady.jams.jam import Jam, JamModes, jam_modes
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units.known import is_known
 
 __all__ = ["Case", "Evaluation", "Key", "Target", "TargetRecorder", "guesses"]

@@ -26,8 +26,8 @@ from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
 from jaxvib.steady.jams.picture import branch_summary, picture
-from jaxvib.steady.orbits.floquet import Floquet, is_stiff, steps_for
-from jaxvib.steady.orbits.orbit import OrbitStatus, orbits
+from jaxvib.steady.orbits.describe import OrbitStatus, orbits
+from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:

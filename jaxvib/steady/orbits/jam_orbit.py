@@ -23,9 +23,9 @@ from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
 from jaxvib.steady.jams.jam import jams_of
-from jaxvib.steady.orbits.collocation import Parameter, branch_tangent, periodic_motion
-from jaxvib.steady.orbits.floquet import is_stiff, steps_for
-from jaxvib.steady.orbits.orbit import Orbit, OrbitStatus, numbers_of, orbits
+from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, numbers_of, orbits
+from jaxvib.steady.orbits.solve import Parameter, branch_tangent, periodic_motion
+from jaxvib.steady.orbits.stability import is_stiff, steps_for
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number, count, number, traced
 

@@ -12,8 +12,8 @@ from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.machine.scene import Scene
 from jaxvib.steady.jams.jam import jam_modes
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit
 
 __all__ = ["SLOW_PERIODS", "ExactJam", "collocation_points", "exact_jam", "slow_period", "unstable", "usual_mode"]
 

@@ -24,7 +24,7 @@ from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.programs import cached
 from jaxvib.steady.jams.folds import light_rotor_speed
-from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
+from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 from jaxvib.units import Number, numbers
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from jaxvib.results.fields import in_unit, part
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.steady.jams.jam import Jam, jam_modes
+from jaxvib.steady.orbits.describe import Orbit
 from jaxvib.steady.orbits.jam_orbit import jam_orbit
-from jaxvib.steady.orbits.orbit import Orbit
 from jaxvib.units import numbers
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from stored_jit import stored_jit
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed, light_rotor_speed
-from jaxvib.steady.orbits.collocation import Harmonics, PeriodicSolution, periodic_motion
-from jaxvib.steady.orbits.orbit import _least_push
+from jaxvib.steady.orbits.describe import _least_push
+from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution, periodic_motion
 
 
 def different():

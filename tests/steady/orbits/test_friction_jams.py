@@ -15,7 +15,7 @@ from jaxvib.machine.effects.base import has_half_turn
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.balance.criterion import criterion_functional
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
+from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 
 def dry(coefficient=0.1, **more):

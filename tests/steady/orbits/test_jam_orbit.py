@@ -9,9 +9,9 @@ import jaxvib as jv
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.steady.orbits import diagram, jam_orbit
-from jaxvib.steady.orbits.floquet import steps_for
+from jaxvib.steady.orbits.describe import _swing
 from jaxvib.steady.orbits.jam_orbit import _between
-from jaxvib.steady.orbits.orbit import _swing
+from jaxvib.steady.orbits.stability import steps_for
 
 
 def test_points_between_follow_the_hermite_cubic():

@@ -18,8 +18,8 @@ from stored_jit import stored_jit
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed
-from jaxvib.steady.orbits.collocation import branch_tangent, periodic_motion
-from jaxvib.steady.orbits.orbit import Orbit, _peaks, _swing
+from jaxvib.steady.orbits.describe import Orbit, _peaks, _swing
+from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 
 class Shaker(jv.Machine):

@@ -19,7 +19,7 @@ from jaxvib.numerics.sincos import sine_and_cosine
 from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.orbits.collocation import (
+from jaxvib.steady.orbits.solve import (
     Harmonics,
     Parameter,
     PeriodicSolution,
@@ -27,7 +27,7 @@ from jaxvib.steady.orbits.collocation import (
     harmonics_of,
     periodic_motion,
 )
-from jaxvib.steady.orbits.floquet import Floquet, floquet
+from jaxvib.steady.orbits.stability import Floquet, floquet
 from jaxvib.steady.outcome import REFUSED
 from jaxvib.units import count, known_number
 

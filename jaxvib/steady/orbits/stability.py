@@ -1,0 +1,422 @@
+"""Floquet multipliers of periodic jams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import CollectedModel
+from jaxvib.numerics import radau
+from jaxvib.numerics.fourier import Grid
+from jaxvib.numerics.linalg import small_solve
+from jaxvib.ode.dopri8 import NODES, ROWS
+from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
+
+__all__ = ["Floquet", "floquet", "is_stiff", "steps_for"]
+
+_PHASE = 0.7
+"""Phase of the carrier's fastest motion in an explicit step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast
+as the carrier, and 1e-10 if they are three times as fast."""
+
+_STIFF = 3.0
+"""Decay so many times as fast as the fastest oscillation is left to the implicit method: explicit steps would have to resolve
+it, and from about 15 times on they diverge."""
+
+# The method's last stage is the end of the step, there to be evaluated for the next one.
+_NODES = np.concatenate([[0.0], NODES[:-1]])
+_ROWS = np.pad(ROWS[:-1, : len(_NODES)], ((1, 0), (0, 0)))
+_WEIGHTS = ROWS[-1]
+
+
+class Floquet(NamedTuple):
+    """Growth of small disturbances of periodic jams, trailing axis over the orbits.
+
+    **Attributes**: `roots` (2 nd + 2 G - 1, P) complex: growth over a turn of the grid, that is half a period followed by the
+    half-turn where the motion has that symmetry (multipliers are their squares), else a period (they are the multipliers);
+    the trivial one, a shift in time, is taken out. `inner` (2, P): the same for two loads that separate while the others
+    stay, None for a single load. `trivial` (P,): the trivial root, 1 but for the error of the integration.
+    """
+
+    roots: Array
+    inner: Array | None
+    trivial: Array
+
+
+class _Rates(NamedTuple):
+    """The fastest of the carrier's `oscillation` and of the linear equations' `decay`, of carrier and loads, rad/s and 1/s."""
+
+    oscillation: Array
+    damping: Array
+    drag: Array
+
+
+def _rates(model: CollectedModel, omega: Array, speed: Array) -> _Rates:
+    """Rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
+
+    A body of loads decays by drag and friction with an inertia that the carrier lessens:
+
+        max_g(-T_rate / I)_g / (1 - mu sum_g S_g^2 / I_g),      mu the largest eigenvalue of B M^-1 B^T
+    """
+    linear, carrier, mount = model.linear, model.linear.carrier, model.linear.mount
+    half = jnp.linalg.inv(jnp.linalg.cholesky(linear.mass))
+    oscillation = jnp.max(linear.modes()[0])
+    damping = jnp.max(jnp.linalg.eigvalsh(half @ carrier.damping @ half.T))
+    if mount.gyroscopic is not None:
+        oscillation = oscillation + speed * jnp.linalg.norm(half @ mount.gyroscopic @ half.T)
+    still = jnp.zeros((len(mount.axes), 1), linear.mass.dtype)
+
+    def fastest(omega: Array, speed: Array) -> Array:
+        one = jnp.ones((model.inertia.shape[0], 1), linear.mass.dtype)
+        by_rate = model.torque_slopes(0.0 * one, omega * one, speed, still)[1]
+        return jnp.max(-by_rate[:, 0] / model.inertia)
+
+    accelerance = jnp.max(jnp.linalg.eigvalsh(mount.rows[0] @ half.T @ half @ mount.rows[0].T))
+    left = 1.0 - accelerance * jnp.sum(model.unbalance**2 / model.inertia)
+    return _Rates(oscillation, damping, jnp.vectorize(fastest)(omega, speed) / left)
+
+
+def is_stiff(model: CollectedModel, omega: Array, speed: Array) -> Array:
+    """True if loads or carrier decay so fast, at load speeds `omega` and the rotor's `speed` (rad/s), that multipliers need the
+    implicit method."""
+    rates = _rates(model, omega, speed)
+    return jnp.maximum(rates.damping, rates.drag) > _STIFF * (rates.oscillation + 2.0 * omega)
+
+
+def steps_for(model: CollectedModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
+    """Number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
+
+    An `implicit` method is stable at any rate of decay: only the oscillation decides.
+    """
+    rates = _rates(model, omega, speed)
+    turn = np.pi if model.half_turn else 2.0 * np.pi
+    if implicit:
+        return radau.steps_for(turn * (rates.oscillation / omega + 2.0))
+    return jnp.ceil(turn * (jnp.maximum(rates.oscillation, rates.damping) / omega + 2.0) / _PHASE).astype(int)
+
+
+class _Coefficients(NamedTuple):
+    """Coefficients of the linear equations at one angle: `moving` s e' with its derivatives `moving1` and `moving2`, and
+    `coupling`, s e' less the share of dry friction, (np, G, P); derivatives of the torque `by_angle`, `by_rate`, (G, P)."""
+
+    moving: Array
+    coupling: Array
+    moving1: Array
+    moving2: Array
+    by_angle: Array
+    by_rate: Array
+
+
+class _Disturbances(NamedTuple):
+    """Linear equations of small disturbances about periodic motions, see `floquet`; displacements in units of `length`.
+
+    **Attributes**: M^-1 K, M^-1 C and M^-1 G as `stiffness`, `damping` and `gyroscopic`; `shift` M^-1 B^T sum_g S_g, `port` B,
+    `accelerance` of the port; `share` of each body of loads in the `total` unbalance; `lever` total/I of each;
+    `omega`, `speed` of the loads and the rotor, (P,), and the same (1, 1, P), `w` and `n`.
+    """
+
+    model: CollectedModel
+    stiffness: Array
+    damping: Array
+    gyroscopic: Array | None
+    shift: Array
+    port: Array
+    accelerance: Array
+    share: Array
+    total: Array
+    lever: Array
+    length: Array
+    omega: Array
+    speed: Array
+    w: Array
+    n: Array
+
+    @classmethod
+    def about(cls, model: CollectedModel, motion: PeriodicSolution) -> _Disturbances:
+        """Equations about the motions of a model."""
+        carrier, mount, mass = model.linear.carrier, model.linear.mount, model.linear.mass
+        nd = mass.shape[0]
+        parts = [carrier.stiffness, carrier.damping, *([] if mount.gyroscopic is None else [mount.gyroscopic])]
+        solved = small_solve(mass, jnp.concatenate([*parts, mount.rows[0].T], axis=1))
+        stiffness, damping, *gyroscopic = (solved[:, k * nd : (k + 1) * nd] for k in range(len(parts)))
+        total = jnp.sum(model.unbalance)
+        share = model.unbalance / total
+        shift = solved[:, len(parts) * nd :] * total
+        length = jnp.max(jnp.abs(shift))
+        shift = shift / length
+        port = mount.rows[0] * length
+        return cls(
+            model=model,
+            stiffness=stiffness,
+            damping=damping,
+            gyroscopic=gyroscopic[0] if gyroscopic else None,
+            shift=shift,
+            port=port,
+            accelerance=port @ shift,
+            share=share,
+            total=total,
+            lever=(total / model.inertia)[None, :, None, None],
+            length=length,
+            omega=motion.omega,
+            speed=motion.rotor_speed,
+            w=motion.omega[None, None],
+            n=motion.rotor_speed[None, None],
+        )
+
+    def coefficients(self, grid: Grid, harmonics: Harmonics, theta: Array, waves: Array) -> _Coefficients:
+        """Coefficients at angles theta (m,), from exp(i k theta), k = 0, 1, ..., and its derivatives `waves` (3, m, K)."""
+        model, omega = self.model, self.omega
+        gap = 2 if grid.symmetric else 1
+        of_deviation, of_motion = (slice(k[0], k[-1] + 1, gap) for k in (grid.deviation_orders, grid.orders))
+        deviation, deviation1, deviation2 = _signals(harmonics.deviation, waves[..., of_deviation])
+        phi, rate = theta[None, :, None] + deviation, 1.0 + deviation1
+        point, moving = model.circle(phi)
+        (acceleration,) = _signals(harmonics.acceleration, waves[:1, :, of_motion])
+        slopes = jax.vmap(lambda p, r, w, n, a: model.torque_slopes(p, w * r, n, a), in_axes=-1, out_axes=-1)
+        by_angle, by_rate, by_acceleration = slopes(phi, rate, omega, self.speed, acceleration)
+        stiff = by_angle + model.unbalance[:, None, None] * jnp.sum(point * acceleration[:, None], axis=0)
+        moving2 = -point * deviation2[None] - moving * rate[None] ** 2
+        s = self.share[None, :, None, None]
+        unit = model.inertia[:, None, None] * omega[None, None] ** 2
+        by_rate = by_rate * omega[None, None] / unit
+        coupling = s * moving
+        coupling = coupling if by_acceleration is None else coupling - by_acceleration / self.total
+        return _Coefficients(s * moving, coupling, -s * point * rate[None], s * moving2, stiff / unit, by_rate)
+
+    def damped(self, q1: Array) -> Array:
+        """Acceleration of the carrier by damping and gyroscopic forces at the velocity q1."""
+        answer = _times(self.damping, q1) / self.w
+        return answer if self.gyroscopic is None else answer + self.n * _times(self.gyroscopic, q1) / self.w
+
+    def whole_motion(self, c: _Coefficients, x: Array, x1: Array) -> Array:
+        """Second derivatives of carrier and bodies of loads, x = (Q, d)."""
+        nd = self.stiffness.shape[0]
+        (q, d), (q1, d1) = ((part[:nd], part[nd:]) for part in (x, x1))
+        t, t1, t2 = (v[:, :, None, :] for v in (c.moving, c.moving1, c.moving2))
+        below = q - _times(self.shift, jnp.sum(t * d[None], axis=1))
+        below1 = q1 - _times(self.shift, jnp.sum(t * d1[None] + t1 * d[None], axis=1))
+        q2 = -self.damped(below1) - _times(self.stiffness, below) / self.w**2
+        pushed = _times(self.port, q2) - _times(self.accelerance, jnp.sum(2.0 * t1 * d1[None] + t2 * d[None], axis=1))
+        torque = c.by_rate[:, None] * d1 + c.by_angle[:, None] * d
+        # The port's acceleration with the bodies giving way to it: an equation for each of its directions.
+        answers = self.lever * c.coupling[:, :, None]
+        weight = jnp.sum(t[:, None] * answers[None], axis=2)
+        factor = _times(self.accelerance, weight)
+        acceleration = _small_solve(factor, pushed - _times(self.accelerance, jnp.sum(t * torque[None], axis=1)))
+        return jnp.concatenate([q2, torque - jnp.sum(answers * acceleration[:, None], axis=0)])
+
+    @staticmethod
+    def relative_motion(c: _Coefficients, x: Array, x1: Array) -> Array:
+        """Second derivative of the angle between loads of one body, the carrier at rest."""
+        return c.by_rate[:, None] * x1 + c.by_angle[:, None] * x
+
+    def along_orbit(self, grid: Grid, harmonics: Harmonics) -> Array:
+        """Direction of a shift in time, (2 nd + 2 G, P): the derivative of the motion itself."""
+        at, at1 = _signals(harmonics.displacement, _derivatives(grid.orders, 2, harmonics.displacement)) / self.length
+        deviation, deviation1, deviation2 = _signals(
+            harmonics.deviation, _derivatives(grid.deviation_orders, 3, harmonics.deviation)
+        )
+        _, moving = self.model.circle(deviation)
+        turning = self.share[None, :, None, None] * moving * (1.0 + deviation1)[None]
+        return jnp.concatenate([
+            at1 + _times(self.shift, jnp.sum(turning, axis=1)),
+            1.0 + deviation1,
+            -self.damped(at1) - _times(self.stiffness, at) / self.w**2,
+            deviation2,
+        ])[:, 0]  # fmt: skip
+
+
+def floquet(
+    model: CollectedModel,
+    grid: Grid,
+    motion: PeriodicSolution,
+    harmonics: Harmonics,
+    steps: int | Array,
+    *,
+    implicit: bool = False,
+) -> Floquet:
+    """Floquet multipliers of the full state about periodic motions, all linear equations integrated at once.
+
+    With Q = q + M^-1 B^T sum_g S_g t_g d_g, t = e'(phi), d_g the disturbance of a body of loads and ' = d/dtheta:
+
+        Q'' = - M^-1 (C + n G)/Omega q' - M^-1 K/Omega^2 q
+        I_g Omega^2 d_g'' = T_rate Omega d_g' + (T_phi + S_g e.a) d_g - Omega^2 (S_g t_g - T_a).B q''
+
+    T is the torque on the body, which depends on the port's acceleration a = Omega^2 B q'' too where there is dry friction.
+    Loads of one body that separate (sum d_j = 0) leave the carrier at rest: the second equation without its last term. Loads
+    that lie side by side are pressed together and do not separate.
+
+    All orbits take equal steps of the same length, by Dormand and Prince's method of order 8, or `implicit` ones by
+    `radau.transition`, which resolve any drag of the loads and any damping of the carrier.
+
+    **Arguments**: `motion`, `harmonics` with a trailing axis over P orbits; `steps` a Python number (then reverse-mode
+    derivatives exist) or a scalar array, see `steps_for`.
+    """
+    nd, count = model.linear.mass.shape[0], model.inertia.shape[0]
+    equations = _Disturbances.about(model, motion)
+    turn = np.pi if model.half_turn else 2.0 * np.pi
+    h = jnp.asarray(turn / steps, motion.omega.dtype)
+    has_relative_motion = model.loads.alike and model.loads.count > 1 and model.loads.ball_radius is None
+    fields: tuple[_Field, ...] = (equations.whole_motion,)
+    sizes: tuple[int, ...] = (nd + count,)
+    if has_relative_motion:
+        fields, sizes = (*fields, equations.relative_motion), (*sizes, 1)
+    transition = _implicit_transition if implicit else _explicit_transition
+    whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps)
+    flip = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
+    monodromy = flip[:, None, None] * whole
+    trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, equations.along_orbit(grid, harmonics))
+    roots = _eigenvalues(rest).T
+    inner = _eigenvalues(jnp.moveaxis(relative[0], -1, 0)).T if relative else None
+    return Floquet(roots, inner, trivial)
+
+
+_Field: TypeAlias = Callable[[_Coefficients, Array, Array], Array]
+"""Second derivatives (n, ..., P) of some coordinates, from their values and first derivatives."""
+
+
+def _explicit_transition(
+    equations: _Disturbances,
+    grid: Grid,
+    harmonics: Harmonics,
+    fields: Sequence[_Field],
+    sizes: Sequence[int],
+    h: Array,
+    steps: int | Array,
+) -> tuple[Array, ...]:
+    """Transition matrices (2 n, 2 n, P) over a turn of the grid, one for each field, by explicit steps of the length `h`."""
+    dtype = equations.omega.dtype
+
+    def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        rows, weights = (jnp.asarray(x, dtype=dtype) for x in (_ROWS, _WEIGHTS))
+
+        # A loop over the stages: written out, the compiler computes every stage anew wherever it is used.
+        def stage(rates: tuple[Array, ...], now: tuple[Array, Array, _Coefficients]) -> tuple[tuple[Array, ...], None]:
+            i, row, c = now
+            moved = (x + h * jnp.tensordot(row, y, 1) for x, y in zip(state, rates, strict=True))
+            changes = (
+                jnp.concatenate([x[size:], field(c, x[:size], x[size:])])
+                for field, size, x in zip(fields, sizes, moved, strict=True)
+            )
+            put = jax.lax.dynamic_update_index_in_dim
+            return tuple(put(rate, change, i, 0) for rate, change in zip(rates, changes, strict=True)), None
+
+        rates = tuple(jnp.zeros((len(_NODES), *x.shape), dtype=x.dtype) for x in state)
+        rates, _ = jax.lax.scan(stage, rates, (jnp.arange(len(_NODES)), rows, at))
+        return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
+
+    begin = lambda: tuple(_units(2 * size, equations) for size in sizes)  # noqa: E731
+    return _stepped(equations, grid, harmonics, _NODES, h, steps, begin, step)
+
+
+def _implicit_transition(
+    equations: _Disturbances,
+    grid: Grid,
+    harmonics: Harmonics,
+    fields: Sequence[_Field],
+    sizes: Sequence[int],
+    h: Array,
+    steps: int | Array,
+) -> tuple[Array, ...]:
+    """Transition matrices as `_explicit_transition` returns them, by implicit steps."""
+    # One solve for all equations: its program is as large as the rest of the step.
+    total, orbits, dtype = sum(sizes), equations.omega.shape[0], equations.omega.dtype
+
+    def step(at: _Coefficients, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        slopes = jnp.zeros((len(radau.NODES), total, 2, total, orbits), dtype)
+        for field, size, begin in zip(fields, sizes, np.cumsum((0, *sizes)), strict=False):
+            unit, here = _units(2 * size, equations), slice(begin, begin + size)
+            own = jax.vmap(lambda c, field=field, unit=unit, k=size: field(c, unit[:k], unit[k:]))(at)
+            slopes = slopes.at[:, here, :, here].set(own.reshape(-1, size, 2, size, orbits))
+        each = slopes.reshape(len(radau.NODES), total, -1, orbits)
+        over = jax.vmap(lambda a: radau.transition(a, h), in_axes=-1, out_axes=-1)(each)
+        return (jnp.einsum("abp,bcp->acp", over, state[0]),)
+
+    begin = lambda: (_units(2 * total, equations),)  # noqa: E731
+    (end,) = _stepped(equations, grid, harmonics, radau.NODES, h, steps, begin, step)
+    both = end.reshape(2, total, 2, total, orbits)
+    parts = np.split(np.arange(total), np.cumsum(sizes)[:-1])
+    return tuple(both[:, k][:, :, :, k].reshape(2 * k.size, 2 * k.size, orbits) for k in parts)
+
+
+def _stepped(
+    equations: _Disturbances,
+    grid: Grid,
+    harmonics: Harmonics,
+    nodes: np.ndarray,
+    h: Array,
+    steps: int | Array,
+    begin: Callable[[], tuple[Array, ...]],
+    step: Callable[[_Coefficients, tuple[Array, ...]], tuple[Array, ...]],
+) -> tuple[Array, ...]:
+    """The state after so many steps from `begin`, each with the coefficients at its `nodes`."""
+    places = jnp.asarray(nodes, dtype=equations.omega.dtype)
+    # exp(i k theta) goes from step to step as a product: sines and cosines at every node took a quarter of the time.
+    every = np.arange(max(grid.deviation_orders[-1], grid.orders[-1]) + 1)
+    at_nodes, turning = _derivatives(every, 3, harmonics.deviation) * _wave(every, places * h), _wave(every, h[None])
+
+    def whole_step(k: Array, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        turned, state = carry
+        found = equations.coefficients(grid, harmonics, (k + places) * h, at_nodes * turned)
+        at = _Coefficients(*(jnp.moveaxis(part, -2, 0) for part in found))
+        return turned * turning, step(at, state)
+
+    return jax.lax.fori_loop(0, steps, whole_step, (jnp.ones_like(turning), begin()))[1]
+
+
+def _units(size: int, equations: _Disturbances) -> Array:
+    """A unit matrix (size, size, P) for each orbit."""
+    omega = equations.omega
+    return jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype)[:, :, None], (size, size, omega.shape[0]))
+
+
+def _wave(orders: np.ndarray, theta: Array) -> Array:
+    """exp(i k theta) at angles theta (n,): (1, n, K)."""
+    return jnp.exp(1j * np.asarray(orders, theta.dtype)[None, None] * theta[None, :, None])
+
+
+def _derivatives(orders: np.ndarray, number: int, like: Array) -> Array:
+    """Factors of exp(i k theta) in its first derivatives, the 0th first: (number, 1, K), of the type of `like`."""
+    return jnp.asarray((1j * orders) ** np.arange(number)[:, None, None], like.dtype)
+
+
+def _signals(harmonics: Array, waves: Array) -> Array:
+    """Re sum_k c_k exp(i k theta) and derivatives, from the waves' own (number, n, K); c (m, K, P) gives (number, m, n, P)."""
+    parts = jnp.concatenate([harmonics.real, harmonics.imag], -2)
+    return jnp.einsum("dnk,mkp->dmnp", jnp.concatenate([waves.real, -waves.imag], -1), parts)
+
+
+def _times(matrix: Array, vectors: Array) -> Array:
+    """Matrix (a, b) times (b, ..., P); of a small matrix as a sum, which the compiler fuses with its surroundings."""
+    if matrix.size > 16:
+        return jnp.tensordot(matrix, vectors, 1)
+    return jnp.sum(matrix.reshape(*matrix.shape, *[1] * (vectors.ndim - 1)) * vectors[None], axis=1)
+
+
+def _small_solve(weight: Array, right: Array) -> Array:
+    """x (np, ...) of (1 - weight) x = right, np = 1 or 2 written out, weight (np, np, ...)."""
+    a = np.eye(weight.shape[0]).reshape(*weight.shape[:2], *[1] * (weight.ndim - 2)) - weight
+    if weight.shape[0] == 1:
+        return right / a[0]
+    det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    return jnp.stack([a[1, 1] * right[0] - a[0, 1] * right[1], a[0, 0] * right[1] - a[1, 0] * right[0]]) / det[None]
+
+
+def _eigenvalues(matrices: Array) -> Array:
+    """Eigenvalues (P, n) of matrices (P, n, n), one matrix after the other: library calls for batches may wait for each other
+    for ever if several programs run side by side (jaxlib 0.10)."""
+    return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
+
+
+def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:
+    """The eigenvalue that belongs to the eigenvector `known`, and a matrix that has the others."""
+    unit = known / jnp.linalg.norm(known)
+    mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))
+    mirror = mirror / jnp.linalg.norm(mirror)
+    turned = matrix - 2.0 * jnp.outer(mirror, mirror @ matrix)
+    turned = turned - 2.0 * jnp.outer(turned @ mirror, mirror)
+    return unit @ (matrix @ unit), turned[1:, 1:]
