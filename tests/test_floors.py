@@ -134,6 +134,41 @@ def test_a_circle_is_seen():
     assert any("jaxvib.machine.scene" in group for group in circles({**modules, "jaxvib.machine.carrier": turned}))
 
 
+PLANS = (
+    "jaxvib.runtime",
+    "jaxvib.units",
+    "jaxvib.boundary",
+    "jaxvib.machine.validation",
+    "jaxvib.steady.outcome",
+    "jaxvib.motion.plan",
+    "jaxvib.steady.orbits.plan",
+    "optimize.quantities.evaluation",
+)
+"""Modules that may ask whether numbers have values, and those in them; constructors use `when_known`."""
+
+
+def asking(modules):
+    """(module, line) of every use of a question whether JAX is transforming a number."""
+    found = []
+    for module, text in modules.items():
+        if not any(module == allowed or module.startswith(allowed + ".") for allowed in PLANS):
+            names = {"traced", "is_known", "Tracer"}
+            for node in ast.walk(ast.parse(text)):
+                called = isinstance(node, ast.Name) and node.id in names
+                if called or (isinstance(node, ast.Attribute) and node.attr in names - {"is_known"}):
+                    found.append(f"{module}:{node.lineno}")
+    return found
+
+
+def test_only_plans_ask_which_numbers_are_known():
+    assert asking(sources()) == []
+
+
+def test_a_question_about_tracers_elsewhere_is_seen():
+    lines = "from jaxvib.units.known import is_known\n\n\ndef f(x):\n    return is_known(x)\n"
+    assert asking({"jaxvib.equations.linear": lines}) == ["jaxvib.equations.linear:5"]
+
+
 def test_folders_and_files_are_small():
     folders, long = collections.Counter(), []
     for part in ("jaxvib", "optimize", "tests", "benchmarks"):

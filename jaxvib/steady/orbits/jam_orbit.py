@@ -8,43 +8,30 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.collected import collected_model
-from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
-from jaxvib.errors import InputError
-from jaxvib.machine.effects.base import has_half_turn
+from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
-from jaxvib.machine.validation import validate_scene
 from jaxvib.numerics.fourier import grid_of
-from jaxvib.runtime.devices import known, on_device
 from jaxvib.runtime.programs import cached
-from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
-from jaxvib.steady.jams.jam import jams_of
+from jaxvib.steady.jams.folds import light_rotor_speed
 from jaxvib.steady.orbits.describe import Orbit, OrbitStatus, numbers_of, orbits
-from jaxvib.steady.orbits.solve import Parameter, branch_tangent, periodic_motion
-from jaxvib.steady.orbits.stability import is_stiff, steps_for
+from jaxvib.steady.orbits.plan import OrbitPlan, plan_orbit
+from jaxvib.steady.orbits.search import exact_mode_speeds
+from jaxvib.steady.orbits.solve import Parameter, periodic_motion
+from jaxvib.steady.orbits.stability import steps_for
 from jaxvib.steady.outcome import outcome
-from jaxvib.units import Number, count, number, traced
+from jaxvib.units import Number
 
-__all__ = ["branch_at", "exact_mode_speeds", "jam_orbit"]
-
-_POINTS = (16, 32, 64, 128)
-"""Points on half a period, tried in turn until the asked accuracy holds."""
-
-_SEARCH, _LANES = 800, 100
-"""Points of the exact branch that are looked at where the leading order does not lead to a mode, and of them at once."""
-
-_PARTS = 32
-"""Into so many parts cubics divide what lies between two of these points."""
-
-_NEAR_FOLD = 1e-6
-"""Relative distance of the rotor's speed from a fold, so far as the cubics say, below which the fold itself is looked for."""
+__all__ = ["jam_orbit"]
 
 _FAR = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
+
+_UNKNOWN_STEPS = 64
+"""Steps of the multipliers' integration under a JAX transformation: reverse derivatives need a number in the program."""
 
 
 @validated
@@ -99,108 +86,54 @@ def jam_orbit(
 
     Source: the antiphase paper, equations (2) and (21), solved without its expansion in eps.
     """
-    named = [name for name, value in (("mode", mode), ("omega", omega), ("near", near)) if value is not None]
-    if len(named) != 1:
-        given = " and ".join(named) if named else "none"
-        raise InputError("jam_orbit", f"was asked with {given}; give one of mode=3, omega=95.0, near=95.0")
-    scene = validate_scene(scene)
-    concrete = not any(traced(leaf) for leaf in jax.tree.leaves((scene, omega, near)))
-    # What is known has no gradient to stop: a scene that was checked stays itself, and numbers need no operation.
-    frozen = scene if concrete else jax.tree.map(lambda x: jax.lax.stop_gradient(x) if traced(x) else x, scene)
-    floor = 1e3 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    if accuracy is None:
-        accuracy = 1e-9 if floor < 1e-9 else 1e-3
-    if not accuracy >= floor:
-        raise InputError("accuracy", f"is {accuracy}; {scene.drive.speed.dtype} numbers allow {floor:.0e} and above")
-    loads = jammed_loads(frozen)
-    require_drag(loads)
-
-    exists, direction, start = on_device(np.asarray(True)), None, frozen.drive.speed
-    if mode is not None:
-        if frozen.machine.mounting().gyroscopic is not None:
-            raise InputError("mode", "is asked of a machine whose resonances move with the rotor's speed; give omega or near")
-        jams = jams_of(frozen)
-        light, speed = known(jams.omega)[jams.row(mode)], known(frozen.drive.speed)
-        direction = on_device(np.asarray(1.0 if mode % 2 == 1 else -1.0, speed.dtype))
-        within = jnp if traced(light) or traced(speed) else np
-        exists = on_device(within.asarray(within.isfinite(light)))
-        start = on_device(within.asarray(within.where(within.isfinite(light), light, speed)))
-    elif near is not None:
-        start = number(near, "rad/s", "near", low=0.0, open_low=True)
-    which: Parameter = "rotor_speed"
-    value = scene.drive.speed
-    if omega is not None:
-        value = number(omega, "rad/s", "omega", low=0.0, open_low=True)
-        which, start = "omega", _light_rotor_speed(frozen, jax.lax.stop_gradient(value))
-
-    if points is not None:
-        bodies = 1 if loads.alike else loads.count
-        count(points, "points", low=2, each=16.0 * bodies**2 * float(points if isinstance(points, int) else 1))
-    half = has_half_turn(scene.effects)
-    if points is None and not concrete:
-        points = 16 if half else 33
-    tried = [points] if points is not None else [p if half else 2 * p + 1 for p in _POINTS]
-    still = jax.lax.stop_gradient(value)
-    differentiated = any(traced(leaf) for leaf in jax.tree.leaves((scene, value)))
-    many, found, settle = tried[0], None, False
-    speeds = (still, start) if which == "omega" else (start, still)
-    # Unknown numbers may be those of loads with much drag.
-    implicit = bool(_is_stiff(frozen, *speeds)) if concrete else True
-
-    def attempt() -> Orbit:
-        """The first that is accurate enough, or the best: beside a fold more points add rounding, and no accuracy."""
-        nonlocal many
-        best, least = None, math.inf
-        for each in tried:
-            orbit = _orbit(frozen, still, start, exists, direction, which, each, None, accuracy, implicit, settle)
-            error = float(orbit.error)
-            if best is None or error < least:
-                best, least, many = orbit, error, each
-            if not error > accuracy:  # nor is it where there is no motion
-                break
-        assert best is not None
-        return best
-
-    if concrete:
-        found = attempt()
-        if mode is not None and not abs(float(found.omega) / float(start) - 1.0) < _FAR:
-            # The leading order has no such mode, or it is far from the exact one: look at the whole exact branch.
-            searched = exact_mode_speeds(frozen).get(int(mode))
-            exists = jnp.asarray(searched is not None)
-            start = start if searched is None else jnp.asarray(searched, dtype=start.dtype)
-            settle = True
-            found = attempt()
-    if found is None or differentiated:
-        # Reverse-mode derivatives ask for a number of steps that is part of the program.
-        steps = 64
-        if concrete:
-            wanted = _steps_for(frozen, *speeds, implicit)
-            steps = 2 ** int(np.ceil(np.log2(float(wanted))))
-        found = _orbit(scene, value, start, exists, direction, which, many, steps, accuracy, implicit, settle)
-    return outcome(found, scene, throw=throw and concrete, failures=("absent", "not_converged"))
+    plan = plan_orbit(scene, mode=mode, omega=omega, near=near, accuracy=accuracy, points=points)
+    if not plan.is_known:
+        return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
+    orbit = _solve_accurately(plan)
+    if plan.mode is not None and not abs(float(orbit.omega) / float(plan.start) - 1.0) < _FAR:
+        # The leading order lacks the mode, or is far from it: search the whole exact branch.
+        orbit = _solve_accurately(_from_search(plan, plan.mode))
+    return outcome(orbit, throw=throw, failures=("absent", "not_converged"))
 
 
-@cached
-def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
-    return light_rotor_speed(jammed_model(scene), omega)
+def _solve_accurately(plan: OrbitPlan) -> Orbit:
+    """Return the first orbit that is accurate enough, or the best one: beside a fold more points add rounding, not accuracy."""
+    best, least = None, math.inf
+    for points in plan.points:
+        orbit = _solve(plan, points)
+        error = float(orbit.error)
+        if best is None or error < least:
+            best, least = orbit, error
+        if not error > plan.accuracy:  # NaN where there is no motion
+            break
+    assert best is not None
+    return best
 
 
-@cached
-def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
-    return is_stiff(collected_model(jammed_model(scene)), omega, speed)
+def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
+    """Return the plan that starts where a search of the whole branch finds the mode."""
+    found = exact_mode_speeds(plan.scene).get(mode)
+    start = plan.start if found is None else jnp.asarray(found, dtype=plan.start.dtype)
+    return dataclasses.replace(plan, exists=jnp.asarray(found is not None), start=start, is_settled_first=True)
 
 
-@cached
-def _steps_for(scene: Scene, omega: Array, speed: Array, implicit: bool) -> Array:
-    return steps_for(collected_model(jammed_model(scene)), omega, speed, implicit=implicit)
+def _solve(plan: OrbitPlan, points: int, steps: int | None = None) -> Orbit:
+    return _solved(
+        plan.scene,
+        plan.value,
+        plan.start,
+        plan.exists,
+        plan.direction,
+        plan.given,
+        points,
+        steps,
+        plan.accuracy,
+        plan.implicit,
+        plan.is_settled_first,
+    )
 
 
-@cached
-def _fold_points(scene: Scene) -> tuple[Array, Array]:
-    return fold_points(jammed_model(scene), _SEARCH)
-
-
-def _from_orbit(
+def _outputs(
     orbit: Orbit,
     scene: Scene,
     value: Array,
@@ -211,13 +144,13 @@ def _from_orbit(
     points: int,
     *_: object,
 ) -> Orbit:
-    """What follows from the motion, which is known; neither multipliers nor how good it is."""
+    """Outputs that follow from the motion, once it is solved: neither multipliers nor errors."""
     untold = jax.tree.map(lambda _: None, orbit)
     return dataclasses.replace(untold, **numbers_of(collected_model(jammed_model(scene)), orbit, value, start, given, points))
 
 
-@cached(outputs_from_solution=_from_orbit)
-def _orbit(
+@cached(outputs_from_solution=_outputs)
+def _solved(
     scene: Scene,
     value: Array,
     start: Array,
@@ -232,8 +165,8 @@ def _orbit(
 ) -> Orbit:
     """One exact jam.
 
-    Its multipliers take so many `steps` of the `implicit` or the explicit method, or those that the speeds ask for (no reverse
-    derivatives then); to `settle` is to start from the motion at the load speed `start`, where that is near the answer.
+    Its multipliers take so many `steps` of the `implicit` or the explicit method, by default as many as the speeds need (no
+    reverse derivatives then). `settle` starts from the motion at the load speed `start`, if that is near the answer.
     """
     model, deviation = collected_model(jammed_model(scene)), None
     if settle:
@@ -242,95 +175,12 @@ def _orbit(
     speeds = (value, start) if given == "omega" else (start, value)
     enough = steps_for(model, *speeds, implicit=implicit) if steps is None else steps
     many = jnp.reshape(value, (1,)), jnp.reshape(start, (1,))
-    lanes, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit)
-    orbit = jax.tree.map(lambda leaf: leaf[0], lanes)
-    # A motion on a falling piece of the branch is not the odd mode that was asked for, nor one on a rising piece the even.
+    batch, _ = orbits(model, *many, given, points, enough, accuracy, deviation, implicit=implicit)
+    orbit = jax.tree.map(lambda leaf: leaf[0], batch)
+    # A motion on a falling piece of the branch is no odd mode, one on a rising piece no even mode.
     there = exists
     if direction is not None:
         there = exists & (~(orbit.slope * direction < 0.0) | (orbit.status == OrbitStatus.at_fold))
     orbit = jax.tree.map(lambda x: jnp.where(there, x, jnp.nan) if eqx.is_inexact_array(x) else x, orbit)
     status, stable = OrbitStatus.where(there, orbit.status, OrbitStatus.absent), there & orbit.stable
     return eqx.tree_at(lambda o: (o.status, o.stable), orbit, (status, stable))
-
-
-def exact_mode_speeds(scene: Scene) -> dict[int, float]:
-    """Load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode: where to start from for each.
-
-    The exact branch n(Omega) is looked at point by point, cut where it turns, and its pieces numbered as `jam_modes` does.
-    """
-    crowded, resonances = _fold_points(scene)
-    crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
-    crowded = np.unique(np.append(crowded, target))  # twice the same point would look like a turn
-    omega = np.interp(np.linspace(0.0, 1.0, _SEARCH), np.linspace(0.0, 1.0, crowded.size), crowded)
-    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
-    known = np.isfinite(speed)
-    omega, speed = _between(omega[known], speed[known], slope[known])
-    rising = speed[1:] > speed[:-1]
-    turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
-    padded = np.pad(turn, (0, 4 * nd - turn.size))
-    main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
-    there = main < turn.size
-    cuts = np.where(there, omega[padded[main]], np.inf)
-    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
-    crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
-    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD * target]
-    close = []
-    for k in near:
-        around = np.clip([k - _PARTS, k + _PARTS], 0, omega.size - 1)
-        low, high = (float(w) for w in omega[around])
-        if _ends_before(scene, low, high, target):
-            crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
-        else:
-            close.append(k)
-    found: dict[int, float] = {}
-    for k in np.flatnonzero(crossed):
-        part = (target - speed[k]) / (speed[k + 1] - speed[k])
-        found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
-    # So close to a fold that it lies between two points: both of its modes are about there.
-    for k in close:
-        for side in (k - 1, k + 1):
-            found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
-    return found
-
-
-def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
-    """Whether the exact branch turns back, between two load speeds, before it comes to the rotor speed `target`.
-
-    The fold is looked at through ever smaller windows; that its slope is 0 says where it is, to rounding.
-    """
-    omega = np.linspace(low, high, _SEARCH)
-    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _LANES)))
-    (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
-    if turns.size != 1:
-        return False
-    ends = slice(turns[0], turns[0] + 2)
-    if looks > 1:
-        low, high = (float(w) for w in omega[ends])
-        return _ends_before(scene, low, high, target, looks - 1)
-    rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    fold = _between(omega[ends], speed[ends], slope[ends])[1]
-    return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
-
-
-def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points of the cubics through (x, y) with these slopes, `_PARTS` an interval."""
-    t, h = np.arange(_PARTS) / _PARTS, np.diff(x)[:, None]
-    a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
-    cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
-    return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
-
-
-@cached
-def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
-    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
-    none."""
-    model = collected_model(jammed_model(scene))
-    grid = grid_of(*((16, True) if model.half_turn else (33, False)))
-
-    def one(w: Array) -> tuple[Array, Array]:
-        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
-        branch = branch_tangent(model, grid, motion)
-        there = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
-        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, branch.slope, jnp.nan)
-
-    return jax.lax.map(jax.vmap(one), omega)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -267,9 +267,8 @@ def floquet(
         fields, sizes = (*fields, equations.relative_motion), (*sizes, 1)
     transition = _implicit_transition if implicit else _explicit_transition
     whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps)
-    flip = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
-    monodromy = flip[:, None, None] * whole
-    trivial, rest = jax.vmap(_deflated, in_axes=-1)(monodromy, equations.along_orbit(grid, harmonics))
+    flip: Any = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
+    trivial, rest = jax.vmap(_deflated, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
     roots = _eigenvalues(rest).T
     inner = _eigenvalues(jnp.moveaxis(relative[0], -1, 0)).T if relative else None
     return Floquet(roots, inner, trivial)

@@ -23,7 +23,8 @@ from jaxvib.motion.start import APART, initial_state, with_spin
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import OrbitStatus
-from jaxvib.steady.orbits.jam_orbit import branch_at, jam_orbit
+from jaxvib.steady.orbits.jam_orbit import jam_orbit
+from jaxvib.steady.orbits.search import branch_at
 from jaxvib.study.accuracy.exact_reference import SLOW_PERIODS, slow_period
 
 __all__ = ["LEAST", "JamQuestion", "RunQuestion", "Values", "admitted", "fold_speed", "mean_torque", "turning_state"]

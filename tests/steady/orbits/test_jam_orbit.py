@@ -8,9 +8,9 @@ from scenes import published
 import jaxvib as jv
 from jaxvib.equations.collected import collected_model
 from jaxvib.equations.linear import jammed_model
-from jaxvib.steady.orbits import diagram, jam_orbit
+from jaxvib.steady.orbits import diagram, search
 from jaxvib.steady.orbits.describe import _swing
-from jaxvib.steady.orbits.jam_orbit import _between
+from jaxvib.steady.orbits.search import _between
 from jaxvib.steady.orbits.stability import steps_for
 
 
@@ -18,7 +18,7 @@ def test_points_between_follow_the_hermite_cubic():
     x = np.array([0.0, 1.0, 3.0, 3.5])
     cubic, slope = np.poly1d([1.0, -4.0, 2.0, 5.0]), np.polyder(np.poly1d([1.0, -4.0, 2.0, 5.0]))
     between, values = _between(x, cubic(x), slope(x))
-    parts = jam_orbit._PARTS
+    parts = search._PARTS_PER_INTERVAL
     assert between.size == values.size == 3 * parts + 1 and parts > 2
     np.testing.assert_allclose(between[::parts], x)
     np.testing.assert_allclose(np.diff(between[parts : 2 * parts]), 2.0 / parts)
@@ -31,10 +31,10 @@ def test_points_between_follow_the_hermite_cubic():
 def test_a_branch_may_turn_back_before_the_rotor_speed(monkeypatch, top, target, ends):
     """n = top -/+ (w - 2)^2, whose fold is at 2; a target that the parabola passes is not before its end."""
     sign = np.sign(top)
-    monkeypatch.setattr(jam_orbit, "branch_at", lambda scene, w: (top - sign * (w - 2.0) ** 2, -2.0 * sign * (w - 2.0)))
+    monkeypatch.setattr(search, "branch_at", lambda scene, w: (top - sign * (w - 2.0) ** 2, -2.0 * sign * (w - 2.0)))
     scene = published().scene()
-    assert jam_orbit._ends_before(scene, 1.7, 2.4, target) == ends
-    assert not jam_orbit._ends_before(scene, 2.1, 2.4, target)  # no fold in there
+    assert search._ends_before(scene, 1.7, 2.4, target) == ends
+    assert not search._ends_before(scene, 2.1, 2.4, target)  # no fold in there
 
 
 def test_the_diagram_begins_at_a_fifth_of_the_lowest_resonance(monkeypatch):
@@ -88,7 +88,7 @@ def test_a_whole_turn_takes_twice_the_steps_of_half_a_turn():
 
 def test_a_branch_is_looked_at_once_at_each_point(monkeypatch):
     """The diagram is evaluated on n = Omega and in whole numbers, some repeated; at the rotor speed itself nothing remains."""
-    points = np.concatenate([np.ones(9), np.arange(1.0, jam_orbit._SEARCH + 1)])
-    monkeypatch.setattr(jam_orbit, "_fold_points", lambda scene: (points, jnp.array([2.0, 3.0])))
-    monkeypatch.setattr(jam_orbit, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))
-    assert jam_orbit.exact_mode_speeds(published(speed=30.0).scene()) == {5: 30.0}
+    points = np.concatenate([np.ones(9), np.arange(1.0, search._BRANCH_POINTS + 1)])
+    monkeypatch.setattr(search, "_fold_points", lambda scene: (points, jnp.array([2.0, 3.0])))
+    monkeypatch.setattr(search, "branch_at", lambda scene, omega: (omega, jnp.ones_like(omega)))
+    assert search.exact_mode_speeds(published(speed=30.0).scene()) == {5: 30.0}

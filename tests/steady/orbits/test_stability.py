@@ -17,7 +17,7 @@ from stored_jit import stored_jit
 
 import jaxvib as jv
 from jaxvib.steady.orbits.diagram import SpecialPoint
-from jaxvib.steady.orbits.jam_orbit import _is_stiff
+from jaxvib.steady.orbits.plan import _is_stiff
 from jaxvib.steady.orbits.stability import _deflated, _small_solve
 from jaxvib.study.maps.stability_onset import StabilityMap, stability_onset
 

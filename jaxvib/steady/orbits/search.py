@@ -1,0 +1,115 @@
+"""Search of the whole exact branch n(Omega) for the jams of a rotor speed."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.equations.collected import collected_model
+from jaxvib.equations.linear import jammed_model
+from jaxvib.machine.scene import Scene
+from jaxvib.numerics.fourier import grid_of
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.folds import fold_points, light_rotor_speed, piece_modes, without_ripples
+from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
+
+__all__ = ["branch_at", "exact_mode_speeds"]
+
+_BRANCH_POINTS, _BATCH = 800, 100
+"""Points of the exact branch that are computed, and of them at once."""
+
+_PARTS_PER_INTERVAL = 32
+"""Parts into which cubics divide the interval between two of these points."""
+
+_NEAR_FOLD = 1e-6
+"""Relative distance of the rotor's speed from a fold of the cubics below which the fold itself is computed."""
+
+
+@cached
+def _fold_points(scene: Scene) -> tuple[Array, Array]:
+    return fold_points(jammed_model(scene), _BRANCH_POINTS)
+
+
+def exact_mode_speeds(scene: Scene) -> dict[int, float]:
+    """Return the load speeds (rad/s) of the exact jams at the scene's rotor speed, by mode, to start from.
+
+    The exact branch n(Omega) is computed point by point and cut at its folds; its pieces are numbered as in `jam_modes`.
+    """
+    crowded, resonances = _fold_points(scene)
+    crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
+    crowded = np.unique(np.append(crowded, target))  # twice the same point would look like a turn
+    omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _BATCH)))
+    known = np.isfinite(speed)
+    omega, speed = _between(omega[known], speed[known], slope[known])
+    rising = speed[1:] > speed[:-1]
+    turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
+    padded = np.pad(turn, (0, 4 * nd - turn.size))
+    main = np.asarray(without_ripples(jnp.asarray(speed[padded]), jnp.asarray(turn.size), 2 * nd))
+    there = main < turn.size
+    cuts = np.where(there, omega[padded[main]], np.inf)
+    modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
+    crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
+    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD * target]
+    close = []
+    for k in near:
+        around = np.clip([k - _PARTS_PER_INTERVAL, k + _PARTS_PER_INTERVAL], 0, omega.size - 1)
+        low, high = (float(w) for w in omega[around])
+        if _ends_before(scene, low, high, target):
+            crossed[around[0] : around[1]] = False  # what seems to cross there is the error of the interpolation
+        else:
+            close.append(k)
+    found: dict[int, float] = {}
+    for k in np.flatnonzero(crossed):
+        part = (target - speed[k]) / (speed[k + 1] - speed[k])
+        found.setdefault(int(modes[np.searchsorted(cuts, omega[k])]), float(omega[k] + part * (omega[k + 1] - omega[k])))
+    # So close to a fold that it lies between two points: both of its modes are about there.
+    for k in close:
+        for side in (k - 1, k + 1):
+            found.setdefault(int(modes[np.searchsorted(cuts, omega[side])]), float(omega[side]))
+    return found
+
+
+def _ends_before(scene: Scene, low: float, high: float, target: float, looks: int = 2) -> bool:
+    """True if the exact branch turns back, between two load speeds, before it reaches the rotor speed `target`.
+
+    The fold is bracketed in ever smaller windows; the zero of its slope locates it to rounding.
+    """
+    omega = np.linspace(low, high, _BRANCH_POINTS)
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _BATCH)))
+    (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
+    if turns.size != 1:
+        return False
+    ends = slice(turns[0], turns[0] + 2)
+    if looks > 1:
+        low, high = (float(w) for w in omega[ends])
+        return _ends_before(scene, low, high, target, looks - 1)
+    rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
+    fold = _between(omega[ends], speed[ends], slope[ends])[1]
+    return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
+
+
+def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cubics through (x, y) with these slopes, `_PARTS_PER_INTERVAL` an interval."""
+    t, h = np.arange(_PARTS_PER_INTERVAL) / _PARTS_PER_INTERVAL, np.diff(x)[:, None]
+    a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]
+    cubic = (1.0 + 2.0 * t) * (1.0 - t) ** 2 * a + t * (1.0 - t) ** 2 * b + t**2 * (3.0 - 2.0 * t) * c + t**2 * (t - 1.0) * d
+    return np.append(x[:-1, None] + h * t, x[-1]), np.append(cubic, y[-1])
+
+
+@cached
+def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
+    """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
+    none."""
+    model = collected_model(jammed_model(scene))
+    grid = grid_of(*((16, True) if model.half_turn else (33, False)))
+
+    def one(w: Array) -> tuple[Array, Array]:
+        motion = periodic_motion(model, grid, "omega", w, light_rotor_speed(model.linear, w))
+        branch = branch_tangent(model, grid, motion)
+        there = branch.residual < 4096.0 * jnp.finfo(w.dtype).eps
+        return jnp.where(there, motion.rotor_speed, jnp.nan), jnp.where(there, branch.slope, jnp.nan)
+
+    return jax.lax.map(jax.vmap(one), omega)
