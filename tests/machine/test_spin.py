@@ -10,6 +10,7 @@ from torus.rigid_ball import RigidBall
 
 import jaxvib as jv
 from jaxvib.equations.forces import energy, power
+from jaxvib.machine.files import TEMPLATES
 from jaxvib.runtime.operations import operations
 
 HEAVY = jv.planar_rotor(mass=1e12, stiffness=0.0, damping=0.0)
@@ -227,3 +228,16 @@ POINTS = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.1)
 def test_what_does_not_go_is_said(ask, says):
     with pytest.raises(jv.InputError, match=says):
         ask()
+
+
+def test_sliding_balls_of_a_torus_move_alike_with_equal_steps():
+    """Two coordinates of each ball, and a slip along each."""
+    template = jv.scene_from_toml(TEMPLATES["torus"])
+    s = jv.Scene(template.machine, template.loads, template.drive, (jv.Sliding(0.1),))
+    chosen, equal = (
+        jv.simulate(s, 0.05, stepsize_controller=steps, estimate=False, samples=64)
+        for steps in (jv.Tolerance(1e-9), jv.EqualSteps(2000))
+    )
+    for ours, theirs in zip(jax.tree.leaves(chosen.trajectory), jax.tree.leaves(equal.trajectory), strict=True):
+        np.testing.assert_allclose(ours[-1], theirs[-1], rtol=1e-6, atol=1e-9)
+    assert len(chosen.trajectory.state.spin.slip) == 2

@@ -112,6 +112,16 @@ def test_where_a_run_blew_up_is_said(stiffness):
     assert error.value.status == "not_finite" and (stiffness < -1e10 or ", after t = 0.02" in str(error.value))
 
 
+def test_a_platform_at_rest_hides_no_other_that_blows_up():
+    """The second platform is on springs of its own and stays where it is."""
+    machine = jv.network(mass=[50.0, 30.0], stiffness=[4e4, 3e4], damping=[10.0, 10.0], links=[], exciter=1)
+    loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0)
+    soft = jv.Scene(machine, loads, jv.ConstantSpeed(60.0), (jv.CubicSupport(-1e8, platform=1),))
+    start = eqx.tree_at(lambda s: s.displacement, jv.initial_state(soft), jnp.array([0.05, 0.0]))
+    run = jv.simulate(soft, 1.0, start=start, max_steps=200, throw=False)
+    assert run.status_name == "not_finite" and int(run.steps) > 100
+
+
 def test_loads_in_contact_start_in_their_order():
     loads = jv.balls(count=3, mass=0.3, radius=0.1, drag=0.5, ball_radius=0.02)
     s = jv.Scene(scene("one_mass").machine, loads, jv.ConstantSpeed(60.0), (jv.LoadContact(stiffness=1e5),))

@@ -37,6 +37,19 @@ def test_items_are_taken_as_there_is_room(monkeypatch):
     assert list(parallel.in_parallel(computed, [])) == []
 
 
+def test_a_result_does_not_wait_for_other_items(monkeypatch):
+    monkeypatch.setattr(parallel, "cores", lambda: 2)
+    first_is_there = threading.Event()
+
+    def computed(k):
+        return k == 0 or first_is_there.wait(timeout=20.0)
+
+    for k, in_time in parallel.in_parallel(computed, [0, 1]):
+        assert in_time, "the second item ended before the result of the first was given"
+        if k == 0:
+            first_is_there.set()
+
+
 def test_an_error_ends_it_and_what_has_not_begun_is_not_computed(monkeypatch):
     monkeypatch.setattr(parallel, "cores", lambda: 2)
     begun = []

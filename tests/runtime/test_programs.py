@@ -87,6 +87,9 @@ ROUTES = {
     "vmap of one argument": lambda f: jax.vmap(lambda shift: f(X, shift).values)(jnp.arange(4.0)),
     "linearize": lambda f: jax.linearize(lambda x: f(x).values, X)[1](jnp.arange(3.0)),
     "linearize, many": lambda f: jax.vmap(jax.linearize(lambda x: f(x).values, X)[1])(jnp.eye(3)),
+    "jvp in a batch of one argument": lambda f: jax.vmap(
+        lambda shift: jax.jvp(lambda *both: f(*both).values, (X, shift), (jnp.ones(3), jnp.ones(())))
+    )(jnp.arange(4.0)),
     "vjp": lambda f: jax.vjp(lambda x: (f(x).values, f(x).phase), X)[1]((jnp.ones(3), jnp.full(3, 1j))),
 }
 
