@@ -32,6 +32,7 @@ import os
 import pathlib
 import random
 import re
+import resource
 import signal
 import time
 import types
@@ -53,6 +54,9 @@ from jaxvib.errors import quoted
 
 PATIENCE = 20.0
 """Seconds that no call may take, of the processor: others who use it do not count."""
+
+MEMORY = 8 * 2**30
+"""Bytes that the trial may take; a call that needs more ends in a `MemoryError`, not in that of the whole machine."""
 
 LONG = ("prepare_cpu", "use_cache")
 """Functions of which only refusals are looked at: a valid call runs for minutes or changes the process."""
@@ -341,6 +345,7 @@ def main() -> int:
     parser.add_argument("--out", type=pathlib.Path, help="folder of the counts, a line of JSON for each function")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     ends: dict[int, dict[str, Any]] = {}
     file = None
     if asked.out is not None:

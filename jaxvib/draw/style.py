@@ -113,8 +113,10 @@ def panels(
     2
     """
     if ax is not None:
-        given = [ax] if isinstance(ax, Axes) else list(np.ravel(np.asarray(ax, dtype=object)))
-        if not all(isinstance(each, Axes) for each in given):
+        given = [ax] if isinstance(ax, Axes) else ax
+        if isinstance(given, (list, tuple, np.ndarray)):  # a long range would fill the memory
+            given = list(np.ravel(np.asarray(given, dtype=object)))
+        if not isinstance(given, list) or not all(isinstance(each, Axes) for each in given):
             raise InputError("ax", f"is {quoted(ax)}; give matplotlib's Axes, such as those of matplotlib.pyplot.subplots()")
         if len(given) != rows * columns:
             raise InputError("ax", f"has {len(given)} axes; this figure has {rows * columns} panels, give as many")

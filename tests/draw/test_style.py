@@ -156,3 +156,15 @@ def test_the_figure_of_jam_modes_names_the_coordinates():
 def test_axes_that_are_none_are_refused():
     with pytest.raises(jv.InputError, match=r"ax is \[1.0\]; give matplotlib's Axes"):
         panels(1, ax=[1.0])
+    with pytest.raises(jv.InputError, match=r"ax is range\(0, 1000000000\); give matplotlib's Axes"):
+        panels(1, ax=range(10**9))
+
+
+def test_diagram_of_no_rotor_speed_is_refused():
+    scene = jv.Scene(
+        jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+        jv.balls(count=1, mass=0.5, radius=0.1, drag=0.5),
+        jv.ConstantSpeed(60),
+    )
+    with pytest.raises(jv.InputError, match=r"most is -1 rad/s; the branches begin at"):
+        jv.branches(scene, points=50).plot(most=-1.0)

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 
 if TYPE_CHECKING:
@@ -78,6 +79,8 @@ def picture(
     kinds = sorted({kind for kind, _, _ in marks})
     shown = {kind: np.array([(w, n) for k, w, n in marks if k == kind and n <= top]).reshape(-1, 2) for kind in kinds}
     rotor_speed = np.asarray(branch.rotor_speed)
+    if not np.any(rotor_speed <= top):
+        raise InputError("most", f"is {top:g} rad/s; the branches begin at {np.nanmin(rotor_speed):.4g} rad/s")
     if resonances is None:
         resonances = np.asarray(estimated_frequencies(branch.scene))
     if modes is None:
