@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
-from jaxvib.runtime.compat import accepted_flags, backend_started, wide_vectors_are_right
+from jaxvib.runtime.compat import accepted_flags, backend_started, loops_need_a_flag, wide_vectors_are_right
 
 __all__ = ["has_flags", "prepare_cpu", "processor"]
 
@@ -25,24 +25,26 @@ _WIDTH = "--xla_cpu_prefer_vector_width"
 
 @validated
 def prepare_cpu(devices: int | None = 1) -> str:
-    """Lets XLA compile a whole time loop into one function; it must be called before JAX computes anything.
+    """Set XLA's flags in the environment, before JAX computes anything.
 
-    jaxvib does so by itself when its first public name is asked for, so that this is only needed for `devices`, where arrays
-    are made before, or with JAXVIB_AUTOMATIC=off in the environment. Without it XLA's CPU backend (jax before 0.12) runs the
-    body of all but the smallest loops as a chain of small functions, and time integration takes many times as long; steady
-    answers hardly change. It can be set in the environment only, as
+    With jax before 0.12 the first use of a public name of jaxvib calls this function, unless JAXVIB_AUTOMATIC=off in the
+    environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest
+    loops as a chain of small functions, and time integration takes many times as long; steady answers hardly change. From
+    0.12 on XLA needs no flag, and jaxvib sets none by itself. The flags, in `XLA_FLAGS`:
 
-        XLA_FLAGS="--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000 ..."
+    - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
+    - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
+    - `--xla_cpu_prefer_vector_width=512` on processors with AVX-512: batches of runs take 0.9 of the time
+    - `--xla_force_host_platform_device_count` for several `devices`: your own programs may use them; jaxvib uses all cores
+      without it
 
-    which this does for you: it also asks for the code generator that compiles such programs in two thirds of the time, for
-    vectors of 512 bits where the processor has them, and for `devices` devices in one process, over which programs of your own
-    may be spread; what computes many cases here uses all cores without them. Flags that the environment holds already are left
-    as they are, and those that the installed jaxlib does not know are left out: XLA would end the process.
+    Flags that are set already stay as they are. Flags that the installed jaxlib does not know are left out, since XLA would
+    end the process.
 
-    **Arguments**: `devices`, default 1; None: as many as this process may use cores.
+    **Arguments**: `devices`, default 1; None: the number of cores that this process may use.
 
-    **Returns** the flags. **Raises** `InputError` where JAX has begun to compute already, so that they would have no effect, or
-    for a number of devices below 1.
+    **Returns** the flags. **Raises** `InputError` if JAX has computed already, so that they would have no effect, or for a
+    number of devices below 1.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> _ = jnp.zeros(1)
@@ -59,11 +61,12 @@ def prepare_cpu(devices: int | None = 1) -> str:
         raise InputError("prepare_cpu", "comes too late, JAX has begun to compute; call it before any array is made")
     flags = os.environ.get("XLA_FLAGS", "").split()
     ours = []
-    for place, flag in enumerate(flags):
-        if flag.startswith(_EXTRA) and _LOOPS not in flag:
-            flags[place] = f"{flag},{_LOOPS}=1000000000"
-    if not any(_LOOPS in flag for flag in flags):
-        ours.append(f"{_EXTRA}{_LOOPS}=1000000000")
+    if loops_need_a_flag():
+        for place, flag in enumerate(flags):
+            if flag.startswith(_EXTRA) and _LOOPS not in flag:
+                flags[place] = f"{flag},{_LOOPS}=1000000000"
+        if not any(_LOOPS in flag for flag in flags):
+            ours.append(f"{_EXTRA}{_LOOPS}=1000000000")
     ours.append(_COMPILING)
     if devices > 1:
         ours.append(f"--xla_force_host_platform_device_count={devices}")
@@ -76,8 +79,8 @@ def prepare_cpu(devices: int | None = 1) -> str:
 
 
 def has_flags() -> bool:
-    """Whether the environment has what `prepare_cpu` sets."""
-    return _LOOPS in os.environ.get("XLA_FLAGS", "")
+    """Return True if time loops run as one function: this jaxlib needs no flag, or the environment has it."""
+    return not loops_need_a_flag() or _LOOPS in os.environ.get("XLA_FLAGS", "")
 
 
 def _has_wide_vectors() -> bool:

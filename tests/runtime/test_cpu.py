@@ -25,7 +25,9 @@ def test_prepare_cpu_sets_flags_first_and_warns_if_late():
 import os, jaxvib as jv
 os.environ["XLA_FLAGS"] = "--xla_cpu_prefer_vector_width=256"
 flags = jv.prepare_cpu(3)
-assert "loop_byte_threshold=1000000000" in flags and flags.count("vector_width") == 1 and flags == jv.prepare_cpu(3)
+from jaxvib.runtime.compat import loops_need_a_flag
+assert ("loop_byte_threshold=1000000000" in flags) == loops_need_a_flag()
+assert flags.count("vector_width") == 1 and flags == jv.prepare_cpu(3)
 import jax
 assert len(jax.devices()) == 3
 jax.numpy.zeros(1)
@@ -38,3 +40,18 @@ except jv.InputError as error:
     assert "prepare_cpu comes too late" in done.stdout
     with pytest.raises(jv.InputError, match="devices is 0"):
         jv.prepare_cpu(0)
+
+
+def test_newer_jax_gets_no_flags_automatically():
+    code = """
+import os
+os.environ.pop("XLA_FLAGS", None)
+os.environ.pop("JAXVIB_AUTOMATIC", None)
+from jaxvib.runtime import compat
+compat._jaxlib = lambda: (0, 12)
+import jaxvib as jv
+jv.balls
+assert "XLA_FLAGS" not in os.environ
+assert "loop_byte_threshold" not in jv.prepare_cpu()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

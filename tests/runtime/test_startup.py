@@ -6,6 +6,10 @@ import sys
 
 import pytest
 
+from jaxvib.runtime.compat import loops_need_a_flag
+
+pytestmark = pytest.mark.skipif(not loops_need_a_flag(), reason="this jaxlib needs no flags")
+
 QUESTION = """
 import os, warnings
 warnings.simplefilter("always")
