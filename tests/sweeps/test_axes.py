@@ -7,7 +7,7 @@ import pytest
 from scenes import scene
 
 import jaxvib as jv
-from jaxvib.sweeps.axes import Grid, axis_of, put, put_start, samples, tile_of
+from jaxvib.sweeps.axes import Axis, Grid, Spot, axis_of, put, put_start, samples, tile_of
 from jaxvib.sweeps.study import study
 from optimize import jam_frequency
 
@@ -128,3 +128,10 @@ RUN = ["run.mode"]
 def test_what_is_not_allowed_is_said(more, says):
     with pytest.raises(jv.InputError, match=says):
         asked(**more)
+
+
+def test_sampled_ranges_are_divided_by_ratio_on_request():
+    share = np.array([0.0, 0.25, 0.5])
+    for log, values in ((False, [1.0, 2500.75, 5000.5]), (True, [1.0, 10.0, 100.0])):
+        axis = Axis("drive.speed", "rad/s", None, 1.0, 1e4, log, Spot(None, "", None))
+        np.testing.assert_allclose(axis.at(share), values, rtol=1e-14)
