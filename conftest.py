@@ -91,15 +91,15 @@ def _stored():
 
 @pytest.fixture(autouse=True)
 def _stored_again():
-    """What a test chooses ends with it."""
+    """Restore the folder of programs that a test changes."""
     folder = program_folder()
     yield
     keep_programs(folder)
 
 
 class _Patch(pytest.MonkeyPatch):
-    """From where a test changes a part of the package it stores no program and finds none: their keys do not know of such
-    changes. Another folder, another environment are none."""
+    """Patches of a test; from its first patch of the package on the test stores no program and finds none: their keys do not
+    know of such changes. Another folder, another environment are none."""
 
     def setattr(self, *change, **how):
         self._unknown()

@@ -16,7 +16,7 @@ TRACED = []
 
 
 class Own:
-    """Of no known package."""
+    """Class of no known package."""
 
     factor = 3.0
 
@@ -58,7 +58,7 @@ X = jnp.asarray([1.0, -2.0])
 
 @pytest.mark.parametrize("kind", kinds(X))
 def test_programs_are_found_again(kind, folder):
-    """By a function that is made anew, of which nothing is held in memory."""
+    """The function is made anew, and nothing of it is held in memory."""
     for _ in range(2):
         function, x = kinds(X)[kind]
         np.testing.assert_allclose(stored_jit(function)(x), 2.0 * X, rtol=1e-15)

@@ -14,7 +14,7 @@ from optimize.search.problem import Point, Problem, evaluate
 __all__ = ["FEASIBLE", "Polished", "Starts", "draw_starts", "optimality", "polish", "restored", "violation"]
 
 FEASIBLE = 1e-8
-"""How well what is held, and demands, must be kept in the end, relative to their values."""
+"""Largest violation of held quantities and demands in the end, relative to their values."""
 
 _AT_REST = 1e-10
 """A fall below this that no step brings is not to be had: derivatives of an exact motion have that rounding."""
@@ -26,15 +26,15 @@ _EVEN = 4
 """Steps back onto a kink, each to first order."""
 
 _ACTIVE = 1e-6
-"""How near to its limit a demand, relative to it, or to its bound a free number counts as being at it."""
+"""Largest distance from its limit, relative to it, at which a demand or a free number counts as being at it."""
 
 _DEAREST = 1e9
 """The most that breaking a constraint may cost before it counts as contradictory, in parts of the objective."""
 
 
 class Optimality(NamedTuple):
-    """What is known of designs: `multipliers` of what is held (s, me) and of demands (s, mi), in units of the objective per
-    unit of the relative excess; of bounds (s, d), positive at the upper one; the `kkt` residual (s,), relative."""
+    """Optimality of designs: `multipliers` of what is held (s, me) and of demands (s, mi), in units of the objective per unit
+    of the relative excess; of bounds (s, d), positive at the upper one; the `kkt` residual (s,), relative."""
 
     held: np.ndarray
     demands: np.ndarray
@@ -43,8 +43,8 @@ class Optimality(NamedTuple):
 
 
 class Polished(NamedTuple):
-    """Where searches ended: the `point`; the objective on the way, `history` (steps, starts); `left`, by how much it could
-    still fall in relation to its value, as slopes and curvatures tell; the greatest `violation`; and its `Optimality`."""
+    """Ends of searches: the `point`; the objective on the way, `history` (steps, starts); `left`, by how much it could still
+    fall in relation to its value, as slopes and curvatures tell; the greatest `violation`; and its `Optimality`."""
 
     point: Point
     history: np.ndarray
@@ -225,7 +225,8 @@ def _first_guess(problem: Problem, point: Point) -> np.ndarray:
 
 
 def _tried(problem: Problem, point: Point, model: Step, size: np.ndarray, price: np.ndarray) -> Point:
-    """Where the step leads, moved back onto what is held, demands and kinks that the model has it at; the best of these."""
+    """Point to which the step leads, moved back onto the held quantities, demands and kinks that the model has it at; the best
+    of these."""
     z = np.clip(point.z + model.p, 0.0, 1.0)
     new = evaluate(problem, z, point.ahead(z))
     active = model.demands > 1e-6

@@ -8,7 +8,7 @@ import numpy as np
 
 __all__ = ["Solved", "elastic"]
 
-_STEPS = 60
+_MAX_NEWTON_STEPS = 60
 
 _STILL, _NEAR = 8, 1e-6
 """A point this near to optimal that has not come to half as much in so many steps comes no nearer: that is rounding."""
@@ -96,7 +96,7 @@ def elastic(
     ridge = 1e-13 * np.eye(n)
 
     best, least, mark, improved = (x, dual), np.full(s, np.inf), np.full(s, np.inf), np.zeros(s, int)
-    for k in range(_STEPS):
+    for k in range(_MAX_NEWTON_STEPS):
         stationary = _times(quadratic, x) + linear + _times(turned, dual)
         primal = _times(rows, x) + slack - right
         gap = np.einsum("sm,sm->s", slack, dual) / m

@@ -84,7 +84,7 @@ def _array(value):
 
 
 def _place(function):
-    """Where a function's text is, and the text where it is not that of a package whose sources or version are known."""
+    """Place of a function's text, and the text itself if it is not that of a package whose sources or version are known."""
     code = function.__code__
     file = pathlib.Path(code.co_filename)
     place = [file.name, code.co_qualname, hashlib.sha256(repr([*code.co_positions()]).encode()).hexdigest()]

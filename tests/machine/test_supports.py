@@ -29,7 +29,7 @@ def test_a_ring_never_pulls():
     np.testing.assert_allclose(support.force(place, away), 0.0, atol=1e-12)
 
 
-def test_a_typical_cubic_support_is_a_hundredth_stiffer_in_the_mean():
+def test_typical_cubic_support_is_one_percent_stiffer():
     """The first harmonic of its force over a swing at the platform that moves most of those on supports."""
     machine = jv.two_mass(mass=(12.0, 9.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
     loads = jv.balls(count=1, mass=0.5, radius=0.1, drag=1.0)

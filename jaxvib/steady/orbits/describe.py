@@ -286,8 +286,8 @@ def orbits(
 def numbers_of(
     model: CollectedModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
-    """Those fields of one orbit that follow from its motion, which is known: as `orbits` with the same arguments gave it, and
-    with the same derivatives; 0 where it gave none."""
+    """Fields of one orbit that follow from its known motion: as `orbits` with the same arguments gave it, and with the same
+    derivatives; 0 where it gave none."""
     grid, there = grid_of(points, model.half_turn), ~jnp.isnan(orbit.omega)
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
@@ -352,17 +352,21 @@ def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, har
     return jnp.min(-jnp.cumsum(needed)[:-1])
 
 
-_PARTS = 16
-"""Of a period, whose peaks are told apart: more than the harmonics that matter have peaks."""
+_PEAK_SEARCH_PARTS = 16
+"""Number of parts of a period in which peaks are searched for separately: more than the harmonics that matter have peaks."""
 
 
 def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array:
     """The greatest value, (16,), of the signal with these harmonics (K,) in each part of the period, its ends included; of one
     that turns its sign in `half` a period the greatest magnitude in each part of that half."""
-    each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PARTS
+    each, width = max(16, int(orders[-1]) // 4), 2.0 * np.pi / _PEAK_SEARCH_PARTS
     if half:
         each, width = each // 2, width / 2.0
-    starts, places, k = width * np.arange(_PARTS), np.arange(each + 1) / each, np.asarray(orders, harmonics.real.dtype)
+    starts, places, k = (
+        width * np.arange(_PEAK_SEARCH_PARTS),
+        np.arange(each + 1) / each,
+        np.asarray(orders, harmonics.real.dtype),
+    )
     angles = k * (starts[:, None] + width * places)[..., None]
     # Real parts and beside them imaginary ones: products of complex numbers take four times as long.
     waves = jnp.asarray(np.concatenate([np.cos(angles), -np.sin(angles)], -1), k.dtype)
@@ -370,8 +374,8 @@ def _peaks(orders: np.ndarray, harmonics: Array, *, half: bool = False) -> Array
     slope, still = np.block([[none, -np.diag(k)], [np.diag(k), none]]), jax.lax.stop_gradient(both)
     derivatives, values = np.stack([slope, slope @ slope, slope @ slope @ slope]) @ still, waves @ still
     best = jnp.argmax(jnp.abs(values) if half else values, axis=1)
-    begin = waves[np.arange(_PARTS), best]
-    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PARTS, k.dtype)
+    begin = waves[np.arange(_PEAK_SEARCH_PARTS), best]
+    side = jnp.where(begin @ still < 0.0, -1.0, 1.0) if half else np.ones(_PEAK_SEARCH_PARTS, k.dtype)
 
     def halley(_: int, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         theta, wave = carry

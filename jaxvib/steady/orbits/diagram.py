@@ -38,15 +38,15 @@ __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 _LANES = 32
 """Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
 
-_POINTS = (16, 32, 64)
+_COLLOCATION_POINTS = (16, 32, 64)
 
 
 _JUDGED = "by the multipliers of the full equations"
 
 
 class SpecialPoint(NamedTuple):
-    """Where the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker), "period_doubling"
-    or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
+    """Point at which the stability of exact jams changes: `kind` "fold" (dn/dOmega = 0), "torus" (Neimark-Sacker),
+    "period_doubling" or "symmetry" (a symmetry of the motion is lost at a multiplier +1); `omega`, `rotor_speed` in rad/s."""
 
     kind: str
     omega: float
@@ -168,7 +168,7 @@ class _Solver:
     def __call__(self, omega: np.ndarray) -> _Values:
         """The jams at these load speeds; those of a batch are integrated in as many steps as its slowest asks for."""
         half = has_half_turn(self.scene.effects)
-        first, *more = _POINTS if half else [2 * p + 1 for p in _POINTS]
+        first, *more = _COLLOCATION_POINTS if half else [2 * p + 1 for p in _COLLOCATION_POINTS]
         found = self._batches(omega, first)
         for many in more:
             todo = np.flatnonzero(~(found.error <= self.accuracy))

@@ -27,7 +27,7 @@ from jaxvib.units import Number
 
 __all__ = ["jam_orbit"]
 
-_FAR = 0.02
+_MAX_SPEED_DIFFERENCE = 0.02
 """Relative distance of an exact load speed from the leading-order one beyond which it may belong to another mode."""
 
 _UNKNOWN_STEPS = 64
@@ -90,7 +90,7 @@ def jam_orbit(
     if not plan.is_known:
         return outcome(_solve(plan, plan.points[0], _UNKNOWN_STEPS), plan.scene)
     orbit = _solve_accurately(plan)
-    if plan.mode is not None and not abs(float(orbit.omega) / float(plan.start) - 1.0) < _FAR:
+    if plan.mode is not None and not abs(float(orbit.omega) / float(plan.start) - 1.0) < _MAX_SPEED_DIFFERENCE:
         # The leading order lacks the mode, or is far from it: search the whole exact branch.
         orbit = _solve_accurately(_from_search(plan, plan.mode))
     return outcome(orbit, throw=throw, failures=("absent", "not_converged"))

@@ -30,7 +30,7 @@ from jaxvib.units.known import is_known
 
 __all__ = ["OrbitPlan", "plan_orbit"]
 
-_POINTS = (16, 32, 64, 128)
+_COLLOCATION_POINTS = (16, 32, 64, 128)
 """Collocation points on half a period, tried in turn until the accuracy is reached."""
 
 _BYTES_PER_POINT = 16.0
@@ -124,7 +124,7 @@ def _points(scene: Scene, loads: CircularLoads, points: int | None, *, all_known
         bodies = 1 if loads.alike else loads.count
         size = _BYTES_PER_POINT * bodies**2 * float(points if isinstance(points, int) else 1)
         return (count(points, "points", low=2, each=size),)
-    tried = _POINTS if has_half_turn(scene.effects) else tuple(2 * p + 1 for p in _POINTS)
+    tried = _COLLOCATION_POINTS if has_half_turn(scene.effects) else tuple(2 * p + 1 for p in _COLLOCATION_POINTS)
     return tried if all_known else tried[:1]
 
 

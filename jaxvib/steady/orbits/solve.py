@@ -18,7 +18,7 @@ __all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branc
 
 Parameter = Literal["omega", "rotor_speed"]
 
-_STEPS = 60
+_MAX_NEWTON_STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
 
@@ -207,7 +207,7 @@ def _newton(
     one, change = jnp.ones_like(start), jnp.zeros(deviation.size + 1, deviation.dtype)
     # The first step goes nowhere: it looks at where Newton starts, which is better than nothing.
     begin = _State(jnp.asarray(-1), deviation, start, jnp.inf * one, one, change, one, no, no)
-    end = jax.lax.while_loop(lambda now: (now.steps < _STEPS) & ~now.settled, step, begin)
+    end = jax.lax.while_loop(lambda now: (now.steps < _MAX_NEWTON_STEPS) & ~now.settled, step, begin)
     return moved(end._replace(change=jnp.where(end.settled & ~end.lost, end.change, 0.0)))
 
 
@@ -260,7 +260,7 @@ class BranchTangent(NamedTuple):
 
 
 def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
-    """How the branch goes on from a periodic motion, and how good the motion is.
+    """Continuation of the branch from a periodic motion, and the error of the motion.
 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
     harmonic of psi for the deviation.

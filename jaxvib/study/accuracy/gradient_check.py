@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 __all__ = ["GradientCheck", "GradientStatus", "ImplicitRoute", "check_gradients"]
 
 _RATIO = math.sqrt(10.0)
-_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
+_DIFFERENCE_STEPS = tuple(float(h) for h in np.logspace(-2.0, -7.0, 11))
 """Relative steps of the sweep; each is `_RATIO` times the next."""
 
-_SMALL = 1e-3
+_SMALL_DERIVATIVE_SHARE = 1e-3
 """Derivatives are judged relative to themselves, but for those below this share of the largest: relative to that."""
 
 _SAFETY = 3.0
@@ -44,7 +44,7 @@ _LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
 
 
 class GradientStatus(eqx.Enumeration):
-    """What came of a check; the members are the sentences a user reads."""
+    """Outcomes of a check; the members are the sentences a user reads."""
 
     agree = "every derivative agrees with finite differences"
     differ = "derivatives differ from finite differences by more than was asked for and these may be off"
@@ -136,7 +136,7 @@ def check_gradients(
     implicit: ImplicitRoute | None = None,
     tolerance: float = 1e-5,
 ) -> GradientCheck:
-    """Whether the derivatives of a quantity of a scene are right: each route against finite differences, for your own tests.
+    """Check the derivatives of a quantity of a scene: each route against finite differences, for your own tests.
 
     Each number p of the scene is moved by relative steps from 1e-2 to 1e-7, and central differences
 
@@ -201,7 +201,7 @@ def check_gradients(
     gradient = {route: np.asarray(_MODES[route](by)(nothing), float) for route in routes}
     if implicit is not None:
         gradient["implicit"] = np.asarray(_implicit(implicit, put, nothing), float)
-    sweep = np.asarray([[_central(by, len(numbers), i, h) for h in _STEPS] for i in range(len(numbers))])
+    sweep = np.asarray([[_central(by, len(numbers), i, h) for h in _DIFFERENCE_STEPS] for i in range(len(numbers))])
     difference, noise, best = (np.asarray(x) for x in zip(*(_extrapolated(row, float(value)) for row in sweep), strict=True))
     scale, routed = _scale(difference), np.stack(list(gradient.values()))
     away = np.abs(routed - difference)
@@ -217,7 +217,7 @@ def check_gradients(
         noise=noise,
         step=best,
         error=away / scale,
-        steps=np.asarray(_STEPS),
+        steps=np.asarray(_DIFFERENCE_STEPS),
         sweep=sweep,
         tolerance=float(tolerance),
         left_out=left_out,
@@ -234,7 +234,7 @@ def _movable(scene: Scene, free: Sequence[str] | None) -> tuple[list[NamedNumber
         for each in find_number(scene, name, "free").single(scene):
             value = float(each.read(scene)[0])
             scale = value or each.spec.typical or 0.0
-            ends = value + _STEPS[0] * scale * np.asarray([-1.0, 1.0])
+            ends = value + _DIFFERENCE_STEPS[0] * scale * np.asarray([-1.0, 1.0])
             if scale and np.all(each.spec.bounds.allow(ends)):
                 found.append(each)
                 scales.append(scale)
@@ -254,7 +254,7 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
     """The derivative from central differences (k,) at falling steps, what it may be off, and the step it was best at."""
     better = central[1:] + (central[1:] - central[:-1]) / (_RATIO**2 - 1.0)
     apart = np.abs(np.diff(better))
-    rounding = np.finfo(float).eps * abs(value) / np.asarray(_STEPS[2:-1])
+    rounding = np.finfo(float).eps * abs(value) / np.asarray(_DIFFERENCE_STEPS[2:-1])
     noise = np.maximum(np.maximum(apart[:-1], apart[1:]), rounding)
     # Steps so small that the quantity does not feel them agree with each other, and not with the larger ones.
     inner = better[1:-1]
@@ -265,24 +265,24 @@ def _extrapolated(central: np.ndarray, value: float) -> tuple[float, float, floa
     if not np.any(np.isfinite(noise)):
         return math.nan, math.nan, math.nan
     k = int(np.nanargmin(noise))
-    return float(inner[k]), float(noise[k]), _STEPS[k + 1]
+    return float(inner[k]), float(noise[k]), _DIFFERENCE_STEPS[k + 1]
 
 
 def _parts(central: np.ndarray, slopes: np.ndarray, value: float) -> bool:
-    """Whether the quantity changes as much at small steps as at large ones, and derivatives (r,) say that it would.
+    """True if the quantity changes as much at small steps as at large ones, and derivatives (r,) say that it would.
 
     Noise of a quantity changes it at small steps too, and leaves its derivatives alone; a wrong derivative leaves the quantity.
     """
-    changed = 2.0 * np.abs(central) * np.asarray(_STEPS)
+    changed = 2.0 * np.abs(central) * np.asarray(_DIFFERENCE_STEPS)
     most, small = float(np.max(changed)), float(np.median(changed[-5:]))
-    claimed = np.abs(slopes) * 2.0 * _STEPS[-1]
+    claimed = np.abs(slopes) * 2.0 * _DIFFERENCE_STEPS[-1]
     return small > max(_LARGE * most, _TINY * abs(value)) and bool(np.any(claimed > _LARGE * most))
 
 
 def _scale(difference: np.ndarray) -> np.ndarray:
     size = np.abs(difference)
     most = np.max(size[np.isfinite(size)], initial=0.0)
-    return np.maximum(size, _SMALL * most if most > 0.0 else np.finfo(float).tiny)
+    return np.maximum(size, _SMALL_DERIVATIVE_SHARE * most if most > 0.0 else np.finfo(float).tiny)
 
 
 def _judged(away: np.ndarray, noise: np.ndarray, scale: np.ndarray, tolerance: float) -> str:

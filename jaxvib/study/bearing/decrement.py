@@ -27,7 +27,7 @@ __all__ = ["Decrement", "Estimate", "TurningPoints", "ten_periods", "turning_poi
 _LARGE, _LARGE_ERROR = np.pi / 3.0, 1e-3
 """Beyond this amplitude, rad, the averaged formula and the fitted arcs are off by so much, relative."""
 
-_LARGEST = np.pi / 2.0
+_MAX_AMPLITUDE = np.pi / 2.0
 """Beyond this amplitude, rad, the error of the arcs fitted to the turning points is unknown: with 25 samples a second and weak
 friction it moved mu1 by 0.4 to 0.9 percent, up to three times the interval of the noise."""
 
@@ -255,7 +255,7 @@ def ten_periods(
     value, error = float(np.mean(estimates)), float(np.sqrt(np.mean(covariance)))
     apart = covariance[0, 0] + covariance[-1, -1] - 2.0 * covariance[0, -1]
     viscous = interval(value, error, 1.959964, float(np.hypot(instrument, _LARGE_ERROR * (a[0] > _LARGE))))
-    if a[0] > _LARGEST:
+    if a[0] > _MAX_AMPLITUDE:
         viscous = Estimate(value, np.inf, 0.0, np.inf)
     return Decrement(
         viscous=viscous,

@@ -42,7 +42,7 @@ _CONTRADICTS = 0.05
 
 
 class IdentifyStatus(eqx.Enumeration):
-    """What a fit is worth; the members are the sentences a user reads."""
+    """Outcomes of a fit; the members are the sentences a user reads."""
 
     found = "the fit explains the record up to noise"
     patterned = "what the fit leaves of the record is no noise: the law of friction misses something, intervals are false"

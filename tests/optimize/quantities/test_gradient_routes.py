@@ -10,7 +10,7 @@ import pytest
 from stored_jit import stored_jit
 
 import jaxvib as jv
-from jaxvib.study.accuracy.gradient_check import _SAFETY, _STEPS, _extrapolated, _scale
+from jaxvib.study.accuracy.gradient_check import _DIFFERENCE_STEPS, _SAFETY, _extrapolated, _scale
 from optimize import (
     amplitude,
     expected,
@@ -112,8 +112,8 @@ class Routes:
         if not np.all(np.isfinite(value)):
             return None
         found = {name: np.asarray(route(scene, near)) for name, route in self.routes.items()}
-        central = np.empty((len(value), 6, len(_STEPS)))
-        for k, step in enumerate(_STEPS):
+        central = np.empty((len(value), 6, len(_DIFFERENCE_STEPS)))
+        for k, step in enumerate(_DIFFERENCE_STEPS):
             for i in range(6):
                 high, low = (np.asarray(self.value(scene, near, sign * step * np.eye(6)[i])) for sign in (1.0, -1.0))
                 central[:, i, k] = (high - low) / (2.0 * step)
