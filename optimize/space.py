@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.boundary import validated
+from jaxvib.boundary import is_real, validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.numbers.named import NamedNumber, find_number, present_numbers, put_numbers
 from jaxvib.machine.scene import Scene
@@ -172,8 +172,16 @@ class DesignSpace(eqx.Module):
         xp = np if isinstance(like, np.ndarray) else jnp
         return xp, xp.asarray(self.low), xp.asarray(self.high)
 
+    def _require_size(self, values: Any, name: str, *, single: bool = False) -> None:
+        """**Raises** `InputError` unless the values are an array with an entry for each free number."""
+        is_array = isinstance(values, (np.ndarray, Array)) and is_real(values) and not np.ma.is_masked(values)
+        if not is_array or (values.shape if single else values.shape[-1:]) != (self.size,):
+            axis = "" if single else " along its last axis"
+            raise InputError(name, f"is {quoted(values)}; it must be an array with {self.size} numbers{axis}")
+
     def numbers(self, z: Numbers) -> Numbers:
         """The free numbers (..., d), SI, of designs z (..., d) in [0, 1]; NumPy's arrays where z is one."""
+        self._require_size(z, "z")
         xp, low, high = self._bounds(z)
         log = np.asarray(self.logs)
         base = xp.where(log, low, 1.0)
@@ -181,21 +189,25 @@ class DesignSpace(eqx.Module):
 
     def at(self, z: Array) -> Scene:
         """The scene of the design z (d,) in [0, 1]."""
+        self._require_size(z, "z", single=True)
         return self.scene_of(self.numbers(z))
 
     def scene_of(self, values: Array) -> Scene:
         """The scene with these free numbers (d,), SI."""
+        self._require_size(values, "values", single=True)
         scene = put_numbers(self.scene, self.free, jnp.asarray(values))
         for tie in self.ties:
             scene = put_numbers(scene, (tie.target,), jnp.asarray(tie.factor) * tie.source.read(scene))
         return scene
 
+    @validated
     def where(self, scene: Scene) -> Array:
         """The design z (d,) of a scene, moved into the bounds where it lies outside."""
         return self.shares(jnp.concatenate([each.read(scene) for each in self.free]))
 
     def shares(self, numbers: Numbers) -> Numbers:
         """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
+        self._require_size(numbers, "numbers")
         xp, low, high = self._bounds(numbers)
         value, log, width = xp.clip(numbers, low, high), np.asarray(self.logs), high - low
         base = xp.where(log, low, 1.0)
@@ -215,6 +227,8 @@ class DesignSpace(eqx.Module):
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
         """The same space between other bounds (d,), SI; equal ones fix a number."""
+        for bounds, name in ((low, "low"), (high, "high")):
+            self._require_size(bounds, name, single=True)
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
 
     def residuals(self, evaluation: Evaluation) -> Array:

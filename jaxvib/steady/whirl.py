@@ -115,6 +115,8 @@ class Whirl(Result):
         """
         from jaxvib.draw.whirl import campbell_diagram  # slow to import: only who draws pays
 
+        if at is not None and not np.isfinite(at):
+            raise InputError("at", f"is {at:g} rad/s; it must be finite")
         critical = (np.asarray(self.critical.speed), np.asarray(self.critical.forward))
         whirls = map(np.asarray, (self.rotor_speed, self.speed, self.forward))
         return campbell_diagram(*whirls, critical=critical, at=at, unit=unit, ax=ax)

@@ -79,6 +79,7 @@ class Quantity:
             problem = "give a function of a scene, or of a scene and its jam modes"
             raise InputError(f"quantity {quoted(self.name)}", f"has the function {quoted(self.function)}; {problem}")
 
+    @validated
     def __call__(self, scene: Scene, modes: JamModes | None = None) -> Array:
         """The quantity's value for a scene, a scalar in `unit`; `modes` saves computing its jam modes once more."""
         return self.read(Evaluation(scene, modes=modes))

@@ -139,3 +139,13 @@ def test_springs_that_are_not_there_stay_away():
             DesignSpace(free, bounds, choices=choices)
     one = eqx.tree_at(lambda s: s.loads.drag, SCENE, jnp.asarray(0.0))
     assert DesignSpace(one, {"loads.drag": (0.0, 2.0)}).size == 1  # a number that all loads share is named by itself
+
+
+@pytest.mark.parametrize("wrong", [None, True, 10**400, np.zeros(0), np.zeros((2, 2)), np.ones(2) + 1j, np.ma.masked])
+def test_designs_that_are_no_arrays_of_their_size_are_refused(wrong):
+    space = DesignSpace(SCENE, free={"machine.stiffness[0]": (1e4, 9e4), "machine.stiffness[1]": (1e4, 9e4)})
+    for ask, name in ((space.at, "z"), (space.scene_of, "values"), (lambda z: space.within(z, z), "low")):
+        with pytest.raises(jv.InputError, match=rf"^{name} (is|has) .*(an array|numbers|masked)"):
+            ask(wrong)
+    with pytest.raises(jv.InputError, match=r"^scene is 3; it must be a Scene"):
+        jam_frequency(mode=3)(3)
