@@ -98,7 +98,7 @@ class Averaged(eqx.Module):
     """The averaged equations of a scene, ready for time integration; a pure function of time (s) and `Amplitudes`.
 
     - `stiffness` M^-1 K, `damping` M^-1 C, `gyroscopic` M^-1 G or None, (nd, nd), M with the loads' masses
-    - `port` (levers, np, nd): B and, where loads have stations, T; `push` M^-1 of their transposes, (levers, np, nd)
+    - `port` (levers, np, nd): B and, where loads have stations, T; `input_matrix` M^-1 of their transposes, (levers, np, nd)
     - `levers` g (levers, count): 1 and, where loads have stations, s_j m
     - `unbalance` S_j kg m, `inertia` I_j kg m^2, `drag` D_j N m s, all (count,)
     """
@@ -106,7 +106,7 @@ class Averaged(eqx.Module):
     stiffness: Array
     damping: Array
     gyroscopic: Array | None
-    push: Array
+    input_matrix: Array
     port: Array
     levers: Array
     unbalance: Array
@@ -125,17 +125,17 @@ class Averaged(eqx.Module):
             unforced = unforced - n * times(self.gyroscopic, state.velocity)
 
         circle, levers = self._circle(), self.levers
-        push = jnp.sum(self.push * circle, axis=1)
-        listen = jnp.sum(self.port * jnp.conj(circle), axis=1)
-        mobility = jnp.sum(listen[:, None, :] * push[None, :, :], axis=-1)
+        push = jnp.sum(self.input_matrix * circle, axis=1)
+        output_row = jnp.sum(self.port * jnp.conj(circle), axis=1)
+        accelerance = jnp.sum(output_row[:, None, :] * push[None, :, :], axis=-1)
 
         def pushes(rate: Array) -> Array:
             return jnp.sum(levers * (self.unbalance * at * (state.rate**2 - 1j * rate))[None, :], axis=-1)
 
         share = levers[:, None, :] * levers[None, :, :] * (self.unbalance**2 / (4.0 * self.inertia))[None, None, :]
-        alone = jnp.eye(levers.shape[0]) - _product(mobility, jnp.sum(share, axis=-1))
-        mirrored = _product(mobility, jnp.sum(share * (at**2)[None, None, :], axis=-1))
-        felt = _with_conjugate(alone, mirrored, times(listen, unforced) + times(mobility, pushes(free)))
+        alone = jnp.eye(levers.shape[0]) - _product(accelerance, jnp.sum(share, axis=-1))
+        mirrored = _product(accelerance, jnp.sum(share * (at**2)[None, None, :], axis=-1))
+        felt = _with_conjugate(alone, mirrored, times(output_row, unforced) + times(accelerance, pushes(free)))
         felt = jnp.sum(levers * felt[:, None], axis=0)
         rate = free + mean_torque(self.unbalance, jnp.conj(at) * felt) / self.inertia
         acceleration = unforced + jnp.sum(push * pushes(rate)[:, None], axis=0)
@@ -205,7 +205,7 @@ def averaged_model(model: LinearModel) -> Averaged:
         stiffness=solved[:, :n],
         damping=solved[:, n : 2 * n],
         gyroscopic=None if mount.gyroscopic is None else solved[:, 2 * n + p :],
-        push=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
+        input_matrix=solved[:, 2 * n : 2 * n + p].T.reshape(port.shape),
         port=port,
         levers=levers,
         unbalance=each(loads.mass * loads.radius),

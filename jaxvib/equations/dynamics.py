@@ -11,6 +11,7 @@ from jax import Array
 
 from jaxvib.boundary import validated
 from jaxvib.equations.exciter import Eliminated, Exciter, depends_on_acceleration, signed, without_coupling
+from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import ContactSolution
 from jaxvib.equations.state import State
 from jaxvib.machine.effects.base import has_term, terms_of
@@ -18,7 +19,7 @@ from jaxvib.machine.effects.terms import RotorImbalance, SupportForce
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.linalg import small_inverse, small_solve, times
 
-__all__ = ["Dynamics", "vector_field"]
+__all__ = ["Dynamics", "dynamics_of", "vector_field"]
 
 
 class _Support(eqx.Module):
@@ -136,11 +137,15 @@ def vector_field(scene: Scene) -> Dynamics:
     equation (1). A gyroscopic matrix acts with the rotor's speed alone: what its change would add, C theta'' psi / 2, is left
     out as in the paper.
     """
-    carrier, mount, effects = scene.machine.carrier(), scene.machine.mount(), scene.effects
+    return dynamics_of(assemble(scene))
+
+
+def dynamics_of(model: Model) -> Dynamics:
+    """Return `vector_field` of a scene that is assembled already."""
+    scene, carrier, mount, effects = model.scene, model.carrier, model.mount, model.scene.effects
     moving = mount.rows if has_term(effects, RotorImbalance) else mount.rows[: len(mount.levers)]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
-    places = [term.rows(scene.machine) for term in terms_of(effects, SupportForce)]
-    parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in places)]
+    parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
     if mount.gyroscopic is not None:
         parts.append(mount.gyroscopic)
     solved = small_solve(carrier.mass, jnp.concatenate(parts, axis=1))
@@ -162,5 +167,5 @@ def vector_field(scene: Scene) -> Dynamics:
         accelerance=rows @ input_matrix,
         rows=rows,
         exciters=(exciter,),
-        supports=tuple(map(_Support, places, rest)),
+        supports=tuple(map(_Support, model.supports, rest)),
     )

@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.exciter import Exciter
+from jaxvib.equations.model import Model, assemble
 from jaxvib.equations.sliding import contact_force, dot, kinematics
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
@@ -44,12 +45,7 @@ def foundation_force(scene: Scene, state: State) -> Array:
 
     Source: the antiphase paper, equation (7).
     """
-    carrier = scene.machine.carrier()
-    force = carrier.bed_force(state.displacement, state.velocity)
-    for term in terms_of(scene.effects, SupportForce):
-        rows = term.rows(scene.machine)
-        force = force + term.force(rows @ state.displacement, rows @ state.velocity)
-    return force
+    return assemble(scene).foundation_force(state.displacement, state.velocity)
 
 
 @validated
@@ -75,19 +71,20 @@ def _at_time(t: Array | float, state: State) -> Any:
 
 @cached
 def _energy(scene: Scene, state: State, t: Array) -> Array:
-    carrier, mount, loads = scene.machine.carrier(), scene.machine.mount(), scene.loads
+    model, loads = assemble(scene), scene.loads
     q, v = state.displacement, state.velocity
     p_rate = jax.jvp(loads.position, state.angle, state.rate)[1]
-    at_load = mount.load_rates(v)
+    at_load = model.mount.load_rates(v)
     total = [rate + at_load.get(axis, 0.0) for axis, rate in enumerate(p_rate)]
     own = loads.inertia_factor() - 1.0
     parts = [
-        0.5 * (v @ carrier.mass @ v + q @ carrier.stiffness @ q),
+        0.5 * (v @ model.carrier.mass @ v + q @ model.carrier.stiffness @ q),
         jnp.sum(0.5 * loads.mass * (sum(w**2 for w in total) + own * sum(w**2 for w in p_rate))),
     ]
     for term in terms_of(scene.effects, LoadPotential, LoadInteraction):
         parts.append(jnp.sum(jnp.broadcast_to(term.energy(loads, state.angle), (loads.count,))))
-    parts += [term.energy(term.rows(scene.machine) @ q) for term in terms_of(scene.effects, SupportForce)]
+    supports = zip(terms_of(scene.effects, SupportForce), model.supports, strict=True)
+    parts += [term.energy(rows @ q) for term, rows in supports]
     t = jnp.asarray(t, q.dtype)
     turn, rate = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
     if state.spin is not None and state.spin.slip is not None:
@@ -98,7 +95,7 @@ def _energy(scene: Scene, state: State, t: Array) -> Array:
         drilling = loads.drilling_spin(state.angle, state.rate, rate)
         assert drilling is not None
         parts.append(jnp.sum(0.5 * drilling.inertia * state.spin.drilling**2))
-    parts.append(rate * _throw_rate(scene, turn) @ v)
+    parts.append(rate * _imbalance_rate(model, turn) @ v)
     motor = scene.drive.torque_and_inertia(rate)
     if motor is not None:
         parts.append(0.5 * motor[1] * rate**2)
@@ -118,15 +115,15 @@ def power(scene: Scene, t: Array | float, state: State) -> tuple[Array, Array]:
 
 @cached
 def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
-    carrier, mount, loads = scene.machine.carrier(), scene.machine.mount(), scene.loads
+    model, loads = assemble(scene), scene.loads
     turn, speed = scene.drive.rotor_angle(t, state.rotor), scene.drive.rotor_speed(t, state.rotor)
-    field = vector_field(scene)
+    field = dynamics_of(model)
     change = field(t, state)
     acceleration = change.velocity
-    at_load = mount.load_rates(acceleration)
+    at_load = model.mount.load_rates(acceleration)
     taken = loads.resistance(state.angle, state.rate, speed)
     g = total_gravity(scene.effects)
-    lost = [state.velocity @ carrier.damping @ state.velocity]
+    lost = [state.velocity @ model.carrier.damping @ state.velocity]
     sliding, spun = _spin_power(field.exciters[0], state, change, at_load, speed)
     for term in terms_of(scene.effects, ContactFriction):
         rubbing = term.friction(loads, state.angle, state.rate, speed, g).forces(at_load)
@@ -136,15 +133,14 @@ def _power(scene: Scene, t: Array, state: State) -> tuple[Array, Array]:
         if term.resistance is not None:
             resistance = term.resistance(loads, state.angle, state.rate)
             lost += [-jnp.sum(f * w) for f, w in zip(resistance, state.rate, strict=True)]
-    for term in terms_of(scene.effects, SupportForce):
-        rows = term.rows(scene.machine)
+    for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
         x, v = rows @ state.displacement, rows @ state.velocity
         if term.resistance is not None:
             lost.append(term.resistance(x, v) @ v)
     braking = jnp.sum(taken[0])
     lost += [speed * braking, *(-jnp.sum(f * w) for f, w in zip(taken, state.rate, strict=True))]
     motor = scene.drive.torque_and_inertia(speed)
-    torque = braking + _throw_rate(scene, turn) @ acceleration if motor is None else motor[0]
+    torque = braking + _imbalance_rate(model, turn) @ acceleration if motor is None else motor[0]
     return speed * torque + spun[0], sum(lost[1:], lost[0]) + spun[1]
 
 
@@ -202,16 +198,17 @@ def _normal_force(scene: Scene, t: Array, state: State) -> Array:
     if normal_force is None:
         problem = f"is {scene.loads.kind!r}; nothing says how they press on their track (Loads.normal_force)"
         raise InputError("loads.kind", problem)
-    acceleration = vector_field(scene)(jnp.asarray(t, state.displacement.dtype), state).velocity
-    return normal_force.at(scene.machine.mount().load_rates(acceleration))
+    model = assemble(scene)
+    acceleration = dynamics_of(model)(jnp.asarray(t, state.displacement.dtype), state).velocity
+    return normal_force.at(model.mount.load_rates(acceleration))
 
 
-def _throw_rate(scene: Scene, turn: Array) -> Array:
+def _imbalance_rate(model: Model, turn: Array) -> Array:
     """d'(theta).P (nd,) of the rotor's imbalance: the carrier's share of its momentum per speed of the rotor."""
-    mount = scene.machine.mount()
+    mount = model.mount
     static, moment = mount.rotor_rows(), mount.tilt
     row = jnp.zeros_like(static[0])
-    for term in terms_of(scene.effects, RotorImbalance):
+    for term in terms_of(model.scene.effects, RotorImbalance):
         rate = jax.jvp(term.at, (turn,), (jnp.ones_like(turn),))[1]
         row = row + jnp.stack([rate.static[axis] for axis in mount.axes]) @ static
         if moment is not None:

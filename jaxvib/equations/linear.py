@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
+from jaxvib.equations.model import Model, assemble
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.carrier import Carrier
 from jaxvib.machine.effects.base import Effect
 from jaxvib.machine.effects.terms import (
     ContactFriction,
@@ -35,7 +35,6 @@ from jaxvib.units.known import when_known
 __all__ = [
     "JAM_TERMS",
     "TURNING_TERMS",
-    "AbstractLinearModel",
     "FrequencyStatus",
     "JammedModel",
     "LinearModel",
@@ -70,18 +69,15 @@ class FrequencyStatus(eqx.Enumeration):
     lost_digits = "rounding hides a natural frequency: use double precision, or stiffnesses and masses that differ less"
 
 
-class AbstractLinearModel(eqx.Module):
-    """A scene, its carrier, its exciter's mount, and the mass with the loads: assembled once a question, and handed on.
+class LinearModel(Model):
+    """A model with the loads on it as masses that move with the machine.
 
         D(w) = K - w^2 M + i w (C + n G),      M = M_carrier + sum_j m_j B_j^T B_j
 
-    **Attributes**: `scene`; `carrier`, see `Carrier`; `mount`, see `Mount`; `mass` M (nd, nd) kg, each load's at its own place.
+    **Attributes**, besides those of `Model`: `mass` M (nd, nd) kg, each load's at its own place.
     """
 
-    scene: eqx.AbstractVar[Scene]
-    carrier: eqx.AbstractVar[Carrier]
-    mount: eqx.AbstractVar[Mount]
-    mass: eqx.AbstractVar[Array]
+    mass: Array
 
     @property
     def direction(self) -> Array:
@@ -115,41 +111,29 @@ class AbstractLinearModel(eqx.Module):
         return root_or_zero(values), inverse.T @ vectors
 
 
-class LinearModel(AbstractLinearModel):
-    """A linear model whose loads may move in any way, see `AbstractLinearModel`."""
-
-    scene: Scene
-    carrier: Carrier
-    mount: Mount
-    mass: Array
-
-
 def linear_model(scene: Scene) -> LinearModel:
-    """The scene's carrier with the loads on it, see `LinearModel`."""
-    carrier, mount = scene.machine.carrier(), scene.machine.mount()
+    """Return the model of a scene with the loads on it, see `LinearModel`."""
+    model = assemble(scene)
+    carrier, mount = model.carrier, model.mount
     each = jnp.broadcast_to(scene.loads.mass, (scene.loads.count,))
     if mount.at_one_point:
         mass = carrier.mass + jnp.sum(each) * mount.rows[0].T @ mount.rows[0]
     else:
         rows = mount.load_rows(scene.loads.count)
         mass = carrier.mass + jnp.einsum("j,jka,jkb->ab", each, rows, rows)
-    return LinearModel(scene, carrier, mount, mass)
+    return LinearModel(scene, carrier, mount, model.supports, mass)
 
 
-class JammedModel(AbstractLinearModel):
+class JammedModel(LinearModel):
     """A linear model whose loads are jammed: checked, and what is the same at all load speeds computed, once a question.
 
-    **Attributes**, besides those of `AbstractLinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2,
-    N m s; `push` (nd,) complex, the `direction` of their force.
+    **Attributes**, besides those of `LinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2,
+    N m s; `force_direction` (nd,) complex, the `direction` of their force.
     """
 
-    scene: Scene
-    carrier: Carrier
-    mount: Mount
-    mass: Array
     unbalance: Array
     drag: Array
-    push: Array
+    force_direction: Array
 
     @property
     def loads(self) -> CircularLoads:
@@ -161,13 +145,14 @@ class JammedModel(AbstractLinearModel):
         if self.mount.gyroscopic is not None and speed is None:
             problem = "jam modes are those of platforms; ask phase_jams, or jam_orbit near a load speed"
             raise InputError("machine.kind", f"is {quoted(self.scene.machine.kind)}; {problem}")
-        return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.push)
+        return small_solve(self.dynamic_stiffness(omega, speed), self.unbalance * omega**2 * self.force_direction)
 
 
 def jammed_model(scene: Scene) -> JammedModel:
     """The scene's carrier with jammed loads on it, see `JammedModel`. **Raises** `InputError` as `jammed_loads`."""
     loads, model = jammed_loads(scene), linear_model(scene)
-    return JammedModel(scene, model.carrier, model.mount, model.mass, loads.unbalance(), loads.drag_sum(), model.direction)
+    linear = model.scene, model.carrier, model.mount, model.supports, model.mass
+    return JammedModel(*linear, loads.unbalance(), loads.drag_sum(), model.direction)
 
 
 @validated

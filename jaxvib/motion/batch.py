@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.dynamics import dynamics_of
+from jaxvib.equations.model import assemble
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.analysis.measure import Measured, Trajectory, measure, trajectory
@@ -126,7 +127,8 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     """
     dtype = state.displacement.dtype
     single, together = wrap_angles(scene, dtype)
-    field = vector_field(scene)
+    model = assemble(scene)
+    field = dynamics_of(model)
     motion = pack_batch(field, state, single, together, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
@@ -149,7 +151,7 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     azimuth = motion.unpack(before).azimuth
     states = motion.unpack(jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), held, later))
     times = begin + spacing * jnp.arange(plan.samples, dtype=dtype)
-    window = trajectory(scene, times, states)
+    window = trajectory(model, times, states)
     speed = (azimuth[1:] - azimuth[:-1]) / length
-    found = measure(scene, field, times, states, natural_units(scene)), regime(scene, window)
+    found = measure(model, field, times, states, natural_units(scene)), regime(scene, window)
     return BatchRun(scene, window, *found, speed, jnp.asarray(length, dtype), is_finite(states))

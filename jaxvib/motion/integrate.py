@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.dynamics import vector_field
+from jaxvib.equations.dynamics import dynamics_of
 from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.model import assemble
 from jaxvib.equations.state import Spin, State
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_term
@@ -150,7 +151,8 @@ def integrate(
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
     saves = _saves(scene, end, slowest, plan)
     single, together = wrap_angles(scene, state.displacement.dtype)
-    field = vector_field(scene)
+    model = assemble(scene)
+    field = dynamics_of(model)
     motion = PackedSystem(field, state, wrapped=single and plan.solver is None, together=together, solver=plan.solver)
     solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
     first_step, controller = _steps(motion, state, unit, plan.control, end, fastest)
@@ -169,12 +171,12 @@ def integrate(
     )
     assert solution.ts is not None and solution.ys is not None
     times, states = solution.ts[0], motion.unpack(solution.ys[0])
-    window = trajectory(scene, times, states)
-    whole = trajectory(scene, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
+    window = trajectory(model, times, states)
+    whole = trajectory(model, solution.ts[2], motion.unpack(solution.ys[2])) if plan.samples else None
     if is_measured is None:
-        numbers = measure(scene, field, times, states, unit)
+        numbers = measure(model, field, times, states, unit)
     else:  # the window of a run with larger steps is compared only
-        numbers = jax.lax.cond(is_measured, lambda: measure(scene, field, times, states, unit), lambda: unmeasured(states))
+        numbers = jax.lax.cond(is_measured, lambda: measure(model, field, times, states, unit), lambda: unmeasured(states))
     numbers, window, whole = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), (numbers, window, whole))
     last = jax.tree.map(lambda leaf: leaf[-1], motion.unpack(solution.ys[1]))
     # A run that did not end has no window; the state where it stopped says whether it was on its way to infinity.

@@ -54,8 +54,8 @@ def fastest_decay(scene: Scene) -> Array:
         return jnp.max(-slope / (kappa * loads.mass * metric[i][i]))
 
     damping, inverse = relative_to(linear.mass, linear.carrier.damping)
-    mobility = jnp.sum((linear.mount.rows[0] @ inverse.T) ** 2)
-    share = mobility * jnp.sum(jnp.broadcast_to(loads.mass / kappa, (loads.count,)))
+    accelerance = jnp.sum((linear.mount.rows[0] @ inverse.T) ** 2)
+    share = accelerance * jnp.sum(jnp.broadcast_to(loads.mass / kappa, (loads.count,)))
     rate = functools.reduce(jnp.maximum, (own(i) for i in range(len(angle)))) / jnp.maximum(1.0 - share, 0.1)
     return jnp.maximum(rate, jnp.max(hermitian_modes(damping)[0]))
 

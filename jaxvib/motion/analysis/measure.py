@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.equations.forces import foundation_force
+from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.extrema import NODES, extremum_value, locate_extrema
@@ -25,7 +25,6 @@ __all__ = [
     "Trajectory",
     "mean_speeds",
     "measure",
-    "natural_force",
     "unmeasured",
 ]
 
@@ -97,28 +96,28 @@ class Measured(AbstractMeasured):
     """Result of `measure`, see `AbstractMeasured`."""
 
 
-def trajectory(scene: Scene, times: Array, states: State) -> Trajectory:
+def trajectory(model: Model, times: Array, states: State) -> Trajectory:
     """States at times, with the forces and rotor speeds that belong to them."""
-    force = jax.vmap(lambda s: foundation_force(scene, s))(states)
-    angle = jax.vmap(lambda t, s: scene.drive.rotor_angle(t, s.rotor))(times, states)
-    speed = jax.vmap(lambda t, s: scene.drive.rotor_speed(t, s.rotor))(times, states)
+    force = jax.vmap(model.foundation_force)(states.displacement, states.velocity)
+    angle = jax.vmap(lambda t, s: model.scene.drive.rotor_angle(t, s.rotor))(times, states)
+    speed = jax.vmap(lambda t, s: model.scene.drive.rotor_speed(t, s.rotor))(times, states)
     return Trajectory(times, states, force, angle, speed)
 
 
-def measure(scene: Scene, field: Field, times: Array, states: State, unit: State) -> Measured:
+def measure(model: Model, field: Field, times: Array, states: State, unit: State) -> Measured:
     """Amplitudes and jam speed of an evenly sampled stretch of motion, see `Measured`.
 
     Extrema and whole turns are found on interpolants that use the rates the equations of motion give, not on the samples.
     `field` gives the rates of a state at a time; it is a pytree of its arrays, such as `Dynamics` or a
     `jax.tree_util.Partial`, and no plain function. `unit`: the scene's `natural_units`.
     """
-    early, late, whole = _spans(scene, field, times, states)
+    early, late, whole = _spans(model, field, times, states)
     nd, half = states.displacement.shape[1], times.shape[0] // 2
 
     speeds, late_speeds = mean_speeds(times, states.azimuth, states.azimuth_rate, (0, half))
     change = jnp.abs(late - early)
     drift = jnp.max(change[:nd]) / jnp.maximum(jnp.max(whole[:nd]), LEAST * unit.displacement)
-    force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), LEAST * natural_force(scene, unit))
+    force_drift = jnp.max(change[nd:]) / jnp.maximum(jnp.max(whole[nd:]), LEAST * model.natural_force(unit))
     omega = jnp.mean(speeds)
     speed_drift = jnp.max(jnp.abs(late_speeds - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
@@ -130,12 +129,6 @@ def measure(scene: Scene, field: Field, times: Array, states: State, unit: State
     )
 
 
-def natural_force(scene: Scene, unit: State) -> Array:
-    """S n^2 N: the loads' unbalance turning with the rotor at its speed n; `unit` the scene's `natural_units`."""
-    (speed,) = unit.rate
-    return jnp.mean(jnp.diagonal(scene.machine.carrier().mass)) * unit.displacement * speed**2
-
-
 def unmeasured(states: State) -> Measured:
     """NaN in place of what `measure` reads off these states."""
     nd, loads = states.displacement.shape[1], states.azimuth.shape[1]
@@ -144,14 +137,14 @@ def unmeasured(states: State) -> Measured:
 
 
 @eqx.filter_custom_jvp
-def _spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
+def _spans(model: Model, field: Field, times: Array, states: State) -> Array:
     """Half of peak to peak of displacements and foundation forces, over the first half of the samples, the second and all of
     them, (3, outputs).
 
     Derivatives, of any order, cost next to nothing: the equations are evaluated once more at the few samples beside the
     extrema, and are differentiated there alone.
     """
-    (low, high), _, _ = _extrema(scene, field, times, states)
+    (low, high), _, _ = _extrema(model, field, times, states)
     return (high - low) / 2.0
 
 
@@ -160,11 +153,11 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     _, samples, places = _extrema(*jax.lax.stop_gradient(primals))
     outputs = jnp.broadcast_to(jnp.arange(samples.shape[-1]), samples.shape)
 
-    def spans(scene: Scene, field: Field, times: Array, states: State) -> Array:
+    def spans(model: Model, field: Field, times: Array, states: State) -> Array:
         def extremum(output: Array, k: Array, place: Array) -> Array:
             def sample(j: Array) -> tuple[Array, Array]:
                 state = jax.tree.map(lambda leaf: leaf[j], states)
-                value, slope = _outputs(scene, _step(times), state, field(times[j], state))
+                value, slope = _outputs(model, _step(times), state, field(times[j], state))
                 return value[output], slope[output]
 
             return extremum_value(*jax.vmap(sample)(k + jnp.arange(NODES)), place)
@@ -175,10 +168,10 @@ def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return eqx.filter_jvp(spans, primals, tangents)
 
 
-def _extrema(scene: Scene, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
+def _extrema(model: Model, field: Field, times: Array, states: State) -> tuple[Array, Array, Array]:
     """Least and greatest values of each output, and their places, see `locate_extrema`; (2, 3, outputs) each."""
     rates = scalarized_vmap(_rates)((times, states), field)
-    values, slopes = jax.vmap(lambda *y: _outputs(scene, _step(times), *y))(states, rates)
+    values, slopes = jax.vmap(lambda *y: _outputs(model, _step(times), *y))(states, rates)
     return jax.vmap(locate_extrema, in_axes=1, out_axes=-1)(values, slopes)
 
 
@@ -186,9 +179,9 @@ def _rates(moment: tuple[Array, State], field: Field) -> State:
     return field(*moment)
 
 
-def _outputs(scene: Scene, step: Array, state: State, rates: State) -> tuple[Array, Array]:
+def _outputs(model: Model, step: Array, state: State, rates: State) -> tuple[Array, Array]:
     """Displacements and foundation forces, and how they change in a sampling step."""
-    force, change = jax.jvp(lambda s: foundation_force(scene, s), (state,), (rates,))
+    force, change = jax.jvp(lambda s: model.foundation_force(s.displacement, s.velocity), (state,), (rates,))
     return jnp.concatenate([state.displacement, force]), jnp.concatenate([rates.displacement, change]) * step
 
 

@@ -16,15 +16,16 @@ from jax import Array
 from jaxtyping import PyTree
 
 from jaxvib.boundary import validated
-from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_field, averaged_growth, averaged_loads
-from jaxvib.equations.linear import estimated_frequencies
+from jaxvib.equations.averaged import Amplitudes, Averaged, amplitudes_of, averaged_growth, averaged_loads, averaged_model
+from jaxvib.equations.linear import estimated_frequencies, linear_model
+from jaxvib.equations.model import Model
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import terms_of
 from jaxvib.machine.effects.terms import LoadPotential
 from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
-from jaxvib.motion.analysis.measure import LEAST, Measured, natural_force
+from jaxvib.motion.analysis.measure import LEAST, Measured
 from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.analysis.separation import GROWTH, is_nearly_one_angle
 from jaxvib.motion.envelope.result import Envelope, Envelopes, EnvelopeStatus
@@ -216,7 +217,7 @@ def _judged_by_separation(run: Envelope) -> Envelope:
 
 @cached
 def _growth_at_end(scene: Scene, window: Envelopes) -> Array:
-    return averaged_growth(averaged_field(scene), window.omega[-1], window.phase[-1], window.displacement[-1])
+    return averaged_growth(averaged_model(linear_model(scene)), window.omega[-1], window.phase[-1], window.displacement[-1])
 
 
 @cached
@@ -235,9 +236,9 @@ def _run(
     # A start that does not exist (a jam mode absent in one lane of a batch) must not keep the others waiting.
     exists = is_finite(begin)
     begin = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), begin)
-    field, nd = averaged_field(scene), begin.displacement.shape[0]
-    frozen = jax.lax.stop_gradient(scene)
-    units = _units(frozen)
+    model, nd = linear_model(scene), begin.displacement.shape[0]
+    field, frozen = averaged_model(model), jax.lax.stop_gradient(scene)
+    units = _units(jax.lax.stop_gradient(model))
     speed, frequencies = frozen.drive.speed, estimated_frequencies(frozen)
     slowest = jnp.min(jnp.where(frequencies > 0.0, frequencies, speed))
     window = 2.0 * jnp.pi * jnp.minimum(turns / slowest, _MAX_WINDOW_TURNS / speed)
@@ -264,7 +265,7 @@ def _run(
     assert solution.ts is not None and solution.ys is not None
 
     def envelopes(times: Array, flat: Array) -> Envelopes:
-        return jax.vmap(lambda t, y: _at(scene, field, t, units.unpack(y, nd)))(times, flat)
+        return jax.vmap(lambda t, y: _at(model, field, t, units.unpack(y, nd)))(times, flat)
 
     kept = envelopes(solution.ts[0], solution.ys[0])
     finite = is_finite(kept)
@@ -277,7 +278,7 @@ def _run(
     status = EnvelopeStatus.where(result == diffrax.RESULTS.successful, status, failed)
     status = EnvelopeStatus.where(exists, status, EnvelopeStatus.no_start)
     whole = envelopes(solution.ts[1], solution.ys[1]) if samples else None
-    seen = (_measure(scene, kept), jnp.max(kept.ripple, axis=0), whole, kept)
+    seen = (_measure(model, kept), jnp.max(kept.ripple, axis=0), whole, kept)
     measured, ripple, whole, kept = jax.tree.map(lambda value: jnp.where(exists, value, jnp.nan), seen)
     return Envelope(
         **{name: getattr(measured, name) for name in type(measured).__dataclass_fields__},
@@ -314,32 +315,31 @@ def _rates(y: Array, args: tuple[Averaged, _Units], nd: int) -> tuple[Callable[.
     return on_numbers, scalars_of(args)
 
 
-def _at(scene: Scene, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
-    carrier = scene.machine.carrier()
+def _at(model: Model, field: Averaged, t: Array, state: Amplitudes) -> Envelopes:
     return Envelopes(
         time=t,
         displacement=state.displacement,
         velocity=state.velocity,
         amplitude=magnitude(state.displacement),
-        foundation_force=magnitude(carrier.bed_force(state.displacement, state.velocity)),
+        foundation_force=magnitude(model.carrier.bed_force(state.displacement, state.velocity)),
         omega=jnp.mean(state.rate),
         load_speed=state.rate,
         phase=state.phase,
-        rotor_speed=scene.drive.rotor_speed(t, None),
+        rotor_speed=model.scene.drive.rotor_speed(t, None),
         ripple=field.ripple(state),
     )
 
 
-def _measure(scene: Scene, window: Envelopes) -> Measured:
+def _measure(model: Model, window: Envelopes) -> Measured:
     """The window in the numbers of `Measured`: means of speeds, the greatest of each amplitude."""
     half = window.time.shape[0] // 2
     amplitude, force = jnp.max(window.amplitude, axis=0), jnp.max(window.foundation_force, axis=0)
     speeds, late = jnp.mean(window.load_speed, axis=0), jnp.mean(window.load_speed[half:], axis=0)
     change = jnp.abs(jnp.max(window.amplitude[half:], axis=0) - jnp.max(window.amplitude[:half], axis=0))
-    unit, omega = natural_units(scene), jnp.mean(speeds)
+    unit, omega = natural_units(model.scene), jnp.mean(speeds)
     drift = jnp.max(change) / jnp.maximum(jnp.max(amplitude), LEAST * unit.displacement)
     force_change = jnp.abs(jnp.max(window.foundation_force[half:], axis=0) - jnp.max(window.foundation_force[:half], axis=0))
-    force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), LEAST * natural_force(scene, unit))
+    force_drift = jnp.max(force_change) / jnp.maximum(jnp.max(force), LEAST * model.natural_force(unit))
     speed_drift = jnp.max(jnp.abs(late - speeds)) / jnp.maximum(jnp.abs(omega), jnp.finfo(omega.dtype).tiny)
     return Measured(
         omega=omega,
@@ -371,9 +371,9 @@ def _turning(scene: Scene, field: Averaged, begin: Amplitudes, window: Envelopes
     return jnp.all((jnp.min(window.load_speed**2, axis=0) > passes) & (lifted | (begin.rate**2 > passes)))
 
 
-def _units(scene: Scene) -> _Units:
-    mass = jnp.mean(jnp.diagonal(scene.machine.carrier().mass))
-    return _Units(averaged_loads(scene).unbalance() / mass, scene.drive.speed)
+def _units(model: Model) -> _Units:
+    mass = jnp.mean(jnp.diagonal(model.carrier.mass))
+    return _Units(averaged_loads(model.scene).unbalance() / mass, model.scene.drive.speed)
 
 
 _HINTS = {

@@ -14,7 +14,7 @@ from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
 from jaxvib.equations.collected import light_friction
-from jaxvib.equations.linear import AbstractLinearModel, JammedModel, jammed_model
+from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
 from jaxvib.machine.scene import Scene
@@ -91,7 +91,7 @@ def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tu
     """`rotor_speed_at`, and the amplitudes of the carrier there."""
     displacement = model.displacement(omega, speed)
     # The drag's torque is opposite to that of the acceleration -w^2 Y.
-    torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.push) * displacement))
+    torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement))
     free = omega + torque / model.drag
     effects = model.scene.effects
     if not has_term(effects, ContactFriction):
@@ -192,7 +192,7 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
     return jax.lax.fori_loop(0, most // 2, fewer, (index, count))[0][:most]
 
 
-def fold_points(model: AbstractLinearModel, per_side: int) -> tuple[Array, Array]:
+def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances,
     of which alone there are derivatives.
 

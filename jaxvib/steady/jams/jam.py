@@ -298,7 +298,7 @@ def _held(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Ar
     loads = model.loads
     if loads.alike:
         return True
-    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.push.conj() * displacement)) / 2.0
+    most = loads.mass * loads.radius * omega**2 * magnitude(jnp.sum(model.force_direction.conj() * displacement)) / 2.0
     need = loads.drag * loads.radius**2 * (rotor_speed - omega)
     return jnp.all(~(most < (1.0 - 1e-6) * need))
 

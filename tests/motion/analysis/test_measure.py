@@ -10,6 +10,7 @@ from small_machine import small_run
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.equations.model import assemble
 from jaxvib.motion.analysis.measure import mean_speeds, measure
 from jaxvib.motion.analysis.scaled_error import estimated_error, natural_units
 
@@ -31,7 +32,7 @@ def test_measure_reads_a_known_motion():
     def field(_, y):
         return jv.State(y.velocity, -(w**2) * (y.displacement - 0.7), y.rate, (jnp.zeros(n),))
 
-    measured = stored_jit(measure)(s, jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     force = np.abs(np.sum((np.asarray(s.machine.stiffness) + 1j * w * np.asarray(s.machine.damping)) * a * np.exp(1j * c)))
     np.testing.assert_allclose(measured.amplitude, a, rtol=1e-12)
     np.testing.assert_allclose(measured.foundation_force, force, rtol=1e-12)
@@ -55,7 +56,7 @@ def test_loads_that_speed_up_drift_by_what_they_gain():
     def field(_, y):
         return jv.State(y.velocity, -(w**2) * y.displacement, y.rate, (jnp.full(3, e),))
 
-    measured = stored_jit(measure)(s, jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     np.testing.assert_allclose(measured.drift, e * 5.0 / 4.0 / (w + e * 2.5), rtol=0.05)
 
 
@@ -75,7 +76,7 @@ def test_derivatives_of_an_amplitude_move_its_extrema_along():
         def field(p, t, y):
             return jv.State(y.velocity, bend(p, t)[None], y.rate, (jnp.zeros(3),))
 
-        return measure(s, jax.tree_util.Partial(field, p), t, states, natural_units(s)).amplitude[0]
+        return measure(assemble(s), jax.tree_util.Partial(field, p), t, states, natural_units(s)).amplitude[0]
 
     def exactly(p):
         ends = []
@@ -113,7 +114,7 @@ def test_a_change_of_the_loads_speed_is_told_relative_to_it():
     def field(_, y):
         return jv.State(y.velocity, -2500.0 * y.displacement, y.rate, (jnp.full(n, 0.5 * 0.01 * 50.0 / 10.0),))
 
-    measured = stored_jit(measure)(s, jax.tree_util.Partial(field), t, states, natural_units(s))
+    measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, natural_units(s))
     # Speeds grow evenly: their mean over the second half is that at 15 s, over all of it that at 10 s, but for part of a turn.
     np.testing.assert_allclose(measured.drift, 0.0025 / 1.005, rtol=0.02)
     assert not bool(measured.settled)
@@ -174,5 +175,5 @@ def test_a_force_that_changes_alone_is_a_drift():
         # Far below the loads' centrifugal force, length * mass * n^2, a change is relative to 1e-4 of that.
         length = jnp.asarray(least / 1e-4 / mass / 120.0**2)
         unit = eqx.tree_at(lambda u: u.displacement, natural_units(s), length)
-        measured = stored_jit(measure)(s, jax.tree_util.Partial(field), t, states, unit)
+        measured = stored_jit(measure)(assemble(s), jax.tree_util.Partial(field), t, states, unit)
         np.testing.assert_allclose(measured.drift, share, rtol=0.02)

@@ -1,0 +1,47 @@
+"""Model of a scene: its matrices and places, assembled once per question and passed on."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from jaxvib.equations.state import State
+from jaxvib.machine.carrier import Carrier
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import SupportForce
+from jaxvib.machine.mount import Mount
+from jaxvib.machine.scene import Scene
+
+__all__ = ["Model", "assemble"]
+
+
+class Model(eqx.Module):
+    """A scene with its numbers as matrices.
+
+    **Attributes**: `scene`; `carrier`, see `Carrier`; `mount` of its exciter, see `Mount`; `supports`, rows (k, nd) of the
+    place of each `SupportForce` of the scene's effects.
+    """
+
+    scene: Scene
+    carrier: Carrier
+    mount: Mount
+    supports: tuple[Array, ...]
+
+    def foundation_force(self, displacement: Array, velocity: Array) -> Array:
+        """Return the force of all supports on the foundation, gravity excluded, (nb,) N."""
+        force = self.carrier.bed_force(displacement, velocity)
+        for term, rows in zip(terms_of(self.scene.effects, SupportForce), self.supports, strict=True):
+            force = force + term.force(rows @ displacement, rows @ velocity)
+        return force
+
+    def natural_force(self, unit: State) -> Array:
+        """Return S n^2, N: the unbalance of the loads turns at the speed n of the rotor; `unit`, the scene's natural units."""
+        (speed,) = unit.rate
+        return jnp.mean(jnp.diagonal(self.carrier.mass)) * unit.displacement * speed**2
+
+
+def assemble(scene: Scene) -> Model:
+    """Return the model of a scene."""
+    carrier, mount = scene.machine.carrier(), scene.machine.mount()
+    return Model(scene, carrier, mount, tuple(term.rows(scene.machine) for term in terms_of(scene.effects, SupportForce)))
