@@ -14,6 +14,7 @@ from scenes import published
 from stored_jit import stored_jit
 
 import jaxvib as jv
+from jaxvib.equations.model import assemble
 from jaxvib.machine.effects.terms import LoadResistance
 from jaxvib.motion.envelope.envelope import _measure, _Tolerance
 from jaxvib.steady.jams.folds import jam_rotor_speed
@@ -281,16 +282,16 @@ def test_what_is_measured_of_a_window():
         foundation_force=jnp.asarray(np.stack([np.where(late, 4.0, 3.0), np.where(late, 2.0, 3.0)], axis=1)),
         load_speed=jnp.full((8, 2), 50.0),
     )
-    found = _measure(published().scene(), window)
+    found = _measure(assemble(published().scene()), window)
     np.testing.assert_allclose(found.drift, 0.25, rtol=1e-9)
     np.testing.assert_allclose(found.amplitude, [1.03e-3, 2e-4])
     np.testing.assert_allclose(found.foundation_force, 5.0)
     np.testing.assert_allclose([found.omega, *found.load_speed], 50.0)
     window.foundation_force = jnp.full((8, 2), 4.0)
-    np.testing.assert_allclose(_measure(published().scene(), window).drift, 0.03 / 1.03, rtol=1e-9)
+    np.testing.assert_allclose(_measure(assemble(published().scene()), window).drift, 0.03 / 1.03, rtol=1e-9)
     window.load_speed = jnp.asarray(np.where(late, 50.5, 49.5)[:, None] + np.zeros(2))
     window.amplitude = jnp.full((8, 2), 1e-3)
-    np.testing.assert_allclose(_measure(published().scene(), window).drift, 0.01, rtol=1e-9)
+    np.testing.assert_allclose(_measure(assemble(published().scene()), window).drift, 0.01, rtol=1e-9)
 
 
 def test_a_run_that_does_not_finish_says_so():
