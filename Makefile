@@ -27,7 +27,7 @@ test-slow: $(VENV)/installed
 # All hard cases and all numbers of the papers, and the tables of both in the documentation; errors and times go into a file.
 validate: $(VENV)/installed
 	PYTHONPATH=tests/helpers $(BIN)/python tests/validation/docs_tables.py
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow" --junitxml=out/validation.xml $(VALIDATION) tests/validation
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "slow or not slow" --junitxml=out/validation.xml tests/validation
 
 # The lowest versions that may be installed with the lowest Python, and the newest with the highest one.
 LOWEST_PYTHON ?= python3.11
