@@ -42,7 +42,7 @@ class CodeState(NamedTuple):
     is_on_disk: bool
 
 
-class _StateWithDetachment(ModuleType):
+class _WatchedModule(ModuleType):
     """Module that records the names set or deleted from outside."""
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -98,7 +98,7 @@ class _Code:
 
 def watch(module: ModuleType) -> None:
     """Watch a module at the end of its import, the submodules that it imported, and those that it will import."""
-    module.__class__ = _StateWithDetachment
+    module.__class__ = _WatchedModule
     if module.__file__ not in _code.stamps or _is_stale(module.__file__):
         _code.doubtful.append(module)
     for name, value in list(vars(module).items()):
@@ -152,7 +152,7 @@ def code_state(*, look: bool = False) -> CodeState:
 
 def clear_derived() -> None:
     """Empty the caches (`functools.cache`) of the functions of both packages but those of `jaxvib.runtime` and this module."""
-    for module in [module for module in list(sys.modules.values()) if isinstance(module, _StateWithDetachment)]:
+    for module in [module for module in list(sys.modules.values()) if isinstance(module, _WatchedModule)]:
         for value in list(vars(module).values()):
             if isinstance(value, _Cache) and not value.__module__.startswith(("jaxvib.runtime", __name__)):
                 value.cache_clear()

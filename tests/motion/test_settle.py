@@ -129,7 +129,7 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
     s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance("4 g m"),))
     start = eqx.tree_at(lambda y: y.rate, jv.initial_state(s, angles=[1.5, -2.0]), (jnp.full(2, 460.0),))
     exact = jv.simulate(s, 3.0, start=start, save="window", estimate=False)
-    monkeypatch.setattr("jaxvib.motion.simulate._STRETCH", 60.0)
+    monkeypatch.setattr("jaxvib.motion.plan._STRETCH_TURNS", 60.0)
     with jax.enable_x64(False):
         single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), (s, start))
         run = jv.simulate(single[0], 3.0, start=single[1], save="window", estimate=False)

@@ -81,9 +81,9 @@ def test_a_run_out_of_steps_names_the_drag():
 
 def test_unresolved_runs_are_named(monkeypatch):
     """Explicit steps are given for unknown numbers."""
-    from jaxvib.motion import ensemble
+    from jaxvib.motion import plan
 
-    monkeypatch.setattr(ensemble, "steps_of", lambda *_: (1.0, False))
+    monkeypatch.setattr(plan, "steps_of", lambda *_: (1.0, False))
     many = jv.ensemble(of_drag, jnp.asarray([1.0, 1e5]), 5.0, stepsize_controller=jv.EqualSteps(1200))
     assert [str(s) for s in np.asarray(many.resolved)] == ["True", "False"]
     assert "too long for the decay of the loads by drag" in many.summary()
