@@ -16,7 +16,7 @@ from jaxvib.boundary import call_user
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.files import rebuild_part
 from jaxvib.machine.scene import Scene, require_comparable
-from jaxvib.runtime.compat import evaluating
+from jaxvib.runtime.compat import evaluating, value_of
 from jaxvib.units import bounds_of_unknowns, require_real
 from jaxvib.units.known import is_known, when_known
 
@@ -74,9 +74,20 @@ def allowed_unknowns(scene: Scene) -> Array | None:
     """
     if is_known(scene):
         return None
+    if is_known(values := jax.tree.map(value_of, scene)):
+        return _allowed_value(values)
     with bounds_of_unknowns() as found:
         _rebuild(scene)
     return jnp.all(jnp.stack(found)) if found else None
+
+
+def _allowed_value(scene: Scene) -> Array | None:
+    """Return None if constructors allow the known numbers of a scene, as under `grad` without `jit`, otherwise False."""
+    try:
+        validate_scene(scene)
+    except InputError:
+        return jnp.asarray(False)
+    return None
 
 
 def _rebuild(scene: Scene) -> None:

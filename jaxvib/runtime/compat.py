@@ -54,6 +54,7 @@ __all__ = [
     "rewritten",
     "traced",
     "user_folder",
+    "value_of",
     "wide_vectors_are_right",
     "without_source_locations",
 ]
@@ -142,6 +143,13 @@ def primal_of(tracer: object) -> object | None:
     """Return the value whose derivative or batch `tracer` represents; None if it is unknown, as inside `jit`."""
     kind = type(tracer).__name__
     return getattr(tracer, {"JVPTracer": "primal", "LinearizeTracer": "primal", "BatchTracer": "val"}.get(kind, ""), None)
+
+
+def value_of(number: object) -> object:
+    """Return the value that derivatives are taken at; a number under `jit` or `vmap`, which has none, as it is."""
+    while type(number).__name__ in ("JVPTracer", "LinearizeTracer") and hasattr(number, "primal"):
+        number = number.primal  # pyright: ignore[reportAttributeAccessIssue]
+    return number
 
 
 def evaluating() -> contextlib.AbstractContextManager[None]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvib as jv
+from jaxvib.machine.validation import allowed_unknowns
 from jaxvib.results.status import status_names
 from jaxvib.steady.jams.phases import phase_jam
 
@@ -68,3 +69,16 @@ def test_each_machine_of_a_batch_is_refused_for_itself():
     assert not bool(jnp.any(found.stable[1])) and (slope != 0.0).tolist() == [True, False, True]
     alone = jams(jnp.asarray(5e4))
     np.testing.assert_allclose(found.omega[2], alone.omega, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("stiffness", "expected"), [(4e4, None), (-4e4, False)])
+def test_derivatives_of_known_numbers_are_checked_by_value(stiffness, expected):
+    """A derivative without `jit` has a value to be checked, and needs no operations for that."""
+    found = []
+
+    def question(k):
+        found.append(allowed_unknowns(eqx.tree_at(lambda s: s.machine.stiffness, ONE, k[None])))
+        return k
+
+    jax.grad(question)(stiffness)
+    assert expected is found[0] if expected is None else bool(found[0]) is expected
