@@ -127,7 +127,7 @@ def linear_model(scene: Scene) -> LinearModel:
 class JammedModel(LinearModel):
     """A linear model whose loads are jammed: checked, and what is the same at all load speeds computed, once a question.
 
-    **Attributes**, besides those of `LinearModel`: `unbalance` S of the collected loads, kg m; `drag` sum b_W R^2,
+    **Attributes**, besides those of `LinearModel`: `unbalance` S of the coincident loads, kg m; `drag` sum b_W R^2,
     N m s; `force_direction` (nd,) complex, the `direction` of their force.
     """
 

@@ -33,7 +33,7 @@ class Dimensionless(eqx.Module):
 
     The two papers scale the unbalance differently, and eps and v_i with it:
 
-    - `form="antiphase"`: s~ = m R, so that s_y = sum sin phi_j, collected loads have s = N, eps is that of one load
+    - `form="antiphase"`: s~ = m R, so that s_y = sum sin phi_j, coincident loads have s = N, eps is that of one load
     - `form="criterion"`: s~ = N m R, so that s_y = (1/N) sum sin phi_j, s = 1, eps is that of all loads
 
     **Arguments**: `natural` n_i and `damping` h_i, one per platform; `link_natural` n_ij and `link_damping` h_ij, one per link

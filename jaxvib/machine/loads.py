@@ -227,7 +227,7 @@ class CircularLoads(Loads):
         return side_by_side(self.count, self.ball_radius / self.radius)
 
     def unbalance(self) -> Array:
-        """Return the unbalance of collected loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
+        """Return the unbalance of coincident loads, kg m: sum m R at one point, m R sin(N arcsin(r/R)) / (r/R) side by side."""
         whole = jnp.sum(jnp.broadcast_to(self.mass * self.radius, (self.count,)))
         return whole if self.ball_radius is None else whole * jnp.mean(jnp.cos(self.offsets()))
 

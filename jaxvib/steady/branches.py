@@ -103,7 +103,7 @@ def branches(
     least: Number | None = None,
     accuracy: float = 1e-8,
 ) -> Branches | ExactBranches:
-    """The branch n(Omega) of jams of collected loads through all its folds: of light loads, or `exact`.
+    """The branch n(Omega) of jams of coincident loads through all its folds: of light loads, or `exact`.
 
     For light loads n(Omega) is explicit (`jam_rotor_speed`); either way every point is computed for itself: nothing is
     followed, nothing missed.

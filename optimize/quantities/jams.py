@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.collected import light_friction
+from jaxvib.equations.coincident import light_friction
 from jaxvib.equations.linear import jammed_loads, peak_force
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_term

@@ -104,7 +104,7 @@ def criterion_functional(scene: Scene, omega: Array, unbalance: Array | None = N
     f > 0 they gather. The paper claims it for two or more loads, and approximately: see `balanced_stability` for the
     exact answer.
 
-    **Arguments**: `unbalance` S kg m; left out, that of all loads collected at one point.
+    **Arguments**: `unbalance` S kg m; left out, that of all loads at one point.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=49.0, stiffness=4e4, damping=30.0)

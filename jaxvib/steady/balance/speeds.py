@@ -1,4 +1,4 @@
-"""Characteristic speeds of a machine: where the mean pull of its exciter on collected loads changes sign."""
+"""Characteristic speeds of a machine: where the mean pull of its exciter on coincident loads changes sign."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def port_receptance(scene: Scene, omega: Array) -> Array:
 def characteristic_speeds(scene: Scene) -> CharacteristicSpeeds:
     """Resonances and additional speeds of a scene's machine with its loads, without and with damping.
 
-    Collected loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
+    Coincident loads push the port with S w^2 Re(e exp(i w t)), e the direction that turns (one number for a port with
     one direction, (1, -i) for two). What is judged is the mean of push times displacement, with b = B^T e:
 
         Re(e^H A(w) e) = Re(b^H [K - w^2 (M_S - i G) + i w C]^-1 b)

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.equations.averaged import mean_torque
-from jaxvib.equations.collected import light_friction
+from jaxvib.equations.coincident import light_friction
 from jaxvib.equations.linear import JammedModel, LinearModel, jammed_model
 from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import ContactFriction
@@ -41,7 +41,7 @@ class Folds(eqx.Module):
 
 
 def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """The rotor's speed n (rad/s) at which the loads jam, collected, at speed `omega` (scalar, rad/s), for light loads.
+    """The rotor's speed n (rad/s) at which the loads jam at one angle at speed `omega` (scalar, rad/s), for light loads.
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 

@@ -179,7 +179,7 @@ def _modes_chart(jams: AbstractJam, resonances: Array | None, unit: SpeedUnit, a
 
 @validated
 def jam_modes(scene: Scene) -> JamModes:
-    """Every way in which light, collected loads can jam at the scene's rotor speed, held back by drag and dry friction.
+    """Every way in which light, coincident loads can jam at the scene's rotor speed, held back by drag and dry friction.
 
     The branch n(Omega) of `jam_rotor_speed` is cut at its folds dn/dOmega = 0 into monotone pieces; each piece that reaches
     the rotor speed holds one mode. Numbers follow the resonances: 2r - 1 rises toward the peak of resonance r, 2r falls

@@ -291,7 +291,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
     """Growth of small disturbances of jams whose loads are together, every load moving for itself, (n,) 1/s.
 
-    **Arguments**: `omega` (n,) rad/s of the jams that collected light loads have.
+    **Arguments**: `omega` (n,) rad/s of the jams that light coincident loads have.
 
     **Returns** the `growth` of `PhaseJam` for each; NaN where there is no such jam nearby, as for `omega` that is NaN, and
     where loads lie side by side or rub, of which the theory knows nothing.

@@ -1,4 +1,4 @@
-"""Exact jams: what is known of a periodic motion of the full equations in which collected loads are stuck."""
+"""Exact jams: what is known of a periodic motion of the full equations in which coincident loads are stuck."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.collected import CollectedModel
+from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.errors import InputError
 from jaxvib.numerics.extrema import greatest
 from jaxvib.numerics.fourier import Grid, deviation_synthesis, grid_of, synthesized
@@ -203,7 +203,7 @@ def _force_peaks(orders: tuple[int, ...], force: Array) -> Array:
 
 
 def orbits(
-    model: CollectedModel,
+    model: CoincidentModel,
     value: Array,
     start: Array,
     given: Parameter,
@@ -284,7 +284,7 @@ def orbits(
 
 
 def numbers_of(
-    model: CollectedModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
+    model: CoincidentModel, orbit: Orbit, value: Array, start: Array, given: Parameter, points: int
 ) -> dict[str, Array]:
     """Fields of one orbit that follow from its known motion: as `orbits` with the same arguments gave it, and with the same
     derivatives; 0 where it gave none."""
@@ -307,7 +307,7 @@ def numbers_of(
     return {name: jnp.where(there, field, 0.0) for name, field in fields.items()}
 
 
-def _numbers(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
+def _numbers(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
     """Harmonics of one motion; slope of the branch, residual, errors of the rotor's speed and of the deviation, and what is
     `_measured`."""
     branch = branch_tangent(model, grid, motion)
@@ -316,7 +316,7 @@ def _numbers(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> tup
 
 
 def _measured(
-    model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
+    model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
 ) -> tuple[Array, ...]:
     """Amplitude, foundation force, power and push between loads of one motion.
 
@@ -336,7 +336,7 @@ def _measured(
     return (swings[:nd], force, power, push)
 
 
-def _least_push(model: CollectedModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
+def _least_push(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
     """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.collected import collected_model
+from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_half_turn
@@ -194,13 +194,13 @@ def _fold_points(scene: Scene) -> tuple[Array, Array]:
 
 @cached
 def _is_stiff(scene: Scene, omega: Array) -> Array:
-    model = collected_model(jammed_model(scene))
+    model = coincident_model(jammed_model(scene))
     return is_stiff(model, omega, light_rotor_speed(model.linear, omega))
 
 
 @cached
 def _values(scene: Scene, omega: Array, many: int, accuracy: float, implicit: bool) -> _Values:
-    model = collected_model(jammed_model(scene))
+    model = coincident_model(jammed_model(scene))
     start = jax.vmap(lambda w: light_rotor_speed(model.linear, w))(omega)
     steps = jnp.max(steps_for(model, omega, start, implicit=implicit))
     orbit, growth = orbits(model, omega, start, "omega", many, steps, accuracy, implicit=implicit)

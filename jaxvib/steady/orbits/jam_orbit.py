@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.collected import collected_model
+from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -45,14 +45,14 @@ def jam_orbit(
     points: int | None = None,
     throw: bool = True,
 ) -> Orbit:
-    """The exact motion in which collected loads jam: no assumption that they are light.
+    """The exact motion in which coincident loads jam: no assumption that they are light.
 
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
-    that share every number are collected at one point, or side by side where they have a `ball_radius` (S is then
+    that share every number are at one point, or side by side where they have a `ball_radius` (S is then
     m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other, on the average of a period, the status is
     `held`). Loads that differ have a psi_j each: they take the places next to each other that their torques ask for.
     The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. Where friction
@@ -146,7 +146,7 @@ def _outputs(
 ) -> Orbit:
     """Outputs that follow from the motion, once it is solved: neither multipliers nor errors."""
     untold = jax.tree.map(lambda _: None, orbit)
-    return dataclasses.replace(untold, **numbers_of(collected_model(jammed_model(scene)), orbit, value, start, given, points))
+    return dataclasses.replace(untold, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
 
 
 @cached(outputs_from_solution=_outputs)
@@ -168,7 +168,7 @@ def _solved(
     Its multipliers take so many `steps` of the `implicit` or the explicit method, by default as many as the speeds need (no
     reverse derivatives then). `settle` starts from the motion at the load speed `start`, if that is near the answer.
     """
-    model, deviation = collected_model(jammed_model(scene)), None
+    model, deviation = coincident_model(jammed_model(scene)), None
     if settle:
         grid = grid_of(points, model.half_turn)
         deviation = periodic_motion(model, grid, "omega", start, light_rotor_speed(model.linear, start)).deviation[None]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import collected_model
+from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_loads, jammed_model, require_drag
 from jaxvib.errors import InputError
 from jaxvib.machine.effects.base import has_half_turn
@@ -147,4 +147,4 @@ def _light_rotor_speed(scene: Scene, omega: Array) -> Array:
 
 @cached
 def _is_stiff(scene: Scene, omega: Array, speed: Array) -> Array:
-    return is_stiff(collected_model(jammed_model(scene)), omega, speed)
+    return is_stiff(coincident_model(jammed_model(scene)), omega, speed)

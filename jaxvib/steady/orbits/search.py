@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import collected_model
+from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.machine.scene import Scene
 from jaxvib.numerics.fourier import grid_of
@@ -103,7 +103,7 @@ def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarra
 def branch_at(scene: Scene, omega: Array) -> tuple[Array, Array]:
     """Rotor speeds (rad/s) and slopes dn/dOmega of exact jams at load speeds `omega` (batches, many), rad/s; NaN where there is
     none."""
-    model = collected_model(jammed_model(scene))
+    model = coincident_model(jammed_model(scene))
     grid = grid_of(*((16, True) if model.half_turn else (33, False)))
 
     def one(w: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""Periodic motions of collected loads: the carrier eliminated by harmonics, the loads' phase deviation by collocation."""
+"""Periodic motions of coincident loads: the carrier eliminated by harmonics, the loads' phase deviation by collocation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import CollectedModel
+from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics.fourier import Grid, analyzed, deviation_analysis, grid_of, resampling, synthesized
 from jaxvib.numerics.linalg import small_solve, solve_in_turn
 
@@ -22,7 +22,7 @@ _MAX_NEWTON_STEPS = 60
 """Newton steps, those that were refused included; ordinary points take 4 to 6."""
 
 
-def receptance(model: CollectedModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+def receptance(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
     """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
 
     D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
@@ -36,12 +36,12 @@ def receptance(model: CollectedModel, omega: Array, speed: Array, orders: np.nda
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _answer(model: CollectedModel, grid: Grid, omega: Array, speed: Array) -> Array:
+def _answer(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
     """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
     return _at_port(model, grid, omega, receptance(model, omega, speed, grid.orders))
 
 
-def _at_port(model: CollectedModel, grid: Grid, omega: Array, answer: Array) -> Array:
+def _at_port(model: CoincidentModel, grid: Grid, omega: Array, answer: Array) -> Array:
     """`_answer` from the receptance at the orders of the grid, and others after these."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
     return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ answer[: w.size])
@@ -64,7 +64,7 @@ class _Balance(NamedTuple):
     pull: Array
 
 
-def _balance(model: CollectedModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
+def _balance(model: CoincidentModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = model.circle(phi)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
@@ -84,7 +84,7 @@ def _balance(model: CollectedModel, grid: Grid, answer: Array, deviation: Array,
 
 
 def _jacobian(
-    model: CollectedModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+    model: CoincidentModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
     """d residual / d deviation (G M, G M)."""
     g, m = deviation.shape
@@ -112,7 +112,7 @@ class PeriodicSolution(NamedTuple):
 
 
 def periodic_motion(
-    model: CollectedModel,
+    model: CoincidentModel,
     grid: Grid,
     given: Parameter,
     value: Array,
@@ -164,7 +164,7 @@ class _State(NamedTuple):
 
 @eqx.filter_custom_jvp
 def _newton(
-    model: CollectedModel,
+    model: CoincidentModel,
     value: Array,
     start: Array,
     deviation: Array,
@@ -217,7 +217,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
     deviation, x = _newton(model, value, start, deviation, grid=grid, given=given, is_known=is_known)
     on = grid_of(*grid)
 
-    def equations(model: CollectedModel, value: Array) -> Array:
+    def equations(model: CoincidentModel, value: Array) -> Array:
         omega, speed = _both(given, value, x)
         residual = _balance(model, on, _answer(model, on, omega, speed), deviation, omega, speed).residual
         return _then_zero(residual.ravel())
@@ -228,7 +228,7 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
 
 
 def _linearised(
-    model: CollectedModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
+    model: CoincidentModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
     """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
     if known is None:
@@ -259,7 +259,7 @@ class BranchTangent(NamedTuple):
     acceleration: Array
 
 
-def branch_tangent(model: CollectedModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
+def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
     """Continuation of the branch from a periodic motion, and the error of the motion.
 
     The error is what one Newton step would change that sees the residual at twice as many points, with the highest
@@ -320,7 +320,7 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(model: CollectedModel, grid: Grid, motion: PeriodicSolution, answer: Array | None = None) -> Harmonics:
+def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, answer: Array | None = None) -> Harmonics:
     """The harmonics of psi and of everything that the carrier does, whose receptance `answer` (K, nd, np) may be known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxvib.equations.collected import CollectedModel
+from jaxvib.equations.coincident import CoincidentModel
 from jaxvib.numerics import radau
 from jaxvib.numerics.fourier import Grid
 from jaxvib.numerics.linalg import small_solve
@@ -55,7 +55,7 @@ class _Rates(NamedTuple):
     drag: Array
 
 
-def _rates(model: CollectedModel, omega: Array, speed: Array) -> _Rates:
+def _rates(model: CoincidentModel, omega: Array, speed: Array) -> _Rates:
     """Rates of the linear equations about a jam at load speeds `omega` and the rotor's `speed`, rad/s.
 
     A body of loads decays by drag and friction with an inertia that the carrier lessens:
@@ -80,14 +80,14 @@ def _rates(model: CollectedModel, omega: Array, speed: Array) -> _Rates:
     return _Rates(oscillation, damping, jnp.vectorize(fastest)(omega, speed) / left)
 
 
-def is_stiff(model: CollectedModel, omega: Array, speed: Array) -> Array:
+def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
     """True if loads or carrier decay so fast, at load speeds `omega` and the rotor's `speed` (rad/s), that multipliers need the
     implicit method."""
     rates = _rates(model, omega, speed)
     return jnp.maximum(rates.damping, rates.drag) > _STIFF * (rates.oscillation + 2.0 * omega)
 
 
-def steps_for(model: CollectedModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
+def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
     """Number of integration steps in a turn of the grid at load speeds `omega` and the rotor's `speed`, rad/s.
 
     An `implicit` method is stable at any rate of decay: only the oscillation decides.
@@ -119,7 +119,7 @@ class _Disturbances(NamedTuple):
     `omega`, `speed` of the loads and the rotor, (P,), and the same (1, 1, P), `w` and `n`.
     """
 
-    model: CollectedModel
+    model: CoincidentModel
     stiffness: Array
     damping: Array
     gyroscopic: Array | None
@@ -136,7 +136,7 @@ class _Disturbances(NamedTuple):
     n: Array
 
     @classmethod
-    def about(cls, model: CollectedModel, motion: PeriodicSolution) -> _Disturbances:
+    def about(cls, model: CoincidentModel, motion: PeriodicSolution) -> _Disturbances:
         """Equations about the motions of a model."""
         carrier, mount, mass = model.linear.carrier, model.linear.mount, model.linear.mass
         nd = mass.shape[0]
@@ -231,7 +231,7 @@ class _Disturbances(NamedTuple):
 
 
 def floquet(
-    model: CollectedModel,
+    model: CoincidentModel,
     grid: Grid,
     motion: PeriodicSolution,
     harmonics: Harmonics,

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxvib.boundary import validated
-from jaxvib.equations.collected import collected_model
+from jaxvib.equations.coincident import coincident_model
 from jaxvib.equations.linear import jammed_model
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.effects.base import has_half_turn
@@ -94,7 +94,7 @@ def harmonic_convergence(
 
 @cached
 def _errors(scene: Scene, omega: Array, points: int) -> tuple[Array, Array]:
-    model = collected_model(jammed_model(scene))
+    model = coincident_model(jammed_model(scene))
     grid = grid_of(points, model.half_turn)
 
     def one(w: Array) -> tuple[Array, Array]:

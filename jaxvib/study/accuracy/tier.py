@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from jax import Array
 
 from jaxvib.equations.averaged import averaged_loads
-from jaxvib.equations.collected import require_collected
+from jaxvib.equations.coincident import require_coincident
 from jaxvib.equations.linear import jammed_loads
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -78,7 +78,7 @@ TIERS = (
     Tier(
         "exact orbit",
         "the periodic motion of a jam, all harmonics, its stability; no way there",
-        require_collected,
+        require_coincident,
         lambda scene, mode, until: jam_orbit(scene, mode=mode, throw=False),
     ),
     Tier(

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvib.equations.collected import COLLECTED_TERMS, require_collected
+from jaxvib.equations.coincident import COINCIDENT_TERMS, require_coincident
 from jaxvib.equations.state import State
 from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
@@ -50,7 +50,7 @@ class Values(NamedTuple):
     - `omega` of the loads, rad/s; `amplitude` of each coordinate, m, of tilts rad; `foundation_force` N
     - `fold`: the rotor speed (rad/s) at which the jam ends, NaN if there is none or none is asked for
     - `uncertainty`: relative, below which nothing of this can be told
-    - `closest`: the least distance of two loads in units of their diameter, NaN if they have none or are taken as collected
+    - `closest`: the least distance of two loads in units of their diameter, NaN if they have none or are treated as coincident
     - `magnified`: changes are relative to so many times these amplitudes and this force, more than 1 if the machine hardly
       moves, see `LEAST`
     """
@@ -79,7 +79,7 @@ class JamQuestion(NamedTuple):
     def can(self, scene: Scene) -> bool:
         """True if the exact orbit answers."""
         try:
-            require_collected(scene)
+            require_coincident(scene)
         except InputError:
             return False
         return True
@@ -163,7 +163,7 @@ class RunQuestion(NamedTuple):
 
 def admitted(scene: Scene) -> Scene:
     """The scene without the effects that theories of jams leave out, an imbalance among them: it shakes at another speed."""
-    kept = tuple(e for e in scene.effects if all(isinstance(term, COLLECTED_TERMS) for term in e.terms()))
+    kept = tuple(e for e in scene.effects if all(isinstance(term, COINCIDENT_TERMS) for term in e.terms()))
     return scene if len(kept) == len(scene.effects) else Scene(scene.machine, scene.loads, scene.drive, kept)
 
 

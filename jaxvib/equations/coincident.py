@@ -1,4 +1,4 @@
-"""Collected loads as rigid bodies on the linear carrier, and the torques on them."""
+"""Coincident loads as rigid bodies on the linear carrier, and the torques on them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from jaxvib.machine.effects.terms import ContactFriction, LoadPotential, RotorIm
 from jaxvib.machine.loads import CircularLoads
 from jaxvib.machine.scene import Scene
 
-__all__ = ["COLLECTED_TERMS", "CollectedModel", "Points", "collected_model", "light_friction", "require_collected"]
+__all__ = ["COINCIDENT_TERMS", "CoincidentModel", "Points", "coincident_model", "light_friction", "require_coincident"]
 
-COLLECTED_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
+COINCIDENT_TERMS = tuple(kind for kind in JAM_TERMS if kind is not RotorImbalance)
 """Terms that exact jams include. Forces between loads cancel in the torque on loads that lie together."""
 
 Points = Array | np.ndarray
 
 
-class CollectedModel(eqx.Module):
+class CoincidentModel(eqx.Module):
     """A scene whose loads are G bodies that do not change their shape, assembled once a question and handed on.
 
     Loads that are alike are one body, loads that differ a body each.
@@ -96,8 +96,8 @@ class CollectedModel(eqx.Module):
         return by_angle, by_rate, jnp.stack(by_a)
 
 
-def collected_model(linear: JammedModel) -> CollectedModel:
-    """The collected loads as bodies on their carrier. **Raises** `InputError` for a rotor out of balance."""
+def coincident_model(linear: JammedModel) -> CoincidentModel:
+    """The coincident loads as bodies on their carrier. **Raises** `InputError` for a rotor out of balance."""
     loads, effects = linear.loads, linear.scene.effects
     _require_balance(effects)
     inertia = loads.inertia_factor() * loads.mass * loads.radius**2
@@ -106,10 +106,10 @@ def collected_model(linear: JammedModel) -> CollectedModel:
     else:
         each = loads.mass * loads.radius, inertia, loads.drag * loads.radius**2
         unbalance, whole, drag = (jnp.broadcast_to(x, (loads.count,)) for x in each)
-    return CollectedModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn(effects))
+    return CoincidentModel(linear, loads, effects, unbalance, whole, drag, loads.offsets(), has_half_turn(effects))
 
 
-def require_collected(scene: Scene) -> CircularLoads:
+def require_coincident(scene: Scene) -> CircularLoads:
     """The loads of a scene whose jams repeat. **Raises** `InputError` for a rotor out of balance, and as `jammed_loads`."""
     loads = jammed_loads(scene)
     _require_balance(scene.effects)
@@ -118,7 +118,7 @@ def require_collected(scene: Scene) -> CircularLoads:
 
 def _require_balance(effects: tuple[Effect, ...]) -> None:
     problem = "shakes|shake the machine at the rotor's own speed, so that no motion repeats"
-    require_terms(effects, COLLECTED_TERMS, problem, "or simulate")
+    require_terms(effects, COINCIDENT_TERMS, problem, "or simulate")
 
 
 def light_friction(loads: CircularLoads, effects: tuple[Effect, ...], omega: Array, speed: Array) -> Array:
