@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -17,9 +18,9 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.scaled_error import error_scale, natural_units, turned
 from jaxvib.motion.integrate import whole_turns, wrap_angles
-from jaxvib.motion.plan import start_state
+from jaxvib.motion.plan import plan_stretch, start_state
 from jaxvib.motion.run import Run
-from jaxvib.motion.simulate import last_state, simulate
+from jaxvib.motion.simulate import last_state, run_planned, simulate
 from jaxvib.motion.start import Start
 from jaxvib.motion.steps import Tolerance
 from jaxvib.results.fields import in_unit
@@ -155,9 +156,11 @@ def growth(
     double = state.displacement.dtype.itemsize >= 8
     separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
 
+    plan = plan_stretch(scene, stretch, state, steps, throw=False)
+
     def run_on(begin: State) -> Run:
-        run = simulate(scene, stretch, start=begin, save="window", stepsize_controller=steps, estimate=False, throw=False)
-        if status_name(run.status) not in ("done", "would_separate"):
+        run = run_planned(dataclasses.replace(plan, state=begin), throw=False)
+        if status_name(run.status) != "done":
             raise failure(run.status)
         return run
 

@@ -44,6 +44,7 @@ __all__ = [
     "enough_steps",
     "plan_ensemble",
     "plan_run",
+    "plan_stretch",
     "start_state",
 ]
 
@@ -144,6 +145,14 @@ def plan_run(
         accuracy=steps.error if isinstance(steps, Accuracy) else None,
         fastest=fastest,
     )
+
+
+def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
+    """Plan one of several runs that follow each other, without a trajectory and an estimate. **Raises** `InputError`."""
+    return plan_run(
+        scene, length, start=state, mode=None, apart=None, spin_up=None, save="window", samples=None, turns=20, estimate=False,
+        solver=None, steps=steps, adjoint=None, max_steps=None, progress_meter=None, throw=throw,
+    )  # fmt: skip
 
 
 def start_state(scene: Scene, start: Start | State, mode: int | None, apart: Number | None, *, throw: bool = True) -> State:

@@ -17,9 +17,10 @@ from jaxvib.machine.scene import Scene
 from jaxvib.machine.validation import validate_scene
 from jaxvib.motion.analysis.regime import Regime, RegimeName
 from jaxvib.motion.integrate import frequency_bounds, whole_turns
+from jaxvib.motion.plan import RunPlan, plan_stretch, start_state
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
-from jaxvib.motion.simulate import last_state, simulate
-from jaxvib.motion.start import APART, Start, initial_state, validate_state
+from jaxvib.motion.simulate import last_state, run_planned
+from jaxvib.motion.start import APART, Start
 from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
@@ -106,51 +107,9 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
-    require_known(scene, "scene", "settle", "transform jam_orbit or simulate instead")
-    scene = validate_scene(scene)
-    if not scene.drive.constant:
-        raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")
-    count(periods, "periods")
-    double = scene.drive.speed.dtype.itemsize >= 8
-    usual, in_the_mean = 1e-6 if double else 1e-3, drift is None
-    drift = usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True))
-    chosen = Tolerance(1e-9 if double else 1e-5) if stepsize_controller is None else stepsize_controller
-    start = ("rest" if mode is None else "jam") if start is None else start
-    if isinstance(start, State):
-        state = validate_state(scene, start, mode, apart)
-    else:
-        apart = APART if apart is None and start == "jam" else apart
-        state = initial_state(scene, start, mode=mode, apart=apart, throw=throw)
-    _, slowest = frequency_bounds(scene)
-    # An imbalance goes on from where it was: the rotor is there after whole turns.
-    stretch = whole_turns(scene, 2.0 * math.pi * periods / float(slowest))
-    remembered = 4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0)
-    decay = _slowest_decay(scene)
-    seen: list[list[float]] = []
-    regimes: list[Regime] = []
-    run, together, ended = None, True, False
-    for _ in range(count(stretches, "stretches")):
-        run = simulate(scene, stretch, start=state, save="window", stepsize_controller=chosen, estimate=False, throw=throw)
-        together = together and bool(run.together)
-        drifts = [*(each[0] for each in seen), float(run.drift)]
-        ended = drifts[-1] < drift and _distance(drifts, run, decay, stretch) < _AWAY * drift
-        # Loads that are not at exactly one angle leave an unstable motion by themselves.
-        leaves = status_name(run.status) == "would_separate" and not bool(run.together)
-        if not bool(run.finished) or (ended and not leaves):
-            break
-        seen.append([float(run.drift), float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
-        if in_the_mean and len(seen) >= remembered and _steady_in_the_mean(np.array(seen[-remembered:])):
-            run = judged_by_separation(dataclasses.replace(run, status=member(RunStatus, "beating")))
-            break
-        if in_the_mean and bool(run.settled) and decay * stretch * len(seen) > -math.log(usual):
-            regimes.append(run.regime)
-            if _is_creeping(regimes[-_CREEPS:]):
-                run = judged_by_separation(dataclasses.replace(run, status=member(RunStatus, "creeping")))
-                break
-        state = last_state(scene, run)
-    assert run is not None
-    run = dataclasses.replace(run, together=on_device(np.asarray(together)))
-    if throw and not (ended or status_name(run.status) in ("beating", "creeping", "would_separate")):
+    plan = _plan_settle(scene, start, mode, apart, drift, periods, stretches, stepsize_controller, throw=throw)
+    run, has_settled = _settled(plan, throw=throw)
+    if throw and not has_settled:
         raise ComputationError(
             "not_settled",
             f"after {stretches} stretches of {periods} slow periods the motion still changes by {float(run.drift):.1e}; "
@@ -159,6 +118,93 @@ def settle(
     if throw and mode is not None:
         _require_mode(scene, run, mode)
     return run
+
+
+@dataclasses.dataclass(frozen=True)
+class _SettlePlan:
+    """Plan of stretches of a run.
+
+    **Attributes**: `first` stretch, at most `stretches` in all; `drift` below which the motion has settled, and the `usual` one
+    of the precision; `remembered` stretches by which a steady mean is judged, None if the motion must come to the drift; the
+    slowest `decay` of the carrier, 1/s.
+    """
+
+    first: RunPlan
+    stretches: int
+    drift: float
+    usual: float
+    remembered: int | None
+    decay: float
+
+
+def _plan_settle(
+    scene: Scene,
+    start: Start | State | None,
+    mode: int | None,
+    apart: Number | None,
+    drift: float | None,
+    periods: int,
+    stretches: int,
+    steps: StepChoice | None,
+    *,
+    throw: bool,
+) -> _SettlePlan:
+    """Validate the arguments of `settle` and choose its stretches. **Raises** `InputError`."""
+    require_known(scene, "scene", "settle", "transform jam_orbit or simulate instead")
+    scene = validate_scene(scene)
+    if not scene.drive.constant:
+        raise InputError("drive", f"is {quoted(scene.drive.kind)}; a motion settles under a constant speed: use ConstantSpeed")
+    count(periods, "periods")
+    double = scene.drive.speed.dtype.itemsize >= 8
+    usual = 1e-6 if double else 1e-3
+    # An imbalance goes on from where it was: the rotor is there after whole turns.
+    length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
+    start = ("rest" if mode is None else "jam") if start is None else start
+    apart = APART if apart is None and isinstance(start, str) and start == "jam" else apart
+    state = start_state(scene, start, mode, apart, throw=throw)
+    return _SettlePlan(
+        first=plan_stretch(scene, length, state, Tolerance(1e-9 if double else 1e-5) if steps is None else steps, throw=throw),
+        stretches=count(stretches, "stretches"),
+        drift=usual if drift is None else float(number(drift, "", "drift", low=0.0, open_low=True)),
+        usual=usual,
+        remembered=4 * math.ceil(_REMEMBERED * max(1.0, 100.0 / periods) / 4.0) if drift is None else None,
+        decay=_slowest_decay(scene),
+    )
+
+
+def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
+    """Return the run of the last stretch, and true if the motion has settled or is unstable and continues at one angle."""
+    length, state = float(plan.first.end), plan.first.state
+    together, drifts, measured, regimes = True, [], [], []
+    while True:
+        run = run_planned(dataclasses.replace(plan.first, state=state), throw=throw)
+        is_together, together = bool(run.together), together and bool(run.together)
+        run = dataclasses.replace(run, together=on_device(np.asarray(together)))
+        if not bool(run.finished):
+            return run, False
+        drifts.append(float(run.drift))
+        if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
+            judged = _judged(run, "done")
+            # Loads that are not at exactly one angle leave an unstable motion by themselves.
+            if is_together or status_name(judged.status) == "done":
+                return judged, True
+        if plan.remembered is not None:
+            measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
+            if len(measured) >= plan.remembered and _steady_in_the_mean(np.array(measured[-plan.remembered :])):
+                return _judged(run, "beating"), True
+            if bool(run.settled) and plan.decay * length * len(measured) > -math.log(plan.usual):
+                regimes.append(run.regime)
+                if _is_creeping(regimes[-_CREEPS:]):
+                    return _judged(run, "creeping"), True
+        if len(drifts) == plan.stretches:
+            last = _judged(run, "done") if bool(run.settled) else run
+            return last, status_name(last.status) == "would_separate"
+        state = last_state(plan.first.scene, run)
+
+
+def _judged(run: Run, name: str) -> Run:
+    """Return the run with the status of that name, or with `would_separate`."""
+    return judged_by_separation(dataclasses.replace(run, status=member(RunStatus, name)))
 
 
 @cached

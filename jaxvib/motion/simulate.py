@@ -32,7 +32,7 @@ from jaxvib.runtime.programs import cached
 from jaxvib.steady.outcome import outcome
 from jaxvib.units import Number
 
-__all__ = ["last_state", "simulate"]
+__all__ = ["last_state", "run_planned", "simulate"]
 
 
 @validated
@@ -120,6 +120,12 @@ def simulate(
         progress_meter=progress_meter,
         throw=throw,
     )
+    run = run_planned(plan, throw=throw)
+    return judged_by_separation(run) if plan.is_known and bool(run.settled) else run
+
+
+def run_planned(plan: RunPlan, *, throw: bool) -> Run:
+    """Return the run of a plan, not yet judged by separation. **Raises** `ComputationError` if it fails and `throw` is true."""
     begun = time.perf_counter()
     if plan.accuracy is not None:
         run = _run_to_accuracy(plan, plan.accuracy)
@@ -130,8 +136,7 @@ def simulate(
     if plan.is_known:
         jax.block_until_ready((run.steps, run.error))
         run = dataclasses.replace(run, seconds=on_device(np.asarray(time.perf_counter() - begun, run.seconds.dtype)))
-    run = outcome(run, plan.asked, plan.end, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
-    return judged_by_separation(run) if plan.is_known and bool(run.settled) else run
+    return outcome(run, plan.asked, plan.end, throw=throw, failures=_FAILURES, hint=partial(_hint, plan, run))
 
 
 def _run(plan: RunPlan, control: Control, *, is_measured: bool = True) -> Run:

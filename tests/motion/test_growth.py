@@ -121,12 +121,13 @@ def test_wrapped_angles_are_compared_across_a_turn(monkeypatch):
     """Two motions in single precision that are 2 pi - 6.2 apart may end at 3.1 rad and -3.1 rad."""
     ends = itertools.cycle([3.1, -3.1])
 
-    def run(scene, stretch, *, start, **_):
-        end = eqx.tree_at(lambda s: s.angle, start, (jnp.full(1, next(ends)),))
+    def run(plan, **_):
+        end = eqx.tree_at(lambda s: s.angle, plan.state, (jnp.full(1, next(ends)),))
         window = SimpleNamespace(state=jax.tree.map(lambda x: x[None], end))
-        return SimpleNamespace(status=jv.RunStatus.done, window=window, trajectory=None)
+        return SimpleNamespace(status=jv.RunStatus.done, window=window)
 
-    monkeypatch.setattr("jaxvib.motion.growth.simulate", run)
+    monkeypatch.setattr("jaxvib.motion.growth.run_planned", run)
+    monkeypatch.setattr("jaxvib.motion.growth._returns", lambda *_: False)
     with jax.enable_x64(False):
         scene, start = forced(0.0, 1.0)
         found = jv.growth(scene, 100.0, start=start, stretches=8)
@@ -166,11 +167,11 @@ def test_growth_starts_as_far_apart_as_asked(monkeypatch):
     s = jv.Scene(jammed().machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=0.5), jv.ConstantSpeed(60.0))
     starts = []
 
-    def noted(scene, until, *, start, **given):
-        starts.append(np.ptp(np.asarray(start.angle[0])))
+    def noted(plan, **_):
+        starts.append(np.ptp(np.asarray(plan.state.angle[0])))
         raise jv.ComputationError("stopped", "no more is needed")
 
-    monkeypatch.setattr("jaxvib.motion.growth.simulate", noted)
+    monkeypatch.setattr("jaxvib.motion.growth.run_planned", noted)
     for apart in (None, "10 deg", 0.0):
         with pytest.raises(jv.ComputationError, match="no more"):
             jv.growth(s, 10.0, apart=apart)

@@ -13,7 +13,7 @@ from small_machine import small_machine, small_run, small_start
 import jaxvib as jv
 from jaxvib.motion.integrate import whole_turns
 from jaxvib.motion.settle import _distance, _is_creeping, _slowest_decay, _steady_in_the_mean
-from jaxvib.motion.simulate import last_state
+from jaxvib.motion.simulate import last_state, run_planned
 
 
 def test_settle_names_a_motion_that_left_its_mode():
@@ -156,11 +156,11 @@ def begins_at(monkeypatch, s, **given):
     """The state that the first stretch starts from."""
     starts = []
 
-    def simulate(scene, until, *, start, **_):
-        starts.append(start)
+    def interrupted(plan, **_):
+        starts.append(plan.state)
         raise InterruptedError
 
-    monkeypatch.setattr("jaxvib.motion.settle.simulate", simulate)
+    monkeypatch.setattr("jaxvib.motion.settle.run_planned", interrupted)
     with pytest.raises(InterruptedError):
         jv.settle(s, **given)
     return starts[0]
@@ -177,7 +177,7 @@ def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
 def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
     """A stretch has 100 slow periods; every quarter has a whole number of stretches."""
     run, seen = small_run(save="window"), []
-    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *_, **__: run)
+    monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda *_, **__: run)
     monkeypatch.setattr("jaxvib.motion.settle._steady_in_the_mean", lambda rows: seen.append(rows.shape) or len(seen) > 1)
     found = jv.settle(small_machine(), start=small_start(), periods=periods)
     assert found.status_name == "beating" and seen == [(stretches, 5)] * 2
@@ -187,7 +187,7 @@ def test_at_least_32_stretches_are_judged(monkeypatch, periods, stretches):
 def test_a_stretch_is_so_many_periods_of_the_slowest_resonance(monkeypatch, periods):
     """A stretch has a whole number of turns of the rotor, which turns three times in a time unit of this machine."""
     asked, run = [], small_run(save="window")
-    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda _, until, **__: asked.append(float(until)) or run)
+    monkeypatch.setattr("jaxvib.motion.settle.run_planned", lambda plan, **_: asked.append(float(plan.end)) or run)
     jv.settle(small_machine(), start=small_start(), periods=periods, stretches=1, throw=False)
     slowest, turn = float(np.min(jv.natural_frequencies(small_machine()))), 2.0 * np.pi / float(small_machine().drive.speed)
     turns = asked[0] / turn
@@ -257,8 +257,10 @@ def test_loads_that_creep_along_balanced_arrangements_settle(monkeypatch):
     machine = jv.planar_rotor(mass=25.0, stiffness=5e5, damping=300.0)
     loads = jv.balls(count=3, mass=0.04, radius=0.1, drag=2.0)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(314.0), (jv.Gravity(), jv.StaticImbalance("6 g m")))
-    runs, ask = [], jv.simulate
-    monkeypatch.setattr("jaxvib.motion.settle.simulate", lambda *args, **given: runs.append(ask(*args, **given)) or runs[-1])
+    runs, integrate = [], run_planned
+    monkeypatch.setattr(
+        "jaxvib.motion.settle.run_planned", lambda *args, **given: runs.append(integrate(*args, **given)) or runs[-1]
+    )
     start = jv.initial_state(s, angles=np.radians([89.8, 188.2, 239.1]))
     found = jv.settle(s, start=start, periods=40)
     assert found.status_name == "creeping" and bool(found.settled) and bool(found.finished) and len(runs) < 12
