@@ -29,9 +29,12 @@ class Carrier(eqx.Module):
 
     **Attributes** (nd coordinates, nb directions of the force on the foundation)
 
-    - `mass` M (nd, nd), kg or kg m^2; `damping` C (nd, nd), N s/m; `stiffness` K (nd, nd), N/m
-    - `bed_stiffness` T_K, `bed_damping` T_C (nb, nd): supports on the foundation, N/m and N s/m
-    - `coordinates`: a name for each coordinate; `coordinate_units`: the unit of each, "m" or "rad", None where all are "m"
+    - `mass` M (nd, nd), kg, of tilts kg m^2; typical: 50 to 5000 kg, of rotors 5 to 50 kg
+    - `damping` C (nd, nd), N s/m; typical: 0.01 to 0.05 of the critical damping 2 sqrt(K M)
+    - `stiffness` K (nd, nd), N/m; typical: 1e4 to 1e6
+    - `bed_stiffness` T_K and `bed_damping` T_C (nb, nd): the supports on the foundation, N/m and N s/m
+    - `coordinates` (nd,): the name of each coordinate
+    - `coordinate_units` (nd,): the unit of each coordinate, "m" or "rad"; None if all are "m"
 
     Source: the general form of all five papers; for platforms Filimonikhin et al. 2022, equations (1)-(6), for rotors
     Artyunin 2013, equation (1).
@@ -47,7 +50,7 @@ class Carrier(eqx.Module):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Unit of each coordinate, "m" or "rad".
+        """Unit of each coordinate, (nd,): "m" or "rad".
 
         >>> import jaxvib as jv
         >>> jv.planar_rotor(mass=37.0, stiffness="1160 N/mm", damping=840.0).structure().units
@@ -57,19 +60,28 @@ class Carrier(eqx.Module):
 
     @property
     def bed_directions(self) -> tuple[str, ...]:
-        """Names of the directions of the force on the foundation: "up", or "across" and "up"."""
+        """Names of the directions of the force on the foundation, (nb,): "up", or "across" and "up"."""
         return ("up",) if self.bed_stiffness.shape[0] == 1 else ("across", "up")
 
     def bed_force(self, displacement: Array, velocity: Array) -> Array:
-        """Return the force on the foundation (nb,) N, T_K q + T_C q', also of complex amplitudes, without effects."""
+        """Return the force on the foundation, T_K q + T_C q', (nb,) N, without effects.
+
+        **Arguments**
+
+        - `displacement` q (nd,), m, of tilts rad; complex amplitudes are allowed
+        - `velocity` q' (nd,), m/s, of tilts rad/s
+        """
         return self.bed_stiffness @ displacement + self.bed_damping @ velocity
 
 
 class Machine(eqx.Module):
     """Machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
 
-    `places` is the kind of its places, for effects and drawings: "platform" by number, "shaft" by the distance along a rotor's
-    axis, "point" if the exciter's place is the only one.
+    `places` states how places on the machine are named, for effects and drawings:
+
+    - "platform": by the number of the platform
+    - "shaft": by the distance along a rotor's axis from its mass centre, m
+    - "point": not at all, because the exciter's place is the only one
     """
 
     kind: eqx.AbstractVar[str]
@@ -84,9 +96,12 @@ class Machine(eqx.Module):
         """Return the mount of the exciter, see `Mount`."""
 
     def rows_at(self, place: Place, name: str = "place") -> Array:
-        """Return rows (np, nd): the point at a `place` moves by rows q. Exciters, supports, stops and drawings use this method.
+        """Return the rows (np, nd) of a point: it moves by rows q. Exciters, supports, stops and drawings use this method.
 
-        **Arguments**: `place`, None for the default; its `name` in messages.
+        **Arguments**
+
+        - `place`: the number of a platform, or a distance along the axis, m; None for the default place
+        - `name` of the place in error messages
 
         **Raises** `InputError` for a place that the machine does not have.
 
@@ -102,9 +117,10 @@ class Machine(eqx.Module):
         return self.mount().rows[0]
 
     def supports(self) -> list[tuple[float, float, float]] | None:
-        """Supports along a rotor's axis, for a drawing: distance from the mass centre m, stiffness N/m, damping N s/m.
+        """Return the supports along a rotor's axis, for a drawing; None if the matrices contain everything for a drawing.
 
-        None if the matrices contain everything for a drawing.
+        **Returns** a list with the distance from the mass centre (m), the stiffness (N/m) and the damping (N s/m) of each
+        support.
         """
         return None
 

@@ -33,15 +33,26 @@ class Dimensionless(eqx.Module):
 
     The two papers scale the unbalance differently, and eps and v_i with it:
 
-    - `form="antiphase"`: s~ = m R, so that s_y = sum sin phi_j, coincident loads have s = N, eps is that of one load
-    - `form="criterion"`: s~ = N m R, so that s_y = (1/N) sum sin phi_j, s = 1, eps is that of all loads
+    - `form="antiphase"`: s~ = m R, so s_y = sum sin phi_j, coincident loads have s = N, and eps is that of one load
+    - `form="criterion"`: s~ = N m R, so s_y = (1/N) sum sin phi_j, s = 1, and eps is that of all loads
 
-    **Arguments**: `natural` n_i and `damping` h_i, one per platform; `link_natural` n_ij and `link_damping` h_ij, one per link
-    (12 for two masses; 12, 13, 23 for three); `rho` rho_i of the platforms without the exciter, in order; `eps`, `beta`,
-    `speed` n; `count` N. The machine's size is free: `mass_scale` M2S kg, `frequency_scale` w rad/s, `radius` R m,
-    `kappa` at least 1 (the loads are pendulums with that kappa).
+    **Arguments** (n platforms; all numbers without a unit unless it is stated)
 
-    **Raises** `InputError` for lengths that do not fit, values not positive, or loads heavier than M2S.
+    - `form`: "antiphase" or "criterion"
+    - `natural` n_i (n,), one number for each platform; typical: 0.2 to 1
+    - `damping` h_i (n,); typical: 0.01 to 0.05
+    - `link_natural` n_ij, one number for each link (12 for two masses; 12, 13, 23 for three); typical: 0.3 to 1
+    - `link_damping` h_ij, one number for each link; typical: 0.01 to 0.05
+    - `rho` rho_i (n - 1,) of the platforms without the exciter, in order; typical: 0.5 to 2
+    - `eps`: the loads' share of the mass M2S, times 1/kappa; typical: 1e-3 to 0.1
+    - `beta`: drag of the loads; typical: 0.1 to 10
+    - `speed` n of the rotor; typical: 1 to 5 times the lowest resonance
+    - `count` N of loads; typical: 1 to 4
+    - `mass_scale` M2S, kg, `frequency_scale` w, rad/s, and `radius` R, m: the size of the machine, which is free; typical: 1
+      each, or 50 to 5000 kg, 10 to 100 rad/s and 0.05 to 0.3 m
+    - `kappa`, at least 1: the loads are pendulums with this kappa; typical: 1 to 1.5
+
+    **Raises** `InputError` for lengths that do not fit, values that are not positive, or loads heavier than M2S.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -135,7 +146,7 @@ class Dimensionless(eqx.Module):
         return jnp.concatenate([others[:where], jnp.full((1,), exciter, dtype=others.dtype), others[where:]])
 
     def scene(self) -> Scene:
-        """Return the scene in SI numbers, at the chosen size."""
+        """Return the `Scene` in SI numbers, at the chosen size."""
         n = self.natural.shape[0]
         w, m_total, m = self.frequency_scale, self.mass_scale, self._load_mass
         mass = m_total / self._by_platform(self.rho, 1.0)
@@ -166,10 +177,22 @@ class Dimensionless(eqx.Module):
     ) -> dict[str, Array]:
         """Convert results in SI to the numbers of the paper.
 
-        **Arguments**: `omega` rad/s, any shape; `amplitude` m, real or complex, last axis over the platforms; `force` N, any
-        shape. NaN in an array, of modes that do not exist, stays NaN.
+        **Arguments**
+
+        - `omega`, rad/s, any shape
+        - `amplitude`, m, real or complex; its last axis is that of the platforms
+        - `force`, N, any shape
+
+        NaN in an array, for modes that do not exist, stays NaN.
 
         **Returns** a dict with the same keys: omega/w, amplitude_i/(rho_i y~), force/(M2S w^2 y~).
+
+        **Raises** `InputError` for amplitudes of another number of platforms.
+
+        >>> import jaxvib as jv
+        >>> form = jv.Dimensionless("antiphase", natural=1/3, damping=0.01, eps=1e-3, beta=1.0, speed=3.0, frequency_scale=50.0)
+        >>> round(float(form.read(omega=jv.natural_frequencies(form.scene()))["omega"][0]), 4)
+        0.3333
         """
         units = {"omega": self.frequency_scale, "amplitude": self.lengths, "force": self.force}
         given = {"omega": omega, "amplitude": amplitude, "force": force}

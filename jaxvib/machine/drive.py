@@ -23,9 +23,9 @@ Rotor = tuple[Array, Array] | None
 
 
 class Drive(eqx.Module):
-    """Drive of the rotor; `speed` is its working speed without a load, rad/s.
+    """Drive of the rotor; `speed` is its working speed without a load, rad/s; typical: 60 to 320 (600 to 3000 rpm).
 
-    An `IdealDrive` prescribes the rotor speed; with a `Motor` the rotor's angle and speed are states.
+    An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.
     """
 
     speed: eqx.AbstractVar[Array]
@@ -39,11 +39,17 @@ class Drive(eqx.Module):
 
     @abc.abstractmethod
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
-        """Return the rotor speed at time `t` (s), rad/s, in the state `rotor`."""
+        """Return the rotor speed, rad/s.
+
+        **Arguments**: `t`, s; `rotor`: angle (rad) and speed (rad/s) in the state under a motor, None under an ideal drive.
+        """
 
     @abc.abstractmethod
     def rotor_angle(self, t: Array, rotor: Rotor) -> Array:
-        """Return the rotor's angle at time `t` (s), rad, in the state `rotor`."""
+        """Return the rotor's angle, rad.
+
+        **Arguments**: `t`, s; `rotor`: angle (rad) and speed (rad/s) in the state under a motor, None under an ideal drive.
+        """
 
     @abc.abstractmethod
     def rotor_acceleration(self, t: Array) -> Array | None:
@@ -51,7 +57,10 @@ class Drive(eqx.Module):
 
     @abc.abstractmethod
     def torque_and_inertia(self, speed: Array) -> tuple[Array, Array] | None:
-        """Return T at the rotor's `speed` (rad/s), N m, and its inertia J, kg m^2; None if no torque changes the speed."""
+        """Return the torque T (N m) at the rotor's `speed` (rad/s), and the rotor's inertia J (kg m^2).
+
+        None if no torque changes the speed.
+        """
 
     def jump_ts(self) -> tuple[Array, ...]:
         """Return the times at which the acceleration jumps, which must be ends of steps."""
@@ -59,21 +68,21 @@ class Drive(eqx.Module):
 
 
 class IdealDrive(Drive):
-    """Drive that prescribes the rotor speed as a function of time."""
+    """Drive that prescribes the rotor speed as a function of time. A new ideal drive is a subclass with three methods."""
 
     ideal = True
 
     @abc.abstractmethod
     def speed_at(self, t: Array) -> Array:
-        """Return the rotor speed at time t (s), rad/s."""
+        """Return the rotor speed at time `t` (s), rad/s."""
 
     @abc.abstractmethod
     def angle_at(self, t: Array) -> Array:
-        """Return the rotor's angle at time t, rad: the integral of its speed from 0."""
+        """Return the rotor's angle at time `t` (s), rad: the integral of its speed from 0."""
 
     @abc.abstractmethod
     def acceleration_at(self, t: Array) -> Array:
-        """Return the rotor's angular acceleration at time t, rad/s^2."""
+        """Return the rotor's angular acceleration at time `t` (s), rad/s^2."""
 
     def rotor_speed(self, t: Array, rotor: Rotor) -> Array:
         """Return `speed_at`."""
@@ -96,7 +105,8 @@ class Motor(Drive):
 
         J theta'' = T(theta') - torque of the loads on the rotor
 
-    J is the moment of inertia of the whole rotor about its axis, its imbalance included, loads not.
+    J is the moment of inertia of the whole rotor about its axis. It includes the rotor's imbalance, not the loads; typical:
+    0.005 to 1 kg m^2.
     """
 
     ideal = False
@@ -128,7 +138,9 @@ class Motor(Drive):
 class ConstantSpeed(IdealDrive):
     """Rotor at a constant speed that the loads do not change.
 
-    **Arguments**: `speed` n, rad/s or a text such as "1500 rpm"; greater than 0.
+        theta' = n
+
+    **Arguments**: `speed` n, rad/s or a text such as "1500 rpm"; greater than 0; typical: 60 to 320 rad/s (600 to 3000 rpm).
 
     **Raises** `InputError` for a wrong unit or a speed that is not positive.
 
@@ -166,7 +178,10 @@ class SpinUp(IdealDrive):
 
     The speed is twice continuously differentiable.
 
-    **Arguments**: `speed` n, rad/s or text, greater than 0; `duration` s or text, greater than 0.
+    **Arguments** (SI or texts with a unit)
+
+    - `speed` n, rad/s, greater than 0; typical: 60 to 320 (600 to 3000 rpm)
+    - `duration`, s, greater than 0; typical: 1 to 20
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -208,7 +223,10 @@ class RunUp(IdealDrive):
 
     The acceleration jumps when the working speed is reached; `simulate` ends a step at that time.
 
-    **Arguments**: `speed` n, rad/s or text, greater than 0; `acceleration` rad/s^2 or text, greater than 0.
+    **Arguments** (SI or texts with a unit)
+
+    - `speed` n, rad/s, greater than 0; typical: 60 to 500 (600 to 4800 rpm)
+    - `acceleration`, rad/s^2, greater than 0; typical: 10 to 300
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -254,8 +272,11 @@ class DCMotor(Motor):
 
         T = stall_torque (1 - theta' / speed)
 
-    **Arguments**: `speed` without a load, rad/s or text; `stall_torque` N m; `inertia` J of the whole rotor, kg m^2; all
-    greater than 0.
+    **Arguments** (SI or texts with a unit; all greater than 0)
+
+    - `speed` without a load, rad/s; typical: 100 to 320 (1000 to 3000 rpm)
+    - `stall_torque`, N m; typical: 1 to 50
+    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not positive.
 
@@ -285,8 +306,13 @@ class InductionMotor(Motor):
 
         T = 2 T_b s s_b / (s^2 + s_b^2),    s = 1 - theta' / speed
 
-    **Arguments**: `speed` synchronous, rad/s or text; `breakdown_torque` T_b N m, the largest torque; `breakdown_slip` s_b,
-    the slip at that torque, below 1; `inertia` J of the whole rotor, kg m^2; all greater than 0.
+    **Arguments** (SI or texts with a unit; all greater than 0)
+
+    - `speed`: synchronous speed, rad/s; typical: "750 rpm", "1000 rpm", "1500 rpm" or "3000 rpm" on a grid of 50 Hz
+    - `breakdown_torque` T_b, the largest torque, N m; typical: 2 to 3 times the rated torque, 8 to 250 for 0.5 to 15 kW at 1500
+      rpm
+    - `breakdown_slip` s_b, the slip at that torque, below 1; typical: 0.1 to 0.4, the larger the smaller the motor
+    - `inertia` J of the whole rotor, kg m^2; typical: 0.005 to 0.5
 
     **Raises** `InputError` for a wrong unit or a value that is not allowed.
 

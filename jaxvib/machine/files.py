@@ -138,7 +138,7 @@ def misplaced_name(name: str, tables: Tables, kind: str, allowed: list[str]) -> 
 def load_scene(path: str | Path) -> Scene:
     """Read a scene file, see `scene_from_toml`.
 
-    **Arguments**: `path` of a TOML file.
+    **Arguments**: `path` of a TOML file, at most 16 MB; typical: about 20 lines. The command `jaxvib new` writes examples.
 
     **Returns** `Scene`. **Raises** `InputError` for a file that cannot be read, and for each error in it, naming the field.
 
@@ -156,9 +156,12 @@ def load_scene(path: str | Path) -> Scene:
 def save_scene(scene: Scene, path: str | Path) -> Path:
     """Write a scene file that `load_scene` reads back bit for bit.
 
-    **Arguments**: `scene`; `path` of the file, which is overwritten.
+    **Arguments**
 
-    **Returns** its path. **Raises** `InputError` if it cannot be written.
+    - `scene` with known numbers (not under a JAX transformation)
+    - `path` of the file, which is overwritten
+
+    **Returns** the path. **Raises** `InputError` if the file cannot be written.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -177,11 +180,14 @@ def save_scene(scene: Scene, path: str | Path) -> Path:
 def scene_from_toml(text: str) -> Scene:
     """Return the scene of the text of a scene file.
 
-    Tables `[machine]`, `[loads]`, `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit;
-    `[effects]` names only the effects of the scene, as `gravity = true` or as a table of the effect's arguments.
+    **Arguments**: `text` in TOML
 
-    **Returns** `Scene`. **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not
-    allowed.
+    - the tables `[machine]`, `[loads]` and `[drive]` have a `kind` and that kind's arguments, in SI or as text with a unit
+    - the table `[effects]` names only the effects of the scene, as `gravity = true` or as a table of the effect's arguments
+
+    **Returns** `Scene`.
+
+    **Raises** `InputError` for a table or field that is missing or unknown, and for values that are not allowed.
 
     >>> import jaxvib as jv
     >>> scene = jv.scene_from_toml('''
@@ -273,7 +279,9 @@ def _needed(parameters: Mapping[str, inspect.Parameter]) -> list[str]:
 def scene_to_toml(scene: Scene) -> str:
     """Return the text of a scene file in SI numbers; `scene_from_toml` returns the same scene, bit for bit.
 
-    **Returns** text.
+    **Arguments**: `scene` with known numbers (not under a JAX transformation).
+
+    **Returns** text. **Raises** `InputError` for a scene whose numbers are not known.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness="40 N/mm", damping=30.0),

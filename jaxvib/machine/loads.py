@@ -73,8 +73,11 @@ class Loads(eqx.Module):
 
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.
 
-    A load has one or several coordinates u; the first is its angle about the rotor's axis, rad, and its generalised force the
+    A load has one or several coordinates u. The first is its angle about the rotor's axis, rad; its generalised force is the
     torque that the load takes off the rotor.
+
+    **Attributes**: `mass` of a load, kg; typical: 0.05 to 1; `count`: number of loads; typical: 1 to 4; `kind`: its name in
+    scene files.
     """
 
     mass: eqx.AbstractVar[Array]
@@ -94,7 +97,10 @@ class Loads(eqx.Module):
 
     @abc.abstractmethod
     def position(self, *u: Array) -> tuple[Array, ...]:
-        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along its axis if it moves there."""
+        """Return the load's position p(u), m: (across, up) in the rotor's plane, and along its axis if it moves there.
+
+        **Arguments**: the coordinates `u`, (count,) each.
+        """
 
     def tangent_lengths(self) -> tuple[Array, ...] | None:
         """Return |dp/du_i| m if they are constant along the track and the tangents are orthogonal; otherwise None.
@@ -118,10 +124,16 @@ class Loads(eqx.Module):
 
     @abc.abstractmethod
     def resistance(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...]:
-        """Return the generalised force of the viscous resistance against the rotor that turns at `speed`, N m."""
+        """Return the generalised force of the viscous resistance against the rotor, (count,) N m for the angle.
+
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s.
+        """
 
     def spin_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], speed: Array) -> tuple[Array, ...] | None:
-        """Return the gyroscopic generalised force of a rolling load's rotation, N m, which does no work; None without one."""
+        """Return the gyroscopic generalised force of a rolling load's rotation, N m, which does no work; None without one.
+
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s.
+        """
         return None
 
     def drilling_spin(
@@ -129,12 +141,16 @@ class Loads(eqx.Module):
     ) -> DrillingSpin | None:
         """Return the dynamics of a spin about the normal of the contact; None for loads that are not coupled to it.
 
-        **Arguments**: `slip` of the contact along each coordinate, m/s, if it may slide.
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; `speed` of the rotor, rad/s; `slip` of the contact
+        along each coordinate, m/s, if it may slide.
         """
         return None
 
     def normal_force(self, u: tuple[Array, ...], rate: tuple[Array, ...], g: Mapping[int, Array | float]) -> NormalForce | None:
-        """Return the force of the loads on their track under gravity `g` (by axis, m/s^2 upward); None if it is not defined."""
+        """Return the force of the loads on their track; None if it is not defined.
+
+        **Arguments**: coordinates `u` and their rates `rate`, (count,) each; gravity `g` by axis, m/s^2 upward.
+        """
         return None
 
     def offsets(self) -> Array:
@@ -283,13 +299,27 @@ def require_side_by_side(count: int, radius: float, ball_radius: float) -> None:
 def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Return balls that roll in an annular track, kappa = 7/5.
 
-    **Arguments**: `count` N; `mass` kg, `radius` R m of the circle of their centres, `drag` b_W N s/m: one number shared by
-    all, or N of them; `ball_radius` r m of a ball, for balls in one track, which cannot all be at one point: in jams and
-    in the criterion, gathered balls lie side by side and have the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of N m R.
-    In time integration only the effect `LoadContact` uses it; without that effect loads pass through each other.
+        kappa m R^2 phi'' = - b_W R^2 (phi' - speed) - m p'(phi) . (acceleration of the track),    p = R (cos phi, sin phi)
 
-    **Returns** `CircularLoads`. **Raises** `InputError` for a count below 1, wrong units, a mass or radius that is not
-    positive, a negative drag (0 is allowed), balls that have no room side by side.
+    **Arguments** (SI or texts with a unit such as "800 g")
+
+    - `count` N: number of balls, at least 1; typical: 1 to 4
+    - `mass` m of a ball, kg, positive, one number for all or N of them; typical: 0.05 to 1
+    - `radius` R of the circle of the balls' centres, m, positive, one number for all or N of them; typical: 0.05 to 0.3
+    - `drag` b_W: viscous resistance of a ball against the rotor, N s/m, one number for all or N of them, 0 is allowed; typical:
+      0.5 to 5 for balls of 0.1 to 1 kg in oil
+    - `ball_radius` r of a ball, m, one number; typical: 0.01 to 0.03. Without it balls can all be at one point
+
+    Balls with a `ball_radius` are in one track and cannot all be at one point:
+
+    - In jams and in the criterion gathered balls lie side by side, with the unbalance m R sin(N arcsin(r/R)) / (r/R) instead of
+      N m R
+    - In time integration only the effect `LoadContact` uses it. Without that effect loads pass through each other
+
+    **Returns** `CircularLoads`.
+
+    **Raises** `InputError` for a count below 1, wrong units, a mass or radius that is not positive, a negative drag, and balls
+    that have no room side by side.
 
     >>> import jaxvib as jv
     >>> float(jv.balls(count=3, mass="800 g", radius=0.12, drag=1.5).unbalance().round(6))
@@ -305,7 +335,13 @@ def balls(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radi
 def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_radius: Number | None = None) -> CircularLoads:
     """Return cylindrical rollers in an annular track, kappa = 3/2.
 
-    **Arguments**: as `balls`.
+    **Arguments** as `balls`, with the same equation
+
+    - `count` N; typical: 1 to 4
+    - `mass` m, kg; typical: 0.1 to 2
+    - `radius` R of the circle of the rollers' axes, m; typical: 0.05 to 0.3
+    - `drag` b_W, N s/m; typical: 0.5 to 5
+    - `ball_radius` r of a roller, m; typical: 0.01 to 0.03
 
     **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
 
@@ -321,9 +357,14 @@ def rollers(*, count: int, mass: Numbers, radius: Number, drag: Numbers, ball_ra
 def pendulums(*, count: int, mass: Numbers, radius: Number, drag: Numbers, inertia: Numbers = 0.0) -> CircularLoads:
     """Return pendulums on the shaft, kappa = 1 + J_C/(m R^2).
 
-    **Arguments**: as `balls`, with `radius` the distance of the mass centre from the axis, and `inertia` J_C kg m^2 about
-    the mass centre (0: a point mass). `drag` acts at that radius: a bearing with the viscous coefficient mu (N m s) has
-    b_W = mu/R^2.
+    **Arguments** as `balls`, with the same equation
+
+    - `count` N; typical: 1 to 4
+    - `mass` m, kg; typical: 0.05 to 1
+    - `radius` R: distance of the mass centre from the axis, m; typical: 0.05 to 0.2
+    - `drag` b_W at that radius, N s/m: a bearing with the viscous coefficient mu (N m s) has b_W = mu/R^2; typical: 0.05 to 3,
+      that is mu from 3e-4 to 0.02 N m s at R = 0.08 m
+    - `inertia` J_C about the mass centre, kg m^2 (default 0: a point mass); typical: 0 to 0.5 m R^2
 
     **Returns** `CircularLoads`. **Raises** `InputError` as `balls`.
 

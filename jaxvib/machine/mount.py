@@ -23,13 +23,14 @@ class Mount(eqx.Module):
 
     **Attributes**
 
-    - `rows`: arrays (np, nd). The first is a point of the rotor's axis; the second, 1/m times the unit of a displacement, is
-      the tilt of the axis. Machines that do not tilt have the first only
-    - `axes`: the direction of a load's plane (0 across, 1 up) of each row
-    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an entry that is absent is 0. (None,) if all loads run at
-      the first point, (None, distances from it in m) if each has a station of its own
+    - `rows`: arrays (np, nd). The first is a point of the rotor's axis. The second is the tilt of the axis, in 1/m times the
+      unit of a displacement. Machines that do not tilt have the first only
+    - `axes` (np,): the direction of a load's plane (0 across, 1 up) of each row
+    - `levers`: a lever (count,) for each entry of `rows`; None is 1, an absent entry is 0. (None,) if all loads run at the
+      first point, (None, distances from it in m) if each has a station of its own
     - `rotor_levers`: the same for the rotor's mass centre, scalars
-    - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one
+    - `gyroscopic` G (nd, nd), kg m^2: G times the rotor's speed times q' is a force on the coordinates; None without one.
+      typical: 0.01 to 0.5 kg m^2, the polar inertia of the rotor
     """
 
     rows: tuple[Array, ...]
@@ -40,7 +41,7 @@ class Mount(eqx.Module):
 
     @property
     def tilt(self) -> Array | None:
-        """Rows (np, nd) by which the axis tilts; None if it cannot."""
+        """Rows (np, nd) by which the axis tilts; None if the axis cannot tilt."""
         return self.rows[1] if len(self.rows) > 1 else None
 
     @property
@@ -54,15 +55,16 @@ class Mount(eqx.Module):
         return len(self.levers) == 1 and self.levers[0] is None
 
     def load_rows(self, count: int) -> Array:
-        """Rows of each load's point, (count, np, nd)."""
+        """Return the rows of each load's point, (count, np, nd). `count` is the number of loads."""
         if self.at_one_point:
             return jnp.broadcast_to(self.rows[0], (count, *self.rows[0].shape))
         return jax.vmap(lambda levers: _combined(levers, self.rows))(self.levers)
 
     def load_rates(self, rate: Array) -> dict[int, Array]:
-        """Velocities (accelerations) of the loads' points by axis, from those of the coordinates, `rate` (nd,).
+        """Return the velocities (or accelerations) of the loads' points by axis, from the rates `rate` (nd,) of the
+        coordinates.
 
-        Each is a number if all loads run at one point, otherwise (count,).
+        Each is a number if all loads run at one point, otherwise (count,). Rates in m/s give velocities in m/s.
         """
         if self.at_one_point:
             return dict(zip(self.axes, self.rows[0] @ rate, strict=True))
@@ -71,11 +73,14 @@ class Mount(eqx.Module):
         return dict(zip(self.axes, _combined(levers, moved), strict=True))
 
     def rotor_rows(self) -> Array:
-        """Rows of the rotor's mass centre, (np, nd)."""
+        """Return the rows of the rotor's mass centre, (np, nd)."""
         return _combined(self.rotor_levers, self.rows)
 
     def distances(self, count: int) -> Array:
-        """Distance of each load from the rotor's mass centre along the axis, (count,) m; 0 on a machine that does not tilt."""
+        """Return the distance of each of `count` loads from the rotor's mass centre along the axis, (count,) m.
+
+        It is 0 on a machine that does not tilt.
+        """
         zero = jnp.zeros((), self.rows[0].dtype)
         load, rotor = (levers[1] if len(levers) > 1 else zero for levers in (self.levers, self.rotor_levers))
         return jnp.broadcast_to((zero if load is None else load) - (zero if rotor is None else rotor), (count,))

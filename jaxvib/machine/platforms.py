@@ -127,7 +127,13 @@ def _links(links: Sequence[Sequence[int]], n: int) -> tuple[tuple[int, int], ...
 def one_mass(*, mass: Number, stiffness: Number, damping: Number) -> Platforms:
     """Return one platform on a support, with the exciter.
 
-    **Arguments**: `mass` kg (loads not counted), `stiffness` N/m, `damping` N s/m; one number each.
+        M y'' + b y' + k y = force of the loads
+
+    **Arguments** (one number each, SI or a text with a unit such as "40 N/mm")
+
+    - `mass` M, kg, loads not included; typical: 50 to 5000
+    - `stiffness` k of the support, N/m; typical: 1e4 to 1e6
+    - `damping` b of the support, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
 
     **Returns** `Platforms`. **Raises** `InputError` for a mass that is not positive or a negative coefficient.
 
@@ -151,10 +157,20 @@ def two_mass(
 ) -> Platforms:
     """Return two platforms on supports, joined by a link.
 
-    **Arguments**: `mass` (2,) kg, `stiffness` (2,) N/m and `damping` (2,) N s/m of the supports, `link_stiffness` N/m,
-    `link_damping` N s/m, `exciter` the platform with the auto-balancer (default: 2).
+        M_1 y_1'' + b_1 y_1' + k_1 y_1 + b_12 (y_1' - y_2') + k_12 (y_1 - y_2) = 0
+        M_2 y_2'' + b_2 y_2' + k_2 y_2 - b_12 (y_1' - y_2') - k_12 (y_1 - y_2) = force of the loads, if they are on platform 2
 
-    **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, units, masses not positive, negative coefficients.
+    **Arguments** (SI or texts with a unit)
+
+    - `mass` (2,), kg, loads not included; typical: 50 to 5000
+    - `stiffness` (2,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
+    - `damping` (2,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
+    - `link_stiffness`, N/m; typical: 5e4 to 5e6, that is 1 to 10 times a support
+    - `link_damping`, N s/m; typical: as `damping`
+    - `exciter`: the number of the platform with the auto-balancer, 1 or 2 (default: 2)
+
+    **Returns** `Platforms`. **Raises** `InputError` for wrong lengths, wrong units, masses that are not positive, or negative
+    coefficients.
 
     >>> import jaxvib as jv
     >>> machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 5e4), damping=(40.0, 40.0),
@@ -178,9 +194,16 @@ def three_mass(
 ) -> Platforms:
     """Return three platforms on supports, every two joined by a link.
 
-    **Arguments**: `mass` (3,) kg, `stiffness` (3,) N/m and `damping` (3,) N s/m of the supports; `link_stiffness` (3,) N/m
-    and `link_damping` (3,) N s/m of the links 1-2, 1-3, 2-3 (0 for an absent link); `exciter` the platform with the
-    auto-balancer.
+        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [ b_ij (y_i' - y_j') + k_ij (y_i - y_j) ] = force of the loads on platform i
+
+    **Arguments** (SI or texts with a unit)
+
+    - `mass` (3,), kg, loads not included; typical: 50 to 5000
+    - `stiffness` (3,) of the supports, N/m; typical: 1e4 to 1e6, 0 without a support
+    - `damping` (3,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M)
+    - `link_stiffness` (3,) of the links 1-2, 1-3, 2-3, N/m; typical: 5e4 to 5e6, 0 for an absent link
+    - `link_damping` (3,) of these links, N s/m; typical: as `damping`
+    - `exciter`: the number of the platform with the auto-balancer, 1 to 3 (default: 2)
 
     **Returns** `Platforms`. **Raises** `InputError` as `two_mass`.
 
@@ -207,9 +230,18 @@ def network(
 ) -> Platforms:
     """Return a machine of any number of platforms, supports and links.
 
-    **Arguments**: `mass` (n,) kg, `stiffness` (n,) N/m, `damping` (n,) N s/m (0 for a platform without a support); `links`
-    pairs of platforms numbered from 1, with `link_stiffness` (L,) N/m and `link_damping` (L,) N s/m; `exciter` the
-    platform with the auto-balancer.
+        M_i y_i'' + b_i y_i' + k_i y_i + sum_j [ b_ij (y_i' - y_j') + k_ij (y_i - y_j) ] = force of the loads on platform i
+
+    **Arguments** (n platforms, L links; SI or texts with a unit)
+
+    - `mass` (n,), kg, loads not included; typical: 50 to 5000
+    - `stiffness` (n,) of the supports, N/m; typical: 1e4 to 1e6, 0 for a platform without a support
+    - `damping` (n,) of the supports, N s/m; typical: 20 to 7000, which is 0.01 to 0.05 of the critical damping 2 sqrt(k M); 0
+      for a platform without a support
+    - `links`: L pairs of platforms, numbered from 1
+    - `link_stiffness` (L,), N/m; typical: 5e4 to 5e6
+    - `link_damping` (L,), N s/m; typical: as `damping`
+    - `exciter`: the number of the platform with the auto-balancer
 
     **Returns** `Platforms`. **Raises** `InputError` as `two_mass`, and for a link to a platform that does not exist.
 

@@ -131,14 +131,36 @@ def rotor(
 ) -> Rotor:
     """Return a rigid rotor on two supports, with the loads at one station or at several.
 
-    **Arguments**: `mass` kg, `transverse_inertia` A and `polar_inertia` C kg m^2 without loads; `stiffness` N/m, `damping`
-    N s/m and `position` m (along the axis from the mass centre, one side negative) of the two supports; `stations` m of the
-    loads, one number or one for each load; `stiffness_terms` (c1, c2, c3) and `damping_terms` (b1, b2, b3), lists of three,
-    instead of those of the supports, see `Rotor`.
+        M y'' + b1 y' + b2 theta' + c1 y + c2 theta = forces
+        A theta'' + C w psi' + b2 y' + b3 theta' + c2 y + c3 theta = moments
+        c1 = k1 + k2,    c2 = k1 L1 + k2 L2,    c3 = k1 L1^2 + k2 L2^2
 
-    **Returns** `Rotor`. **Raises** `InputError` for wrong units and values that are not allowed, for supports at one
-    place, for a polar inertia above twice the transverse one, and for terms that no supports can have (negative ones, or
-    c2^2 > c1 c3).
+    The same holds for z and psi, see `Rotor`, and for b1, b2, b3. w is the rotor speed; L1 and L2 are the positions of the
+    supports with their signs.
+
+    **Arguments** (SI or texts with a unit)
+
+    - `mass` M, kg, loads not included; typical: 5 to 50
+    - `transverse_inertia` A about an axis across, kg m^2, loads not included; typical: 0.05 to 1
+    - `polar_inertia` C about the axis of rotation, kg m^2, loads not included, at most 2 A; typical: 0.01 to 0.5
+    - `stiffness` k (2,) of the supports, N/m; typical: 1e5 to 1e6
+    - `damping` (2,) of the supports, N s/m; typical: 100 to 1000
+    - `position` (2,) of the supports along the axis, m from the mass centre, one side negative; typical: 0.1 to 0.5
+    - `stations` of the loads along the axis, m from the mass centre, one number or one for each load; typical: -0.3 to 0.3,
+      default 0
+    - `stiffness_terms` (c1, c2, c3) in N/m, N, N m: a list of three in place of those of the supports; typical: 1e6, up to 2e4,
+      3e4
+    - `damping_terms` (b1, b2, b3) in N s/m, N s, N m s: a list of three in place of those of the supports; typical: 800, up to
+      10, 20
+
+    **Returns** `Rotor`.
+
+    **Raises** `InputError` for
+
+    - wrong units and values that are not allowed
+    - supports at one place
+    - a polar inertia above twice the transverse one
+    - terms that no supports can have (negative ones, or c2^2 > c1 c3)
 
     >>> import jaxvib as jv
     >>> machine = jv.rotor(mass=37.0, transverse_inertia=0.479, polar_inertia=0.093, stiffness=(0.604e6, 0.555e6),
@@ -227,7 +249,13 @@ class PlanarRotor(Machine):
 def planar_rotor(*, mass: Number, stiffness: Number, damping: Number) -> PlanarRotor:
     """Return a rotor that moves across and up on one isotropic support.
 
-    **Arguments**: `mass` kg without loads, `stiffness` N/m, `damping` N s/m.
+        M y'' + b y' + k y = f_y,    M z'' + b z' + k z = f_z
+
+    **Arguments** (SI or texts with a unit)
+
+    - `mass` M, kg, loads not included; typical: 5 to 50
+    - `stiffness` k, N/m; typical: 1e3 for a soft suspension, 1e5 to 1e6 for bearings
+    - `damping` b, N s/m; typical: 50 to 1000
 
     **Returns** `PlanarRotor`. **Raises** `InputError` for wrong units and values that are not allowed.
 

@@ -26,12 +26,19 @@ class Scene(eqx.Module):
 
     `jax.grad`, `jax.vmap` and `jax.jit` apply to every number in it; `equinox.tree_at` replaces one.
 
-    **Arguments**: `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor`, `rotor`; `loads` from
-    `balls`, `rollers`, `pendulums`; `drive` such as `ConstantSpeed`; `effects` such as `Gravity`, once
-    each; `CubicSupport` and `Stop` once for each such support.
+    **Arguments**
 
-    **Raises** `InputError` for a part of the wrong type, an effect that occurs twice and may occur once, a number of stations
-    other than that of the loads, and an effect that cannot act on this machine or these loads.
+    - `machine` from `one_mass`, `two_mass`, `three_mass`, `network`, `planar_rotor` or `rotor`
+    - `loads` from `balls`, `rollers`, `pendulums` or `torus_balls`; typical: 0.1 % to 5 % of the machine's mass
+    - `drive` such as `ConstantSpeed`; typical: 600 to 3000 rpm
+    - `effects` such as `Gravity`, each once; `CubicSupport` and `Stop` once for each such support. typical: none
+
+    **Raises** `InputError` for
+
+    - a part of the wrong type
+    - an effect that occurs twice and may occur once
+    - a number of stations other than that of the loads
+    - an effect that cannot act on this machine or these loads
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -138,15 +138,28 @@ def torus_balls(
 ) -> TorusBalls:
     """Return balls that roll in a tube bent to a ring around the rotor's axis, kappa = 7/5.
 
-    Their first coordinate is the angle about the axis, the second the angle in the cross-section of the tube, see `TorusBalls`.
-    Dry friction is the effect `RollingFriction`, gravity along a vertical axis `Gravity(along="axis")`.
+    Their first coordinate is the angle about the axis. The second is the angle in the cross-section of the tube. `TorusBalls`
+    has the equations. Dry friction is the effect `RollingFriction`, gravity along a vertical axis is `Gravity(along="axis")`.
 
-    **Arguments**: `count` N; `mass` kg of each, one number or N; `radius` R m of the tube's middle line; `tube` m, radius of
-    its cross-section; `ball_radius` r m of a ball, less than `tube`: what is left is the gap in which the ball's angle in the
-    cross-section moves; `drag` N s/m, viscous resistance against the wall, at the ball's centre, one number or N (0).
+    **Arguments** (SI or texts with a unit)
 
-    **Returns** `TorusBalls`. **Raises** `InputError` for wrong units, values that are not positive, a ball that fills its tube
-    or more, a tube wider than its ring, balls that have no room side by side on the outer equator.
+    - `count` N: number of balls, at least 1; typical: 2
+    - `mass` m of a ball, kg, one number or N; typical: 0.03 to 0.1, steel balls of 10 to 15 mm radius
+    - `radius` R of the tube's middle line, m; typical: 0.2
+    - `tube`: radius of the tube's cross-section, m; typical: 0.015
+    - `ball_radius` r of a ball, m, less than `tube`; typical: 0.01 to 0.0145. The difference is the gap in which the ball's
+      angle in the cross-section moves
+    - `drag`: viscous resistance against the wall at the ball's centre, N s/m, one number or N; typical: 0 (the default) in air,
+      0.5 to 5 in oil
+
+    **Returns** `TorusBalls`.
+
+    **Raises** `InputError` for
+
+    - wrong units and values that are not positive
+    - a ball that fills its tube or is larger
+    - a tube wider than its ring
+    - balls that have no room side by side on the outer equator
 
     >>> import jaxvib as jv
     >>> loads = jv.torus_balls(count=2, mass="64 g", radius="200 mm", tube="15 mm", ball_radius="12.5 mm")

@@ -27,10 +27,12 @@ class LoadContact(Effect):
 
         force between centres = max(0, k (2 r - s) - c s'),    s the distance of the centres
 
-    r is the loads' `ball_radius`. On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1
-    follows load j, and load 1 follows the last one a turn later, so there are N pairs. A start has its angles in this order,
-    less than a turn apart; named starts place coincident loads side by side. With several coordinates each pair can touch,
-    s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 of 2 r.
+    r is the loads' `ball_radius`.
+
+    - On a circle s = 2 R sin((phi_{j+1} - phi_j) / 2), and loads never pass each other: load j+1 follows load j, and load 1
+      follows the last one a turn later, so there are N pairs. A start has its angles in this order, less than a turn apart;
+      named starts place coincident loads side by side
+    - With several coordinates each pair can touch, s = |p(u_i) - p(u_j)|, and no two loads may start nearer than 0.9 of 2 r
 
     Two loads on a track at rest separate with the share e of their approach speed, the restitution
 
@@ -40,10 +42,15 @@ class LoadContact(Effect):
     their relative motion, rolling included; friction between loads is neglected. A contact lasts about pi sqrt(mu/k), which
     steps must resolve: equal steps need ten per contact, the default of `ensemble` and `capture`.
 
-    **Arguments**: `stiffness` k N/m; `damping` c N s/m, or instead `restitution` e, above 0, up to 1.
+    **Arguments** (SI or texts with a unit)
 
-    **Raises** `InputError` for values that are not allowed, for damping beside a restitution, and, by the scene, for loads
-    without a ball radius, or with a restitution for loads that differ.
+    - `stiffness` k, N/m, positive; typical: 4e4 to 1e6, softer than steel so that a contact lasts 1 to 10 ms. Ten times the
+      stiffness needs about three times the steps
+    - `damping` c, N s/m, at least 0 (the default); typical: 2 to 200
+    - `restitution` e in place of the damping, above 0, up to 1; typical: 0.3 to 0.9
+
+    **Raises** `InputError` for values that are not allowed and for damping beside a restitution. A scene raises it for loads
+    without a ball radius, and for loads that differ if there is a restitution.
 
     >>> import jaxvib as jv
     >>> float(jv.LoadContact(stiffness=1e6).stiffness)
@@ -75,7 +82,7 @@ class LoadContact(Effect):
         return (LoadInteraction(self.energy, self.resistance, self.validate_start),)
 
     def validate(self, machine: Machine, loads: Loads) -> None:
-        """**Raises** `InputError` for loads without a size, or at several stations."""
+        """**Raises** `InputError` for `loads` without a size, or at several stations of the `machine`."""
         ball_radius(loads, "effects.load_contact")
         if self.restitution is not None and jnp.ndim(loads.mass) > 0:
             raise InputError("effects.load_contact.restitution", "is for loads of one mass; give the damping of their contacts")
@@ -83,7 +90,8 @@ class LoadContact(Effect):
             raise InputError("effects.load_contact", "needs loads on one track; this machine has them at several stations")
 
     def validate_start(self, loads: Loads, u: Coordinates) -> None:
-        """**Raises** `InputError` if loads on a circle are not in order within a turn, or if others overlap."""
+        """**Raises** `InputError` if `loads` on a circle at the coordinates `u` are not in order within a turn, or if others
+        overlap."""
         if not loads.circular:
             self._require_distances(loads, u)
             return
@@ -109,7 +117,7 @@ class LoadContact(Effect):
             raise InputError("start.angle", f"{problem}; start them {size:.4g} m apart, their diameter")
 
     def fastest_rate(self, loads: Loads, speed: Array) -> Array:
-        """Return sqrt(k / mu), the natural frequency of a contact."""
+        """Return sqrt(k / mu), the natural frequency of a contact, rad/s; typical: 300 to 3000."""
         return jnp.sqrt(self.stiffness / self._reduced_mass(loads))
 
     def prepare(self, loads: Loads) -> LoadContact:

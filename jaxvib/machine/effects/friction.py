@@ -54,12 +54,17 @@ class DryFriction(Effect):
     - `"run_up"`: N = m R phi'^2 - 2 m R speed (speed - phi'), as printed for a run-up (its second term mixes frames)
     - `"steady"`: N = m R speed^2, as printed for loads that turn with the rotor
 
-    **Arguments**: `coefficient` mu2 (about 0.0015 for ball bearings); `diameter` d, m, of the bearing; `reaction`; `width`,
-    rad/s, of the sliding speed over which the sign is smoothed, see `sliding_sign`. Viscous bearing friction is the loads'
-    `drag`, mu1 = b_W R^2.
+    Viscous bearing friction is the loads' `drag`, mu1 = b_W R^2; typical: 3e-4 to 2e-3 N m s. The sign of N is that of the
+    motion without this friction. If the sign with friction differs, N is smaller than mu2 times the other forces, and so is the
+    error.
 
-    The sign of N is that of the motion without this friction. If the sign with friction differs, N is smaller than mu2 times
-    the other forces, and so is the error.
+    **Arguments** (SI or texts with a unit)
+
+    - `coefficient` mu2, at least 0; typical: about 0.0015 for ball bearings, 0.001 to 0.005 for rolling bearings
+    - `diameter` d of the bearing, m; typical: 0.005 to 0.05
+    - `reaction`: one of the three names above (default: "exact")
+    - `width`, rad/s, of the sliding speed over which the sign is smoothed, see `sliding_sign`; typical: 0.01 (the default) to
+      1. A smaller width is more exact and needs more steps
 
     **Raises** `InputError` for values that are not allowed.
 
@@ -85,7 +90,7 @@ class DryFriction(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical | None:
-        """Return a ball bearing whose diameter is a fifth of the loads' radius."""
+        """Return the friction of a ball bearing whose diameter is a fifth of the loads' radius."""
         if not loads.circular:
             return None
         assert isinstance(loads, CircularLoads)
@@ -107,7 +112,8 @@ class DryFriction(Effect):
             )
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
-        """Return mu2 d/2 and N."""
+        """Return mu2 d/2 and N of `loads` at `u` with rates `rate`, the rotor at `speed` (rad/s), under gravity `g` by axis
+        (m/s^2)."""
         assert isinstance(loads, CircularLoads)
         turn = rate[0]
         lever = dry_lever(self.coefficient, self.diameter, speed - turn, self.width)

@@ -29,18 +29,22 @@ class RollingFriction(Effect):
 
         Q_u = - (k/r) max(N, 0) J^T d,    v = J (u' - (w, 0, ...)),    d = v tanh(|v|/width)/|v|
 
-    J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w. N is the normal
-    force (`Loads.normal_force`), solved together with the accelerations; r the radius of the load. A load that does not press
-    has no friction. A load that would have to stick under the share s < 1 of the largest friction creeps at width artanh(s),
-    which goes to zero with the width.
+    - J = dp/du. v is the velocity of the load's centre along the wall relative to the rotor, which turns at w
+    - N is the normal force (`Loads.normal_force`), solved together with the accelerations; r is the radius of the load. A load
+      that does not press has no friction
+    - A load that would have to stick under the share s < 1 of the largest friction creeps at width artanh(s), which goes to
+      zero with the width
+    - The sign of N is that of the motion without this friction
 
-    **Arguments**: `coefficient` k, m (about 2e-5 to 4e-5 for steel balls on steel), 0 for none; `direction` "along" the
-    rolling, or "each": for each coordinate separately, d_i = tanh(v_i/width), as printed in the paper, so that motion around
-    the axis does not reduce the friction across it; `width` m/s, over which the sign is smoothed.
+    **Arguments** (SI or texts with a unit)
 
-    The sign of N is that of the motion without this friction.
+    - `coefficient` k, m, at least 0; typical: about 2e-5 to 4e-5 for steel balls on steel, 0 for none
+    - `direction`: "along" the rolling (the default), or "each": for each coordinate separately, d_i = tanh(v_i/width), as
+      printed in the paper, so that motion around the axis does not reduce the friction across it
+    - `width`, m/s, over which the sign is smoothed; typical: 0.01 (the default) to 0.1. A smaller width is more exact and needs
+      more steps
 
-    **Raises** `InputError` for values that are not allowed, and, by the scene, for loads without a ball radius.
+    **Raises** `InputError` for values that are not allowed. A scene raises it for loads without a ball radius.
 
     >>> import jaxvib as jv
     >>> jv.RollingFriction("0.04 mm").direction
@@ -63,7 +67,7 @@ class RollingFriction(Effect):
 
     @classmethod
     def typical(cls, machine: Machine, loads: Loads, speed: Array, amplitude: Array) -> Typical:
-        """Return k of steel on steel."""
+        """Return the friction with k of steel on steel."""
         return Typical(cls(3e-5), "k = 0.03 mm, steel on steel")
 
     def terms(self) -> tuple[Term, ...]:
@@ -75,7 +79,8 @@ class RollingFriction(Effect):
         ball_radius(loads, "effects.rolling_friction")
 
     def friction(self, loads: Loads, u: Coordinates, rate: Coordinates, speed: Array, g: Mapping[int, Array]) -> Friction:
-        """Return -(k/r) J^T d and N."""
+        """Return -(k/r) J^T d and N of `loads` at `u` with rates `rate`, the rotor at `speed` (rad/s), under gravity `g` by
+        axis (m/s^2)."""
         normal_force = loads.normal_force(u, rate, g)
         assert normal_force is not None
         slip = (rate[0] - speed, *rate[1:])
