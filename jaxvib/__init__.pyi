@@ -105,6 +105,9 @@ from jaxvib.results.csv import write_csv
 from jaxvib.results.files import load
 from jaxvib.results.result import Result
 
+# Exchange with other tools
+from jaxvib.exchange.state_space import StateSpace, state_space
+
 __version__: str
 
 __all__ = [
@@ -264,4 +267,7 @@ __all__ = [
     "load",
     "write_csv",
     "html_report",
+    # Exchange with other tools
+    "state_space",
+    "StateSpace",
 ]

@@ -1,0 +1,41 @@
+"""Names and units of what a machine feels and shows, the same in every format."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxvib.machine.carrier import Carrier
+
+__all__ = ["Signal", "coordinate_signals", "force_inputs", "foundation_forces", "signals_of"]
+
+_RATES = ("", "/s", "/s^2")
+
+
+class Signal(NamedTuple):
+    """Name of a quantity, such as "displacement.y1", and its unit."""
+
+    name: str
+    unit: str
+
+
+def coordinate_signals(carrier: Carrier, name: str, order: int) -> tuple[Signal, ...]:
+    """Signals of a derivative of the coordinates: of the order 0, displacements, 1, velocities, or 2, accelerations."""
+    named = zip(carrier.coordinates, carrier.units, strict=True)
+    return tuple(Signal(f"{name}.{coordinate}", unit + _RATES[order]) for coordinate, unit in named)
+
+
+def force_inputs(carrier: Carrier) -> tuple[Signal, ...]:
+    """Signals of the forces on the coordinates: N, of an angle N m."""
+    named = zip(carrier.coordinates, carrier.units, strict=True)
+    return tuple(Signal(f"force.{coordinate}", "N" if unit == "m" else "N m") for coordinate, unit in named)
+
+
+def foundation_forces(carrier: Carrier) -> tuple[Signal, ...]:
+    """Signals of the force on the foundation."""
+    return tuple(Signal(f"foundation_force.{direction}", "N") for direction in carrier.bed_directions)
+
+
+def signals_of(names: Sequence[str], unit: str) -> tuple[Signal, ...]:
+    """Signals of one unit."""
+    return tuple(Signal(name, unit) for name in names)

@@ -1,0 +1,268 @@
+"""State-space models of a machine at rest and of a jam."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.equations.averaged import Amplitudes, averaged_field
+from jaxvib.equations.linear import linear_model
+from jaxvib.errors import InputError, quoted, written
+from jaxvib.exchange.signals import Signal, coordinate_signals, force_inputs, foundation_forces, signals_of
+from jaxvib.machine.drive import ConstantSpeed
+from jaxvib.machine.effects.base import terms_of
+from jaxvib.machine.effects.terms import SupportForce
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
+from jaxvib.numerics.linalg import magnitude
+from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.jam import Jam
+from jaxvib.steady.jams.phases import PhaseJam
+from jaxvib.units import Number, number
+
+if TYPE_CHECKING:
+    import control
+    import scipy.signal
+
+__all__ = ["StateSpace", "state_space"]
+
+_MAX_RESIDUAL = 1e-6
+"""Largest acceleration of a load in a jam, relative to that of its drag alone."""
+
+_AT_REST = (
+    "linear machine with the masses of its loads at their places, at the rotor speed {speed:.6g} rad/s; inputs are forces on "
+    "the coordinates and at the exciter; loads do not turn"
+)
+_IN_JAM = (
+    "averaged equations linearized about a jam at the load speed {omega:.6g} rad/s and the rotor speed {speed:.6g} rad/s; "
+    "signals are deviations from the operating point and change slowly against the vibration; amplitudes are zero to peak; "
+    "the common phase of all loads is left out"
+)
+
+
+class StateSpace(NamedTuple):
+    """Linear model x' = A x + B u, y = C x + D u with named signals.
+
+    **Attributes**
+
+    - `A` (nx, nx), `B` (nx, nu), `C` (ny, nx), `D` (ny, nu), SI units
+    - `states`, `inputs`, `outputs`: a `Signal` (`name`, `unit`) for each entry of x, u and y
+    - `x0`, `u0`, `y0`: the operating point; x, u and y are deviations from it. 0 at rest
+    - `about`: a sentence about the equations
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    x0: np.ndarray
+    u0: np.ndarray
+    y0: np.ndarray
+    about: str
+
+    def poles(self) -> np.ndarray:
+        """Eigenvalues of A, (nx,) complex, 1/s."""
+        return np.linalg.eigvals(self.A)
+
+    def frequency_response(self, omega: Any) -> np.ndarray:
+        """Return C (i w - A)^-1 B + D, amplitudes of outputs per input at the frequencies `omega` (nw,) rad/s, (nw, ny, nu)."""
+        frequencies = np.atleast_1d(np.asarray(omega, float))[:, None, None]
+        inner = np.linalg.solve(1j * frequencies * np.eye(len(self.A)) - self.A, self.B.astype(complex))
+        return self.C @ inner + self.D
+
+    def scipy(self) -> scipy.signal.StateSpace:
+        """Return the model as `scipy.signal.StateSpace`, without names. **Raises** `InputError` if SciPy is not installed."""
+        return _module("scipy.signal", "mat").StateSpace(self.A, self.B, self.C, self.D)
+
+    def control(self) -> control.StateSpace:
+        """Return the model for python-control, with the names of its signals; a point in a name becomes "_".
+
+        **Raises** `InputError` if python-control is not installed (extra `control`).
+        """
+        names = {
+            name: [each.name.replace(".", "_") for each in getattr(self, name)] for name in ("states", "inputs", "outputs")
+        }
+        return _module("control", "control").ss(self.A, self.B, self.C, self.D, **names)
+
+    @validated
+    def save(self, path: str | Path) -> Path:
+        """Write a MAT file (".mat", added if it is missing) that MATLAB, Octave and SciPy read.
+
+        It holds A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names, state_units,
+        input_names, input_units, output_names, output_units.
+
+        **Returns** the path. **Raises** `InputError` for a path that cannot be written to.
+        """
+        path = Path(path)
+        path = path if path.suffix == ".mat" else path.with_name(path.name + ".mat")
+        content: dict[str, Any] = {name: getattr(self, name) for name in ("A", "B", "C", "D", "x0", "u0", "y0", "about")}
+        for kind in ("state", "input", "output"):
+            signals = getattr(self, f"{kind}s")
+            content[f"{kind}_names"] = np.asarray([each.name for each in signals], dtype=object)
+            content[f"{kind}_units"] = np.asarray([each.unit for each in signals], dtype=object)
+        io = _module("scipy.io", "mat")
+        with written(path) as part, part.open("wb") as file:
+            io.savemat(file, content, oned_as="column")
+        return path
+
+
+def _module(name: str, extra: str) -> Any:
+    """A module of an optional package. **Raises** `InputError` with the command that installs it."""
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise InputError(package, f"is not installed; install it with: pip install 'jaxvib[{extra}]'") from error
+
+
+@validated
+def state_space(
+    scene: Scene, at: Literal["rest"] | Jam | PhaseJam = "rest", *, rotor_speed: Number | None = None
+) -> StateSpace:
+    """State-space model of a scene's machine, at rest or in a jam.
+
+    At rest, with the masses of the loads in M and the linear part of nonlinear supports in K and C:
+
+        M q'' + (C + n G) q' + K q = f + P^T f_e,      x = (q, q'),      y = (q, q', q'', T_K q + T_C q')
+
+    In a jam it is the linearization of the averaged equations (`envelope`) about it: states are the complex amplitudes of the
+    carrier (real and imaginary parts), the speeds of the loads and their phases relative to the first one; the input is the
+    rotor speed; outputs are the mean speed of the loads, the amplitudes of the coordinates and of the foundation force. Its
+    poles are those whose largest real part is the `growth` of `phase_jams`.
+
+    **Arguments**: `at` "rest", or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`; `rotor_speed` n, rad/s,
+    of a machine at rest with a gyroscopic matrix (default: the drive's speed).
+
+    **Returns** `StateSpace`.
+
+    **Raises** `InputError` for a jam that does not exist, or is no equilibrium of the averaged equations of this scene, for
+    effects that they leave out, and for a rotor speed beside a jam.
+
+    >>> import jaxvib as jv
+    >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)
+    >>> scene = jv.Scene(machine, jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> model = jv.state_space(scene)
+    >>> [each.name for each in model.inputs], [round(float(x), 2) for x in model.A[1]]
+    (['force.y1', 'exciter.up'], [-784.31, -0.59])
+    """
+    scene = validate_scene(scene)
+    if isinstance(at, (Jam, PhaseJam)):
+        if rotor_speed is not None:
+            raise InputError("rotor_speed", f"is {quoted(rotor_speed)}, but a jam has its own; leave it out")
+        return _in_jam(scene, at)
+    if at != "rest":
+        raise InputError("at", f"is {quoted(at)}; it must be 'rest' or a jam, for example jam_modes(scene).select(3)")
+    speed = scene.drive.speed if rotor_speed is None else number(rotor_speed, "rad/s", "rotor_speed", low=0.0)
+    return _at_rest(scene, speed)
+
+
+def _at_rest(scene: Scene, speed: Array) -> StateSpace:
+    a, b, c, d = map(np.asarray, _rest_matrices(scene, speed))
+    carrier, mounting = scene.machine.structure(), scene.machine.mounting()
+    states = (*coordinate_signals(carrier, "displacement", 0), *coordinate_signals(carrier, "velocity", 1))
+    at_exciter = signals_of([f"exciter.{('across', 'up')[axis]}" for axis in mounting.axes], "N")
+    outputs = (*states, *coordinate_signals(carrier, "acceleration", 2), *foundation_forces(carrier))
+    inputs = (*force_inputs(carrier), *at_exciter)
+    x0, u0, y0 = (np.zeros(len(signals)) for signals in (states, inputs, outputs))
+    return StateSpace(a, b, c, d, states, inputs, outputs, x0, u0, y0, _AT_REST.format(speed=float(speed)))
+
+
+@cached
+def _rest_matrices(scene: Scene, speed: Array) -> tuple[Array, Array, Array, Array]:
+    model = linear_model(scene)
+    carrier, nd = model.carrier, model.mass.shape[0]
+    stiffness, damping = carrier.stiffness, model.damping(speed)
+    foundation = [carrier.bed_stiffness, carrier.bed_damping]
+    rest = jnp.zeros(nd, model.mass.dtype)
+    for term, rows in zip(terms_of(scene.effects, SupportForce), model.supports, strict=True):
+        slopes = [slope @ rows for slope in jax.jacfwd(term.force, (0, 1))(rows @ rest, rows @ rest)]
+        stiffness, damping = stiffness + rows.T @ slopes[0], damping + rows.T @ slopes[1]
+        foundation = [whole + slope for whole, slope in zip(foundation, slopes, strict=True)]
+    forces = jnp.concatenate([jnp.eye(nd, dtype=model.mass.dtype), model.mount.rows[0].T], axis=1)
+    solved = jnp.linalg.solve(model.mass, jnp.concatenate([-stiffness, -damping, forces], axis=1))
+    zero, one = jnp.zeros_like(model.mass), jnp.eye(nd, dtype=model.mass.dtype)
+    still = jnp.zeros_like(forces)
+    a = jnp.block([[zero, one], [solved[:, : 2 * nd]]])
+    b = jnp.concatenate([still, solved[:, 2 * nd :]])
+    c = jnp.concatenate([jnp.eye(2 * nd, dtype=model.mass.dtype), solved[:, : 2 * nd], jnp.concatenate(foundation, axis=1)])
+    d = jnp.concatenate([still, still, solved[:, 2 * nd :], jnp.zeros((len(foundation[0]), forces.shape[1]), forces.dtype)])
+    return a, b, c, d
+
+
+def _in_jam(scene: Scene, jam: Jam | PhaseJam) -> StateSpace:
+    if not np.ndim(jam.omega) == 0 or not np.isfinite(jam.omega):
+        raise InputError("at", f"is no single jam that exists ({jam.message}); take one that does, with select(mode)")
+    scene = Scene(scene.machine, scene.loads, ConstantSpeed(jam.rotor_speed), scene.effects)
+    phase = jam.phase if isinstance(jam, PhaseJam) else jnp.zeros(scene.loads.count)
+    if phase.shape != (scene.loads.count,) or jam.displacement.shape != scene.machine.structure().mass.shape[:1]:
+        raise InputError(
+            "at", "is the jam of a machine with other coordinates or another number of loads; take one of this scene"
+        )
+    averaged_field(scene)  # refuses what the averaged equations leave out before anything is compiled
+    found = jax.tree.map(np.asarray, _jam_matrices(scene, jam.omega, phase, jam.displacement))
+    (a, b, c, d), x0, y0, residual = found
+    if not residual < _MAX_RESIDUAL:
+        problem = f"is no equilibrium of the averaged equations of this scene (relative residual {float(residual):.1e})"
+        raise InputError("at", f"{problem}; take a jam of this scene, of loads that differ one from phase_jams(scene)")
+    carrier, loads = scene.machine.structure(), range(1, scene.loads.count + 1)
+    parts = [("displacement", 0), ("velocity", 1)]
+    states = [signal for name, order in parts for part in ("real", "imaginary")
+              for signal in coordinate_signals(carrier, f"{part}_{name}", order)]  # fmt: skip
+    states += [
+        *signals_of([f"rate.load{j}" for j in loads], "rad/s"),
+        *signals_of([f"phase.load{j}" for j in loads[1:]], "rad"),
+    ]
+    outputs = [Signal("load_speed", "rad/s"), *coordinate_signals(carrier, "amplitude", 0), *foundation_forces(carrier)]
+    about = _IN_JAM.format(omega=float(jam.omega), speed=float(jam.rotor_speed))
+    inputs = (Signal("rotor_speed", "rad/s"),)
+    return StateSpace(a, b, c, d, tuple(states), inputs, tuple(outputs), x0, np.atleast_1d(jam.rotor_speed), y0, about)
+
+
+@cached
+def _jam_matrices(
+    scene: Scene, omega: Array, phase: Array, displacement: Array
+) -> tuple[tuple[Array, Array, Array, Array], Array, Array, Array]:
+    """A, B, C, D; the operating point of states and outputs; the residual of the loads' equations."""
+    nd, count, carrier = displacement.shape[0], phase.shape[0], linear_model(scene).carrier
+
+    def amplitudes(x: Array) -> Amplitudes:
+        y = x[: 2 * nd], x[2 * nd : 4 * nd]
+        relative = jnp.concatenate([jnp.zeros_like(x[:1]), x[4 * nd + count :]])
+        rate = x[4 * nd : 4 * nd + count]
+        return Amplitudes(jax.lax.complex(y[0][:nd], y[0][nd:]), jax.lax.complex(y[1][:nd], y[1][nd:]), rate, relative)
+
+    def flow(x: Array, speed: Array) -> Array:
+        moving = amplitudes(x)
+        change = averaged_field(eqx.tree_at(lambda s: s.drive.speed, scene, speed))(jnp.zeros_like(omega), moving)
+        # Amplitudes turn with the mean angle of the loads; here they turn with the first load.
+        turn = 1j * change.phase[0]
+        rates = [change.displacement - turn * moving.displacement, change.velocity - turn * moving.velocity]
+        parts = [part for rate in rates for part in (rate.real, rate.imag)]
+        return jnp.concatenate([*parts, change.rate, change.phase[1:] - change.phase[0]])
+
+    def outputs(x: Array, speed: Array) -> Array:
+        moving = amplitudes(x)
+        force = carrier.bed_force(moving.displacement, moving.velocity)
+        return jnp.concatenate([jnp.mean(moving.rate)[None], magnitude(moving.displacement), magnitude(force)])
+
+    turned = displacement * jnp.exp(-1j * phase[0])
+    velocity = 1j * omega * turned
+    x = [turned.real, turned.imag, velocity.real, velocity.imag, jnp.full_like(phase, omega), phase[1:] - phase[0]]
+    x, speed = jnp.concatenate(x), scene.drive.speed
+    (a, b), (c, d) = jax.jacfwd(flow, (0, 1))(x, speed), jax.jacfwd(outputs, (0, 1))(x, speed)
+    field = averaged_field(scene)
+    drag = jnp.max(field.drag * jnp.abs(speed - omega) / field.inertia)
+    residual = jnp.max(jnp.abs(flow(x, speed)[4 * nd : 4 * nd + count])) / drag
+    return (a, b[:, None], c, d[:, None]), x, outputs(x, speed), residual

@@ -1,0 +1,124 @@
+"""State-space models against branches, whirl, averaged growth and finite differences."""
+
+import control
+import numpy as np
+import pytest
+import scipy.io
+import scipy.signal
+from scenes import ROTOR, scene
+
+import jaxvib as jv
+from jaxvib.equations.averaged import Amplitudes, averaged_field
+
+UNBALANCE = 3 * 0.8 * 0.12
+EFFECTS = (jv.CubicSupport(1e9, platform=1), jv.Stop(1e6, gap=0.01, platform=2))
+
+
+def rotor_scene():
+    return jv.Scene(jv.rotor(**ROTOR), jv.pendulums(count=4, mass=0.05, radius=0.08, drag=0.1), jv.ConstantSpeed(460.0))
+
+
+def rows(model, name):
+    return [k for k, each in enumerate(model.outputs) if each.name.startswith(name)]
+
+
+def test_frequency_response_equals_branches():
+    found, model = jv.branches(scene()), jv.state_space(scene())
+    omega = np.asarray(found.omega)
+    response = model.frequency_response(omega)[:, :, 2] * (-1j * UNBALANCE * omega**2)[:, None]
+    moved = response[:, rows(model, "displacement")]
+    assert np.max(np.abs(moved - found.displacement) / np.abs(found.displacement)) < 1e-10
+    force = np.abs(response[:, rows(model, "foundation_force")[0]])
+    np.testing.assert_allclose(force, found.foundation_force, rtol=1e-10)
+
+
+def test_force_at_exciter_equals_force_on_its_platform():
+    model = jv.state_space(scene("three_mass"))
+    assert [each.name for each in model.inputs] == ["force.y1", "force.y2", "force.y3", "exciter.up"]
+    assert np.array_equal(model.B[:, 2], model.B[:, 3]) and np.array_equal(model.D[:, 2], model.D[:, 3])
+
+
+def test_poles_equal_whirl():
+    model, whirl = jv.state_space(rotor_scene(), rotor_speed=300.0), jv.whirl(rotor_scene(), [300.0])
+    expected = -np.asarray(whirl.decay[0]) + 1j * np.asarray(whirl.speed[0])
+    poles = model.poles()
+    np.testing.assert_allclose(np.sort_complex(poles[poles.imag > 0]), np.sort_complex(expected), rtol=1e-10)
+
+
+def test_nonlinear_supports_at_rest_have_no_part():
+    plain, supported = jv.state_space(scene()), jv.state_space(scene(effects=EFFECTS))
+    assert all(np.array_equal(one, two) for one, two in zip(plain[:4], supported[:4], strict=True))
+
+
+@pytest.mark.parametrize("mode", [3, 4, 5])
+def test_poles_of_a_jam_equal_its_growth(mode):
+    jams = jv.phase_jams(scene())
+    jam = jv.jam_modes(scene()).select(mode)
+    growth = float(jams.growth[np.argmin(np.abs(jams.omega - jam.omega) + np.max(np.abs(jams.phase), axis=1))])
+    assert np.max(jv.state_space(scene(), jam).poles().real) == pytest.approx(growth, rel=1e-8)
+
+
+def test_jam_of_opposite_loads_has_its_growth():
+    jams = jv.phase_jams(scene())
+    for k in range(len(jams.omega)):
+        jam = jams.select(k)
+        assert np.max(jv.state_space(scene(), jam).poles().real) == pytest.approx(float(jam.growth), rel=1e-7)
+
+
+def test_jam_outputs_follow_the_jam_over_rotor_speed():
+    modes = [jv.jam_modes(scene(speed=n)).select(3) for n in (120.0, 119.99, 120.01)]
+    model = jv.state_space(scene(), modes[0])
+    steady = model.D - model.C @ np.linalg.solve(model.A, model.B)
+    values = [np.array([m.omega, *m.amplitude, m.foundation_force]) for m in modes]
+    np.testing.assert_allclose(steady[:, 0], (values[2] - values[1]) / 0.02, rtol=1e-5)
+    np.testing.assert_allclose(model.y0, values[0], rtol=1e-9)
+
+
+def test_jam_model_follows_the_averaged_equations():
+    jam = jv.jam_modes(scene()).select(3)
+    model, field, step = jv.state_space(scene(), jam), averaged_field(scene()), 1e-6
+
+    def flow(x):
+        y, v = x[0:2] + 1j * x[2:4], x[4:6] + 1j * x[6:8]
+        at = field(0.0, Amplitudes(y, v, x[8:11], np.concatenate([[0.0], x[11:]])))
+        y, v = at.displacement - 1j * at.phase[0] * y, at.velocity - 1j * at.phase[0] * v
+        return np.concatenate([y.real, y.imag, v.real, v.imag, at.rate, at.phase[1:] - at.phase[0]])
+
+    for k, direction in enumerate(step * np.eye(len(model.x0))):
+        column = (flow(model.x0 + direction) - flow(model.x0 - direction)) / (2.0 * step)
+        assert np.max(np.abs(column - model.A[:, k])) < 1e-6 * np.max(np.abs(model.A))
+
+
+def test_mat_file_is_read_back_bit_for_bit(tmp_path):
+    model = jv.state_space(scene())
+    read = scipy.io.loadmat(model.save(tmp_path / "machine"), simplify_cells=True)
+    assert all(read[name].tobytes() == np.asarray(getattr(model, name)).tobytes() for name in "ABCD")
+    assert list(read["input_names"]) == ["force.y1", "force.y2", "exciter.up"] and list(read["input_units"]) == ["N"] * 3
+    assert read["about"] == model.about and str(read["output_units"][-1]) == "N"
+
+
+def test_other_packages_have_the_same_response():
+    model, omega = jv.state_space(scene()), 37.0
+    expected = model.frequency_response(omega)[0]
+    ours = model.control()
+    np.testing.assert_allclose(ours(1j * omega), expected, rtol=1e-12)
+    assert ours.input_labels[0] == "force_y1" and ours.output_labels[-1] == "foundation_force_up"
+    assert isinstance(model.scipy(), scipy.signal.StateSpace) and np.array_equal(model.scipy().B, model.B)
+    time, moved, _ = scipy.signal.lsim(model.scipy(), np.eye(3)[:1].repeat(200, 0), np.linspace(0.0, 0.2, 200))
+    np.testing.assert_allclose(control.forced_response(ours, time, np.eye(3)[:1].repeat(200, 0).T).outputs, moved.T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda s: jv.state_space(s, "jam"), "at is 'jam'; "),
+        (lambda s: jv.state_space(s, jv.jam_modes(s).select(1, throw=False)), "at is no single jam that exists"),
+        (lambda s: jv.state_space(s, jv.jam_modes(scene("one_mass")).select(1, throw=False)), "at is "),
+        (lambda s: jv.state_space(s, jv.jam_modes(scene(load="rollers")).select(3)), "at is no equilibrium of the averaged"),
+        (lambda s: jv.state_space(s, jv.jam_modes(s).select(3), rotor_speed=3.0), "rotor_speed is 3.0, but a jam has its own"),
+        (lambda s: jv.state_space(s).save("/none/x.mat"), "path is '/none/x.mat', which cannot be written"),
+    ],
+)
+def test_wrong_arguments_end_in_one_sentence(call, says):
+    with pytest.raises(jv.InputError, match="^" + says.replace("(", r"\(")):
+        call(scene())
