@@ -117,14 +117,16 @@ class Dynamics(eqx.Module):
 
 @validated
 def vector_field(scene: Scene) -> Dynamics:
-    """The right-hand side of the scene's equations of motion.
+    """Return the right-hand side of a scene's equations of motion.
 
         M q'' + (C + speed G) q' + K q + sum_j m_j B_j^T (B_j q'' + d^2 p_j/dt^2) = what the effects add
         kappa m J^T J u'' + kappa m J^T (dJ/dt) u' + m J^T B_j q'' = Q_u        (J = dp/du, for each load)
         J_r theta'' = T(theta') - what loads and imbalance take off              (under a motor)
 
-    **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative; `jit`, `vmap` and
-    `grad` go through it and through the scene.
+    **Arguments**: `scene`, on any machine, with any drive and effects.
+
+    **Returns** `Dynamics`, a pure function of time (s) and `State` that gives the state's time derivative. `jit`, `vmap` and
+    `grad` go through it and through the scene. The cost of an evaluation grows in proportion to the number of loads.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -157,11 +157,14 @@ def jammed_model(scene: Scene) -> JammedModel:
 
 @validated
 def natural_frequencies(scene: Scene) -> Array:
-    """Undamped natural frequencies of the carrier with its loads, ascending, (nd,) rad/s.
+    """Return the undamped natural frequencies of the carrier with its loads, ascending, (nd,) rad/s.
 
         det(K - w^2 (M + sum_j m_j B^T B)) = 0
 
-    Derivatives are finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
+    **Arguments**: `scene`; only its machine and its loads count.
+
+    **Returns** an array (nd,), rad/s; typical: 10 to 100 for platforms on springs, 100 to 500 for rotors. Derivatives are
+    finite for equal frequencies, and taken as 0 at frequency 0 (a carrier that is free to drift).
 
     **Raises** `ComputationError` (status "lost_digits") if rounding hides a frequency, as that of a soft spring beside a link
     1e8 times as stiff does in single precision; under a JAX transformation it is NaN.

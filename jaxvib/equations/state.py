@@ -11,9 +11,11 @@ __all__ = ["Spin", "State"]
 class Spin(eqx.Module):
     """Free rotation of rolling loads, if effects release it (`FreeSpin`, `Sliding`); also the time derivative of one.
 
-    **Attributes**: `drilling` (count,) rad/s, a load's spin about the normal of its contact, relative to its track; `slip`, a
-    (count,) array m/s for each coordinate of a load, the velocity of its point of contact relative to the track along that
-    coordinate. Each is None if no effect releases it.
+    **Attributes** (each is None if no effect releases it)
+
+    - `drilling` (count,), rad/s: a load's spin about the normal of its contact, relative to its track
+    - `slip`: a (count,) array, m/s, for each coordinate of a load: the velocity of its point of contact relative to the track
+      along that coordinate
     """
 
     drilling: Array | None = None
@@ -23,10 +25,14 @@ class Spin(eqx.Module):
 class State(eqx.Module):
     """Positions and velocities of all parts; also the time derivative of such a state.
 
-    **Attributes**: `displacement` q (nd,) m and `velocity` q' (nd,) m/s of the carrier's coordinates; `angle` and `rate`, a
-    tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),) in rad and rad/s;
-    `rotor` the rotor's angle and speed, rad and rad/s, where a motor drives it, None under an ideal drive; `spin` of the loads
-    where effects make it free, see `Spin` and `with_spin`, else None.
+    **Attributes**
+
+    - `displacement` q (nd,), m, and `velocity` q' (nd,), m/s, of the carrier's coordinates; tilts in rad and rad/s; typical:
+      0.1 to 10 mm
+    - `angle` and `rate`: a tuple of (count,) arrays, one for each coordinate of a load: for loads on a circle ((phi_1, ...),)
+      in rad and rad/s
+    - `rotor`: the rotor's angle and speed, rad and rad/s, if a motor drives it; None under an ideal drive
+    - `spin` of the loads if effects release it, see `Spin` and `with_spin`; otherwise None
     """
 
     displacement: Array

@@ -71,15 +71,20 @@ class EnsembleStatus(eqx.Enumeration):
 class Ensemble(Result):
     """Ends of many runs.
 
-    **Attributes** (B runs): `state` a `State` whose arrays have a leading axis over the runs, at the end, in single precision
-    with angles within a turn; `load_speed` (B, count) rad/s, the mean speed of each load over the last quarter of the run;
-    `error` (B,) estimated, as that of a `Run` but for the end state alone, each run's displacements relative to its own
-    largest: NaN where no estimate was asked for or the motion did not stay finite, infinite where 4 steps or fewer leave no
-    larger ones to compare with; `allowed` (B,) false if `make` put a number into a scene that its constructor would not take;
-    `finite` (B,) whether the motion stayed so; `resolved` (B,) false
-    if explicit steps are too long for what decays fastest; `detached` (B, count) whether a load's track, which
-    holds it by pressing alone, would have had to pull it at any stage of any step; `steps` each run took; `seconds` all of it
-    took, compiling included where a program was new, NaN under a JAX transformation.
+    **Attributes** (B runs)
+
+    - `state`: a `State` whose arrays have a leading axis over the runs, at the end; in single precision with angles within a
+      turn
+    - `load_speed` (B, count), rad/s: the mean speed of each load over the last quarter of the run
+    - `error` (B,), estimated: as that of a `Run`, but for the end state alone, each run's displacements relative to its own
+      largest. NaN if no estimate was requested or the motion did not stay finite; infinite if 4 steps or fewer leave no larger
+      ones to compare with; typical: below 1e-6 with the default steps
+    - `allowed` (B,): False if `make` put a number into a scene that its constructor would not take
+    - `finite` (B,): True if the motion stayed finite
+    - `resolved` (B,): False if explicit steps are too long for the fastest decay
+    - `detached` (B, count): True if a load's track, which only pushes, would have had to pull the load at any stage of any step
+    - `steps` that each run took
+    - `seconds` that all runs took, compilation included if a program was new; NaN under a JAX transformation
     """
 
     state: State = eqx.field(metadata=part("run", fields=STATE))
@@ -104,7 +109,7 @@ class Ensemble(Result):
         return jax.vmap(one)(self.allowed, self.finite, self.detached, self.resolved)
 
     def summary(self) -> str:
-        """Text of the outcomes, the load speeds and the errors of the runs."""
+        """Return the outcomes, the load speeds and the errors of the runs as text."""
         finite = np.asarray(self.finite)
         head = f"{self.message}; {int(self.steps)} steps each, {float(self.seconds):.3g} s in all"
         if not np.any(finite):
@@ -115,7 +120,7 @@ class Ensemble(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """The mean speed of each load in `unit`, over the runs.
+        """Plot the mean speed of each load in `unit` over the runs.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -137,28 +142,30 @@ def ensemble(
     batch: int = BATCH_SIZE,
     equations: Equations = vector_field,
 ) -> Ensemble:
-    """Integrates many scenes, or one scene from many starts, from 0 to `until` with equal steps.
+    """Integrate many scenes, or one scene from many starts, from 0 to `until` with equal steps.
 
-    Runs advance together, `batch` at a time, every number of the state a contiguous array over them, and chunks are spread over
-    all cores, or all graphics processors; under a JAX transformation they follow each other. Equal steps keep runs together
-    that would wait for each other otherwise; near the boundary between two outcomes they also keep the choice of steps from
-    deciding. Other values need no new program where `make` is the same function and the same numbers are shared by all runs,
-    nor does the integration of another number of runs above `batch`; a function written in the call is another one each time.
-    In single precision angles are kept within a turn while time is integrated, so that long runs keep their phase.
+    - Runs advance together, `batch` at a time, every number of the state a contiguous array over them. Chunks are spread over
+      all cores, or all graphics processors; under a JAX transformation they follow each other
+    - Equal steps keep runs together that would wait for each other otherwise. Near the boundary between two outcomes they also
+      keep the choice of steps from deciding
+    - Other values need no new program if `make` is the same function and the same numbers are shared by all runs, nor does
+      another number of runs above `batch`. A function written in the call is another one each time
+    - In single precision angles are kept within a turn while time is integrated, so that long runs keep their phase
 
     **Arguments**
 
-    - `make`: gives a run's `Scene`, which starts at rest, or its scene and `State`, from one entry of `values`; it is compiled
-      as by `jax.jit`, so what it refers to besides must stay what it was at the first call
-    - `values`: an array with a leading axis over the runs, or a tree of them
-    - `until`: end time, s or text, of all runs
-    - `stepsize_controller`: `EqualSteps(n)`, how many each run takes, rounded up to a multiple of 4; the default is 4 for each
-      radian of what moves fastest, and more if loads decay by drag, or the carrier by damping, faster than these resolve: from
-      100 times as fast on all runs take implicit steps, 32 for each radian
-    - `estimate`: whether to estimate errors by a second run with half as many steps, which needs more than 4
-    - `batch`: how many runs advance together
-    - `equations`: a function that gives a scene's equations of motion, a module that is called as `vector_field`'s; another one
-      where a printed model is to be compared with the scene's own
+    - `make`: returns a run's `Scene`, which starts at rest, or its scene and `State`, from one entry of `values`. It is
+      compiled as by `jax.jit`, so everything else that it refers to must stay as it was at the first call
+    - `values`: an array with a leading axis over the runs, or a tree of them; typical: 64 to 100,000 runs
+    - `until`: end time of all runs, s or text; typical: 5 to 60
+    - `stepsize_controller`: `EqualSteps(n)`, the number of steps of each run, rounded up to a multiple of 4. The default is 4
+      for each radian of the fastest motion, and more if loads decay by drag, or the carrier by damping, faster than these
+      resolve: from 100 times as fast on all runs take implicit steps, 32 for each radian. The time grows in proportion to n
+    - `estimate`: True to estimate errors by a second run with half as many steps, which needs more than 4; it adds half the
+      time
+    - `batch`: number of runs that advance together; typical: the default. A larger batch needs more memory in proportion
+    - `equations`: a function that returns a scene's equations of motion, a module that is called as that of `vector_field`;
+      another one to compare a printed model with the scene's own
 
     **Returns** `Ensemble`. Derivatives go through it in forward mode.
 

@@ -55,7 +55,7 @@ _TURNS, _SAMPLES = 3.0, 4096
 
 
 class GrowthStatus(eqx.Enumeration):
-    """Growth of small disturbances; the members are the sentences a user reads."""
+    """Growth of small disturbances. Each member is the sentence shown to the user."""
 
     regular = "small disturbances do not grow exponentially: derivatives of the motion mean what they say"
     unstable = "the motion repeats itself and is unstable: small disturbances grow exponentially until it is left"
@@ -70,10 +70,10 @@ class Growth(Result):
 
     - `status`: a `GrowthStatus`
     - `exponent`: the largest Lyapunov exponent, 1/s, and its standard error `uncertainty`, over the later half of the stretches
-    - `horizon`: time in s after which rounding is as large as the motion itself, ln(1/eps)/exponent: a derivative with respect
-      to a number of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite
-      for a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
-    - `rates`: (stretches,) 1/s of each stretch, which end at `time` s
+    - `horizon`, s: time after which rounding is as large as the motion itself, ln(1/eps)/exponent. A derivative with respect to
+      a number of the scene has grown by 1/eps then, and says nothing about a change that is larger than rounding. Infinite for
+      a regular motion; for an undecided one the shortest that the rates allow, ln(1/eps)/(exponent + 3 uncertainty)
+    - `rates` (stretches,), 1/s: of each stretch; the stretches end at `time`, s
     """
 
     status: GrowthStatus
@@ -84,14 +84,14 @@ class Growth(Result):
     time: np.ndarray = eqx.field(metadata=in_unit("s", "time"))
 
     def summary(self) -> str:
-        """The exponent and the horizon, for a person to read."""
+        """Return the exponent and the horizon as text."""
         least = "at least " if self.status_name == "undecided" else ""
         lasts = "" if math.isinf(self.horizon) else f", horizon {least}{self.horizon:.3g} s"
         return f"{self.message}: largest Lyapunov exponent {self.exponent:.3g} +- {self.uncertainty:.1g} 1/s{lasts}"
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Draw the rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the rate of each stretch and the exponent over time. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import growth_chart  # slow to import
 
         return growth_chart(self.time, self.rates, self.exponent, self.uncertainty, ax=ax)
@@ -111,10 +111,10 @@ def growth(
 
         exponent = mean of ln(d_k / d_0) / T over the later stretches of length T
 
-    A second motion starts at the distance d_0 and is put back to it after each stretch, in the direction that it has come to
-    (Benettin's method). Derivatives of a run grow at the same rate: if it is positive, no derivative of a run that is longer
-    than the horizon says anything, however exactly it is computed; ask for those of shorter runs, of averages over many
-    starts, or of exact motions (`jam_orbit`).
+    A second motion starts at the distance d_0. After each stretch it is put back to this distance, in its current direction
+    (Benettin's method). Derivatives of a run grow at the same rate. If it is positive, no derivative of a run that is longer
+    than the horizon says anything, however exactly it is computed. Use derivatives of shorter runs, of averages over many
+    starts, or of exact motions (`jam_orbit`) then.
 
     The later half of the run decides, with G the logarithm of the growth over it and s its standard error:
 
@@ -124,12 +124,17 @@ def growth(
     - "regular": G + 3 s < ln 1000 and G < 2 s, or, if G < ln 2.1, the rates fade as those of a growth in proportion to time do
     - "undecided": everything else, for example a rate that is certain in a run in which it does not reach ln 1000
 
-    A motion that leaves an unstable one during the run, as every motion does sooner or later for rounding, is judged by the
-    motion that it has come to.
+    A motion that leaves an unstable one during the run, as every motion does sooner or later by rounding, is judged by the
+    motion that it reaches.
 
-    **Arguments**: `until` s or text, about how long all stretches are together; each is a whole number of turns of the rotor;
-    `start`, `mode`, `apart` as `simulate`; `stretches`, 8 at least: so many that motions a rounding apart are not far apart
-    after one.
+    **Arguments**
+
+    - `scene` with a drive of constant speed
+    - `until`, s or text: approximate length of all stretches together; each is a whole number of turns of the rotor; typical:
+      20 to 200
+    - `start`, `mode`, `apart` as `simulate`
+    - `stretches`, at least 8; typical: 40 (the default). They must be so many that motions a rounding apart are not far apart
+      after one
 
     **Returns** `Growth`. **Raises** `InputError` for a drive whose speed changes; `ComputationError` for a run that fails.
 

@@ -44,7 +44,7 @@ def _detached(scene: Scene, kept: Trajectory) -> Array:
 
 
 class RunStatus(eqx.Enumeration):
-    """Outcomes of a run; the members are the sentences a user reads."""
+    """Outcomes of a run. Each member is the sentence shown to the user."""
 
     done = "the run reached its end"
     max_steps_reached = "the run did not reach its end in the steps it was allowed"
@@ -61,21 +61,28 @@ class RunStatus(eqx.Enumeration):
 
 
 class Run(AbstractMeasured, Result):
-    """A run of a scene: what was measured over its last turns (see `AbstractMeasured`), and the motion itself.
+    """Run of a scene: the quantities measured over its last turns (see `AbstractMeasured`), and the motion itself.
 
-    **Attributes**: `status` a `RunStatus`; `trajectory` evenly spaced states over the whole run, None where only the window
-    was asked for; `window` the densely sampled end of the run, over which was measured; `steps` taken and how many of them
-    were `rejected`; `error` estimated, NaN where none was asked for, infinite where it cannot be told; `scene` that ran;
-    `together`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even where
-    that is unstable. If such a motion repeats itself, the linearized equations are asked whether loads a little apart leave it;
-    its status is then `would_separate`, and it is not `settled`. What it cost, the runs with
-    larger steps that were made for its error included: `evaluations` of the vector field (0 where the method does not say) and
-    `seconds`, compiling included where the program was new, NaN under a JAX transformation.
+    **Attributes**
 
-    The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles
-    in rad, speeds of loads relative to the rotor's. It is what is left of the difference to a run with larger steps, of which
-    not all is counted on to vanish with smaller ones, and twice of it where an effect is not `smooth`; rounding counts too. A
-    motion that forgets its phase has a large error and may have exact amplitudes all the same.
+    - `status`: a `RunStatus`
+    - `trajectory`: evenly spaced states over the whole run; None if only the window was requested
+    - `window`: the densely sampled end of the run, over which quantities are measured
+    - `steps` taken, and how many of them were `rejected`
+    - `error`, estimated; NaN if no estimate was requested, infinite if it cannot be estimated; typical: 1e-8 to 1e-5
+    - `scene` that ran
+    - `together`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even if
+      that is unstable. If such a motion repeats itself, the linearized equations show whether loads a little apart leave it;
+      its status is then `would_separate`, and it is not `settled`
+    - `evaluations` of the vector field (0 if the method does not count them) and `seconds`: the cost, including the runs with
+      larger steps for the error, and compilation if the program was new; `seconds` is NaN under a JAX transformation
+
+    The `error` is that of everything in the window at the end: displacements and velocities relative to the largest, angles in
+    rad, speeds of loads relative to the rotor's.
+
+    - It is the part of the difference to a run with larger steps that may remain with smaller ones, and twice of it if an
+      effect is not `smooth`; rounding counts too
+    - A motion that forgets its phase has a large error and may have exact amplitudes all the same
     """
 
     status: RunStatus
@@ -91,7 +98,7 @@ class Run(AbstractMeasured, Result):
 
     @property
     def settled(self) -> Array:
-        """True if the motion repeats itself, as far as amplitudes and speed tell, and loads a little apart do not leave it."""
+        """True if the motion repeats itself, judged by amplitudes and speed, and loads a little apart do not leave it."""
         return (self.drift < 1e-3) & (self.status != RunStatus.would_separate)
 
     @property
@@ -101,7 +108,7 @@ class Run(AbstractMeasured, Result):
         return functools.reduce(operator.or_, (self.status == end for end in ends))
 
     def summary(self) -> str:
-        """Text of the run; amplitudes zero to peak."""
+        """Return the outcome of the run as text; amplitudes zero to peak."""
         error = "error not estimated" if np.isnan(self.error) else f"estimated error {float(self.error):.1e}"
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
@@ -141,10 +148,10 @@ class Run(AbstractMeasured, Result):
 
     @property
     def detached(self) -> Array:
-        """When each load first did not press on a track that holds it by pressing alone, (count,) s, as far as states are kept.
+        """Time at which each load first did not press on a track that only pushes, (count,) s, among the kept states.
 
-        NaN for a load that pressed throughout, and for loads that are held from both sides. The equations go on as if the load
-        stayed on its track, so that what comes after it is no motion of a real one.
+        NaN for a load that pressed throughout, and for loads that are held from both sides. The equations continue as if the
+        load stayed on its track, so the computed motion after this time is not that of a real load.
         """
         if not self.scene.loads.one_sided:
             return jnp.asarray(np.full(self.scene.loads.count, np.nan), self.window.time.dtype)
@@ -152,13 +159,17 @@ class Run(AbstractMeasured, Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
-        """Time histories: platforms, load speeds against the rotor's, foundation force. To the left the whole run as bands
-        between its peaks (the window if nothing else was kept), to the right its last three periods, where phases are seen.
+        """Plot time histories: platforms, speeds of loads and rotor, foundation force.
 
-        **Arguments**: `unit` of speeds, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto, as many as there are panels, by rows.
+        To the left the whole run as bands between its peaks (the window if nothing else was kept), to the right its last three
+        periods, which show the phases.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or
-        number of axes.
+        **Arguments**
+
+        - `unit` of speeds, "rad/s", "rpm" or "Hz"
+        - `ax`: axes to draw onto, as many as there are panels, by rows
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit or number of axes.
         """
         from jaxvib.draw.motion.histories import time_histories  # slow to import: only who draws pays
 
@@ -172,20 +183,23 @@ class Run(AbstractMeasured, Result):
 
     @validated
     def spectrum(self, parts: int = 1) -> Spectrum:
-        """Frequencies of the motion: over the window, or from piece to piece over `parts` pieces of the whole run, each of
-        which shares its halves with its neighbours.
+        """Return the frequencies of the motion over the window, or over `parts` pieces of the whole run.
 
-        **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked. **Raises** `InputError` for
-        more parts than there are samples for, and for several where the run kept its window only.
+        **Arguments**: `parts`: number of pieces, each of which shares its halves with its neighbours; typical: 10 to 60 for a
+        run-up. More pieces resolve time better and frequency worse.
+
+        **Returns** `Spectrum`; of several parts its figure is a waterfall, with resonances marked.
+
+        **Raises** `InputError` for more parts than there are samples for, and for several parts if the run kept its window
+        only.
         """
         return spectrum_of(self.scene, self.window, self.trajectory, parts)
 
     @validated
     def plot_path(self, *, ax: Axes | None = None) -> Drawn:
-        """The path of a rotor's axis across and up over the last three periods, mm; of one that tilts at every station.
+        """Plot the path of a rotor's axis across and up over the last three periods, mm; at every station if the rotor tilts.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves
-        up and down only.
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for a machine that moves up and down only.
         """
         from jaxvib.draw.motion.histories import last_periods  # slow to import: only who draws pays
         from jaxvib.draw.motion.spectra import path_chart

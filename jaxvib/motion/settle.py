@@ -69,36 +69,39 @@ def settle(
 ) -> Run:
     """Simulate one stretch after another until amplitudes and speed no longer change, or change without a trend.
 
-    Jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged by its last
-    32 stretches (of 100 slow periods; more where they are shorter): it is steady in the mean where the means of amplitudes,
-    force and speed over each quarter of them differ by no more than their scatter explains, or by half the `drift` that is
-    told, and the drift shows no fall. Its status is then `beating`.
+    Two kinds of motion never repeat themselves and count as settled too:
 
-    Four loads or more, or three with an imbalance, balance the rotor in a whole family of arrangements (`balanced_states`), and
-    nothing but small disturbances such as gravity moves them along it, for hours. If they balance the rotor, free vibrations
-    of the carrier have decayed, and over four stretches the loads creep evenly while their unbalance does not change, the
-    status is `creeping`.
+    - `beating`: jammed loads and an imbalance, which turns faster, beat; some motions wander for ever. Such a motion is judged
+      by its last 32 stretches (of 100 slow periods; more if they are shorter). It is steady in the mean if the means of
+      amplitudes, force and speed over each quarter of them differ by no more than their scatter explains, or by half the given
+      `drift`, and the drift does not fall
+    - `creeping`: four loads or more, or three with an imbalance, balance the rotor in a whole family of arrangements
+      (`balanced_states`), and nothing but small disturbances such as gravity moves them along it, for hours. If they balance
+      the rotor, free vibrations of the carrier have decayed, and over four stretches the loads creep evenly while their
+      unbalance does not change, the status is `creeping`
 
     **Arguments**
 
-    - `start`, `mode`: as `simulate`; unless said otherwise near the jam mode `mode`, at rest where none is named
+    - `scene` with a drive of constant speed
+    - `start`, `mode`: as `simulate`; default: near the jam mode `mode`, at rest without a mode
     - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
-    - `drift`: the change that counts as none, see `Measured`; if it is given the motion must come to less. The default is 1e-6,
-      in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too. What the motion is still away
-      from its end, estimated from the slowest decay of the carrier or from how the drift falls, must be below ten times as
-      much: with little damping a motion changes slowly long before it has settled
-    - `periods` of the lowest natural frequency a stretch is about long; at most so many `stretches`
+    - `drift`: the change that counts as none, see `Measured`; typical: 1e-3 to 1e-8. If it is given the motion must come to
+      less. The default is 1e-6, in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too.
+      The estimated distance of the motion from its end, from the slowest decay of the carrier or from the fall of the drift,
+      must be below ten times as much: with little damping a motion changes slowly long before it has settled
+    - `periods` of the lowest natural frequency: approximate length of a stretch; typical: 100 (the default)
+    - `stretches`: their largest number; typical: 200 (the default); 1 to 3 suffice at damping ratios of 0.05 to 0.01
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-9)`, in single precision 1e-5
-    - `throw`: raise if the motion has not settled by then, otherwise the last run says so by its `drift`, and by its status
-      where it failed
+    - `throw`: raise if the motion has not settled by then; otherwise the `drift` of the last run shows it, or its status if it
+      failed
 
-    A motion that only loads at exactly one angle keep does not pass for settled: if they start at one angle (`apart=0`), its
+    A motion that only loads at exactly one angle keep does not count as settled: if they start at one angle (`apart=0`), its
     status is `would_separate`, see `Run`.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
-    **Raises** `ComputationError` (status "not_settled", or "left_mode" where the loads went to another
-    mode than they began in), `InputError` for a drive whose speed changes; as `simulate` besides.
+    **Raises** `ComputationError` (status "not_settled", or "left_mode" if the loads went to another mode than they began in),
+    `InputError` for a drive whose speed changes; further errors as `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -55,40 +55,52 @@ def simulate(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = True,
 ) -> Run:
-    """Integrates the full equations of motion of `scene` from 0 to `until` and measures what comes out.
+    """Integrate the full equations of motion of a scene from 0 to `until`, and measure the end of the run.
 
     **Arguments**
 
-    - `until`: end time, s or text such as "20 s"
-    - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly
-      over the time `spin_up`, half of `until` unless said otherwise), or a `State`; see `initial_state`
+    - `scene` to integrate, see `vector_field` for its equations
+    - `until`: end time, s or text such as "20 s"; typical: 5 to 60 s, that is 100 or more vibrations
+    - `start`: "rest", "jam" (near the jam mode with number `mode`), "spin_up" (at rest, the rotor's speed rising smoothly over
+      the time `spin_up`; default: half of `until`), or a `State`; see `initial_state`
+    - `mode`: number of the jam mode for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
+    - `spin_up`, s; typical: 1 to 20
     - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads that
       start at exactly one angle (`apart=0`) stay at one angle (`Run.together`); if that motion repeats itself but is unstable
       against their separation, the status is `would_separate`
-    - `save`: "all" keeps `samples` evenly spaced states (unless said otherwise 16384, for runs of more than 1024 turns of the
-      rotor 262144, and 2000 under a JAX transformation); "window" keeps no trajectory, only what is measured
-    - `turns`: how many periods of the lowest natural frequency the measuring window at the end is long (at most half the run,
-      and 256 turns of the rotor)
-    - `estimate`: whether the run's `error` is estimated, by a second run with larger steps (half as many evaluations again);
-      the default is to do so where all numbers are known, that is not under a JAX transformation, and
-      steps are not chosen by a controller of diffrax
-    - `stepsize_controller`: how steps are chosen: `Tolerance(1e-8)` by the error that each may make (the default, in single
-      precision 1e-5); `Accuracy(1e-4)` by the `error` that the result may have: the run is repeated with smaller tolerances
-      until its estimated error is below it, 6 times at most, or fails as `not_accurate`; `EqualSteps(2000)` so many equal
-      ones; or a step size controller of diffrax
-    - `solver`, `adjoint`: diffrax's, passed through; the defaults are `Rodas4` for known scenes whose loads (or carrier) decay
-      100 times as fast as anything moves, otherwise Dormand and Prince's method of order 8 as `UnrolledDopri8`, in large scenes
-      and JAX transformations `LoopDopri8`, and reverse derivatives of the very steps that were taken. Forward derivatives,
-      `diffrax.ForwardMode()`, take less time for up to about ten parameters
-    - `max_steps`: the run fails after so many steps; unless said otherwise 500 for each turn of what moves fastest, under a JAX
-      transformation of the scene 2^20. A reverse derivative keeps a time for each of them: say fewer for large batches
-    - `progress_meter`: diffrax's, shows how much of the time is done
-    - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status says so
+    - `save`: "all" keeps `samples` evenly spaced states; "window" keeps no trajectory, only the measured quantities
+    - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
+      typical: 20 for each vibration. They cost memory, hardly time
+    - `turns`: length of the measuring window at the end, in periods of the lowest natural frequency (at most half the run, and
+      256 turns of the rotor); typical: 20 (the default)
+    - `estimate`: True to estimate the run's `error` by a second run with larger steps (half as many evaluations again). The
+      default is True if all numbers are known, that is not under a JAX transformation, and steps are not chosen by a controller
+      of diffrax
+    - `stepsize_controller`: how steps are chosen, see below
+    - `solver`, `adjoint`: those of diffrax, passed through. The defaults are `Rodas4` for known scenes whose loads (or carrier)
+      decay 100 times as fast as anything moves, otherwise Dormand and Prince's method of order 8 as `UnrolledDopri8`, in large
+      scenes and JAX transformations `LoopDopri8`; and reverse derivatives of the very steps that were taken. Forward
+      derivatives, `diffrax.ForwardMode()`, take less time for up to about ten parameters
+    - `max_steps`: the run fails after this number of steps; default: 500 for each turn of the fastest motion, under a JAX
+      transformation of the scene 2^20. A reverse derivative keeps a time for each of them: give fewer for large batches
+    - `progress_meter` of diffrax, which shows the finished share of the time
+    - `throw`: raise if the run fails; otherwise, and under a JAX transformation, its status shows the failure
 
-    **Returns** `Run`, which carries its estimated `error` and its cost. Gradients, forward and reverse, go through all of it;
-    `jit` and `vmap` too. In single precision angles are kept within a turn while time is integrated, those of the window are
-    counted from a turn at its beginning, and runs of more than 20,000 turns under a constant speed that keep a window only are
-    cut into stretches, so that they do not lose phase.
+    Choices of `stepsize_controller`:
+
+    - `Tolerance(1e-8)`: by the error that each step may make (the default, in single precision 1e-5); typical: 1e-6 to 1e-10
+    - `Accuracy(1e-4)`: by the `error` that the result may have; typical: 1e-3 to 1e-8. The run is repeated with smaller
+      tolerances until its estimated error is below it, 6 times at most, or fails as `not_accurate`. An error of 1e-8 takes
+      about twice the time of an error of 1e-4
+    - `EqualSteps(2000)`: this number of equal steps; typical: 4 for each radian of the fastest motion
+    - a step size controller of diffrax
+
+    **Returns** `Run`, which carries its estimated `error` and its cost.
+
+    - Gradients, forward and reverse, go through all of it; `jit` and `vmap` too
+    - In single precision angles are kept within a turn while time is integrated, those of the window are counted from a turn at
+      its beginning, and runs of more than 20,000 turns under a constant speed that keep a window only are cut into stretches,
+      so that they do not lose phase
 
     **Raises** `InputError` for values that are not allowed, `ComputationError` for a run that does not finish.
 

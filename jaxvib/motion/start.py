@@ -53,21 +53,22 @@ def initial_state(
 
     **Arguments**
 
-    - `start`: "rest" (platforms in equilibrium, loads at rest about the bottom of their track), "spin_up" (the same
-      state; `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
-    - `mode`: number of the jam mode, for "jam"
+    - `scene` of the state
+    - `start`: "rest" (platforms in equilibrium, loads at rest about the bottom of their track), "spin_up" (the same state;
+      `simulate` lets the rotor's speed rise smoothly with it), or "jam" (on the leading-order motion of a jam mode)
+    - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles`: the loads' angles about the rotor's axis, rad, (count,); or one number for the middle of all loads, in place of
-      the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle
-    - `apart`: angle between neighbouring loads, rad; loads that touch (`LoadContact`) start so much further apart than side by
-      side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0 in a jam, whose theory is
-      about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at exactly one angle
-      (`apart=0`) stay at one angle, even where the motion is unstable against their separation
-    - `throw`: raise where the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
+      the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle; typical: -pi to pi
+    - `apart`: angle between neighbouring loads, rad; typical: 0.02. Loads that touch (`LoadContact`) start this much further
+      apart than side by side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0 in a
+      jam, whose theory is about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at
+      exactly one angle (`apart=0`) stay at one angle, even if the motion is unstable against their separation
+    - `throw`: raise if the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
 
-    **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that
-    does not exist at the scene's rotor speed.
+    **Returns** `State`. **Raises** `InputError` for an unknown name or a missing mode, `ComputationError` for a mode that does
+    not exist at the scene's rotor speed.
 
     >>> import jaxvib as jv
     >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
@@ -139,15 +140,20 @@ def _in_jam(omega: Array, displacement: Array, row: Array | np.ndarray, angle: A
 
 @validated
 def with_spin(scene: Scene, state: State, turning: Turning = "rolling") -> State:
-    """The state with the loads' own rotation, as far as effects of the scene make it free; one that has it stays as it is.
-
-    **Arguments**: `turning` "rolling", for loads that roll on their track and do not spin on it, or "still", for loads that do
-    not turn in space, so that their contact slides where the scene has `Sliding`:
+    """Return the state with the loads' own rotation, if effects of the scene release it; a state that has one stays as it is.
 
         c = p' - w axis x (p + r n),    s = - w axis . n        (n the normal of the contact)
 
-    **Returns** `State`. **Raises** `InputError` for another word, and for a spin that the scene does not make free or of a
-    wrong shape.
+    **Arguments**
+
+    - `scene` whose effects release the rotation (`FreeSpin`, `Sliding`)
+    - `state` without it
+    - `turning`: "rolling" (the default), for loads that roll on their track and do not spin on it, or "still", for loads that
+      do not turn in space, so that their contact slides if the scene has `Sliding`, as in the equation; typical: slips of 5 to
+      50 m/s for "still"
+
+    **Returns** `State`. **Raises** `InputError` for another name, and for a spin that the scene does not release or of a wrong
+    shape.
 
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> loads = jv.balls(count=1, mass=0.1, radius=0.2, drag=0.0, ball_radius=0.01)

@@ -28,6 +28,11 @@ class Tolerance:
     Natural units are the unbalance radius S/M of the loads for displacements, that times the rotor's speed for velocities, and
     1 rad for angles, whose error is never relative.
 
+    **Arguments**: `tolerance`; typical: 1e-6 to 1e-10 in double precision, 1e-5 in single. The methods of order 8 need about
+    1.8 times the steps for a hundredth of the tolerance.
+
+    **Raises** `InputError` for a value that is no real number.
+
     >>> import jaxvib as jv
     >>> jv.Tolerance(1e-6)
     Tolerance(tolerance=1e-06)
@@ -43,6 +48,10 @@ class Tolerance:
 class Accuracy:
     """Steps of such a size that the estimated `error` of the whole result is at most this; found by repeated runs.
 
+    **Arguments**: `error`, relative; typical: 1e-3 to 1e-8. An error of 1e-8 takes about twice the time of an error of 1e-4.
+
+    **Raises** `InputError` for a value that is no real number.
+
     >>> import jaxvib as jv
     >>> jv.Accuracy(1e-4)
     Accuracy(error=0.0001)
@@ -57,6 +66,11 @@ class Accuracy:
 @dataclass(frozen=True)
 class EqualSteps:
     """A number of steps of equal length.
+
+    **Arguments**: `number` of steps; typical: 4 for each radian of the fastest motion, 25 for each turn. The time grows in
+    proportion to it.
+
+    **Raises** `InputError` for a value that is no real number.
 
     >>> import jaxvib as jv
     >>> jv.EqualSteps(2000)

@@ -47,7 +47,7 @@ _BALANCED = 0.02
 
 
 class RegimeName(eqx.Enumeration):
-    """Kinds of motion; the members are the sentences a user reads."""
+    """Kinds of motion. Each member is the sentence shown to the user."""
 
     swinging = "the loads swing and do not go round"
     jammed = "the loads are jammed: they turn together, slower than the rotor"
@@ -62,21 +62,24 @@ REGIMES = enumeration_names(RegimeName)
 
 
 class Regime(Result):
-    """The kind of motion over a stretch, and what it was judged by.
+    """Kind of motion over a part of a run, with the evidence for it.
 
     **Attributes**
 
-    - `name`: a `RegimeName`; `pattern`: a `PhasePattern` of the loads
-    - `load_speed` (count,) mean speeds over whole turns and `rotor_speed`, rad/s; `ripple` half of peak to peak of the loads'
-      speed, the largest
-    - `phase` (count,) rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
-    - `unbalance`: what loads and rotor together leave out of balance in the rotor's frame, relative to the loads' own together
-    - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed` rad/s
-    - `mode`: the jam mode, 0 where the loads are not jammed: 2 k falls from the k-th natural frequency, the last one below the
-      loads' mean speed, 2 k + 1 rises from there to the next one, or to the rotor's speed where that is less; it is the one
-      whose end the loads are nearer to, so that beyond the last of nd frequencies close to the rotor it is 2 nd + 1
-    - `caught`: whether the rotor itself is held at a resonance, below the speed that its motor would give it without a load
-    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's
+    - `name`: a `RegimeName`
+    - `pattern`: a `PhasePattern` of the loads
+    - `load_speed` (count,): mean speeds over whole turns, and `rotor_speed`, rad/s
+    - `ripple`: half of peak to peak of the loads' speed, the largest, rad/s
+    - `phase` (count,), rad: mean angle of each load relative to the first one (jammed) or to the rotor (turning with it)
+    - `unbalance`: remaining unbalance of loads and rotor in the rotor's frame, relative to that of all loads; balanced below
+      0.02
+    - `resonance`: number of the natural frequency nearest to the loads' mean speed, counted from 1; `resonance_speed`, rad/s
+    - `mode`: the jam mode, 0 if the loads are not jammed. 2 k falls from the k-th natural frequency, the last one below the
+      loads' mean speed. 2 k + 1 rises from there to the next one, or to the rotor's speed if that is less. The mode is the one
+      whose end is nearer to the loads, so beyond the last of nd frequencies close to the rotor it is 2 nd + 1
+    - `caught`: True if the rotor itself is held at a resonance, below the speed that its motor would give it without a load
+    - `change`: largest change of a load's mean speed from the first to the second half, relative to the rotor's; steady below
+      0.003
     """
 
     name: RegimeName
@@ -94,21 +97,21 @@ class Regime(Result):
 
     @property
     def status(self) -> RegimeName:
-        """The `name`: what is known of the motion is what kind it is."""
+        """The `name`: the status of a regime is the kind of motion."""
         return self.name
 
     @property
     def label(self) -> str:
-        """The name's own word: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
+        """Short name of the regime: "swinging", "jammed", "unbalanced", "balanced", "parted" or "unsettled"."""
         return status_name(self.name)
 
     @property
     def pattern_label(self) -> str:
-        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        """Short name of the pattern: "together", "opposite", "spread" or "other"."""
         return status_name(self.pattern)
 
     def summary(self) -> str:
-        """The name and its evidence, for a person to read."""
+        """Return the name and its evidence as text."""
         pattern = sentence(self.pattern)
         speeds = ", ".join(f"{float(w):.5g}" for w in self.load_speed)
         evidence = [f"loads {speeds} rad/s, rotor {float(self.rotor_speed):.5g} rad/s, ripple {float(self.ripple):.2g} rad/s"]
@@ -144,15 +147,23 @@ class Regime(Result):
 
 @validated
 def regime(scene: Scene, stretch: Trajectory) -> Regime:
-    """Names the motion over a stretch of a run of `scene`, such as `run.window`.
+    """Return the kind of motion over a part of a run.
 
-    Loads that go round by less than a turn swing. Loads whose mean speed differs from the rotor's by less than 0.3 % turn with
-    it, unless they fall behind steadily: by more than 0.1 rad over the stretch, and by the same slip, to 2 %, in both halves.
-    They are balanced where loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about tilts
-    where there are stations). Loads at one other speed, their relative phases fixed, are jammed. A speed that changes by more
-    than 0.3 % of the rotor's from one half of the stretch to the other is not steady.
+    - Loads that go round by less than a turn swing
+    - Loads whose mean speed differs from the rotor's by less than 0.3 % turn with it, unless they fall behind steadily: by more
+      than 0.1 rad over the part, and by the same slip, to 2 %, in both halves
+    - They are balanced if loads and rotor together leave less than 2 % of the loads' own unbalance (static, and about tilts if
+      there are stations)
+    - Loads at one other speed with fixed relative phases are jammed
+    - A speed that changes by more than 0.3 % of the rotor's from one half of the part to the other is not steady
 
-    **Returns** `Regime`; `jit` and `vmap` go through it.
+    **Arguments**
+
+    - `scene` of the run
+    - `stretch`: a `Trajectory`, such as `run.window`; typical: 20 or more turns
+
+    **Returns** `Regime`; `jit` and `vmap` go through it. Its `name` is "unsettled" if the motion is not steady; nothing is
+    raised.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -36,9 +36,15 @@ class Spectrum(Result):
 
     A piece is weighted by Hann's window; a vibration of constant amplitude has a peak of that height, zero to peak, to 2 %.
 
-    **Attributes** (P pieces, nf frequencies): `time` (P,) s, the middles of the pieces; `frequency` (nf,) rad/s; `amplitude`
-    (P, nf, nd) m, of tilts rad; `force` (P, nf, nb) N on the bed; `rotor_speed` and `load_speed` (P,) rad/s, means of the
-    pieces; `resonances` (nd,) rad/s; `coordinates` and `units` (nd,) their names and units.
+    **Attributes** (P pieces, nf frequencies)
+
+    - `time` (P,), s: the middles of the pieces
+    - `frequency` (nf,), rad/s; its resolution is about 2 pi over the length of a piece
+    - `amplitude` (P, nf, nd), m, of tilts rad
+    - `force` (P, nf, nb), N, on the foundation
+    - `rotor_speed` and `load_speed` (P,), rad/s: means of the pieces
+    - `resonances` (nd,), rad/s
+    - `coordinates` and `units` (nd,): names of the coordinates, and their units
     """
 
     status = Computed.done
@@ -54,7 +60,7 @@ class Spectrum(Result):
     units: tuple[str, ...] = eqx.field(static=True, metadata=in_unit("", "coordinate", name="unit"))
 
     def summary(self) -> str:
-        """The strongest frequency of each coordinate in the last piece, for a person to read."""
+        """Return the strongest frequency of each coordinate in the last piece as text."""
         last = self.amplitude[-1]
         peaks = np.argmax(last, axis=0)
         lines = [
@@ -74,13 +80,18 @@ class Spectrum(Result):
         unit: SpeedUnit = "rad/s",
         ax: Axes | None = None,
     ) -> Drawn:
-        """Plot amplitudes over frequency for one piece; for several pieces a waterfall over time, darker for larger amplitudes.
-        Resonances, the rotor's speed and the loads' are marked.
+        """Plot amplitudes over frequency for one piece, or a waterfall over time for several, darker for larger amplitudes.
 
-        **Arguments**: `show` displacements or the force on the bed; `coordinate` by name, in a waterfall the one that moves
-        most unless said otherwise; `unit` of frequencies, "rad/s", "rpm" or "Hz"; `ax` axes to draw onto.
+        Resonances and the speeds of rotor and loads are marked.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for other words.
+        **Arguments**
+
+        - `show`: displacements or the force on the foundation
+        - `coordinate` by name; default in a waterfall: the one that moves most
+        - `unit` of frequencies, "rad/s", "rpm" or "Hz"
+        - `ax`: axes to draw onto
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for other names.
         """
         from jaxvib.draw.motion.spectra import spectrum_chart, waterfall_chart  # slow to import: only who draws pays
 

@@ -140,25 +140,31 @@ def envelope(
     max_steps: int = 2**16,
     throw: bool = True,
 ) -> Envelope:
-    """Integrates the averaged equations of `scene` from 0 to `until`: amplitudes and load speeds in place of vibrations.
+    """Integrate the averaged equations of a scene from 0 to `until`: amplitudes and load speeds in place of vibrations.
 
-    A run-up through resonances, a capture or a passage takes steps of many turns. What it answers is the limit of light
-    loads: its relative error is of first order in their share of the mass times the dynamic magnification, and about as large
-    as the result's `ripple`; its equilibria are those of `jam_modes`. `averaged_field` has the equations.
+    A run-up through resonances, a capture or a passage takes steps of many turns. The result is the limit of light loads:
 
-    Near the line between capture and passage the smallest difference decides: there ask `simulate`.
+    - its relative error is of first order in the loads' share of the mass times the dynamic magnification, and about as large
+      as the result's `ripple`; typical: 1e-3 to 0.1
+    - its equilibria are those of `jam_modes`
+    - near the line between capture and passage the smallest difference decides: use `simulate` there
+
+    `averaged_field` has the equations.
 
     **Arguments**
 
-    - `until`, `start`, `mode`, `apart`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase:
-      loads that start apart separate if the averaged motion at one angle is unstable
-    - `save`: "all" keeps `samples` evenly spaced times; "window" keeps only what is measured
-    - `stepsize_controller`: `Tolerance`, the error a step may make, relative to the largest amplitude, and absolute in natural
-      units, for rates the rotor's speed, for phases 1 rad (1e-4 by default); or a step size controller of diffrax
-    - `solver`: diffrax's, for stiff systems; `Rodas4` unless said otherwise
-    - `max_steps`: the run fails after so many steps
+    - `scene`, without effects other than gravity
+    - `until`, s; typical: 5 to 600
+    - `start`, `mode`, `apart`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: loads that
+      start apart separate if the averaged motion at one angle is unstable
+    - `save`: "all" keeps `samples` (default 256) evenly spaced times; "window" keeps only the measuring window
+    - `stepsize_controller`: `Tolerance`, the error that a step may make, relative to the largest amplitude, and absolute in
+      natural units, for rates the rotor's speed, for phases 1 rad; typical: 1e-3 to 1e-6, default 1e-4. Or a step size
+      controller of diffrax
+    - `solver` of diffrax for stiff systems; default: `Rodas4`
+    - `max_steps`: the run fails after this number of steps; typical: 2^16 (the default)
 
-    Gravity has no mean torque on a load that turns; where one turns too slowly against it, or its drag does not lift it from
+    Gravity has no mean torque on a load that turns. If a load turns too slowly against it, or its drag does not lift it from
     the bottom of its track, the status is `not_turning`. Effects other than gravity are refused.
 
     **Returns** `Envelope`. Gradients, forward and reverse, go through all of it; `jit` and `vmap` too.

@@ -24,7 +24,7 @@ __all__ = ["Envelope", "EnvelopeStatus", "Envelopes"]
 
 
 class EnvelopeStatus(eqx.Enumeration):
-    """Outcomes of an averaged run; the members are the sentences a user reads."""
+    """Outcomes of an averaged run. Each member is the sentence shown to the user."""
 
     done = "the averaged run reached its end"
     max_steps_reached = "the averaged run did not reach its end in the steps it was allowed"
@@ -58,12 +58,16 @@ class Envelopes(eqx.Module):
 
 
 class Envelope(AbstractMeasured, Result):
-    """An averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
+    """Averaged run of a scene: the quantities of `AbstractMeasured` over the last turns, and the averaged motion.
 
-    **Attributes**: those of `AbstractMeasured`; `status` an `EnvelopeStatus`; `ripple` (count,) rad, by how much the vibration
-    that averaging leaves out shakes each load's angle, largest over the window: amplitudes and speeds are off by a share of
-    about this size; `trajectory` and `window` as `Envelopes`, the former None where only the window was asked for; `steps`,
-    `rejected`; `scene`.
+    **Attributes**: those of `AbstractMeasured`, and
+
+    - `status`: an `EnvelopeStatus`
+    - `ripple` (count,), rad: amplitude by which the vibration that averaging leaves out shakes each load's angle, largest over
+      the window. Amplitudes and speeds are off by a share of about this size; typical: 1e-3 to 0.1
+    - `trajectory` and `window`: `Envelopes`; the former None if only the window was requested
+    - `steps` taken, and `rejected`
+    - `scene`
     """
 
     ripple: Array = eqx.field(metadata=in_unit("rad", "load"))
@@ -80,7 +84,7 @@ class Envelope(AbstractMeasured, Result):
         return (self.drift < 1e-3) & (self.status != EnvelopeStatus.would_separate)
 
     def summary(self) -> str:
-        """Text of the run; amplitudes zero to peak."""
+        """Return the outcome of the run as text; amplitudes zero to peak."""
         unstable, first = bool(self.status == EnvelopeStatus.would_separate), []
         speeds = ", ".join(f"{float(w):.6g}" for w in self.load_speed)
         state = "settled" if bool(self.settled) else "not settled: run longer"
@@ -101,8 +105,9 @@ class Envelope(AbstractMeasured, Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
-        """Amplitudes, load speeds against the rotor's, amplitude of the foundation force, over time; arguments as
-        `Run.plot`.
+        """Plot amplitudes, load and rotor speeds, and the amplitude of the foundation force over time.
+
+        **Arguments**: `unit` and `ax` as `Run.plot`.
         """
         from jaxvib.draw.motion.histories import amplitude_histories  # slow to import: only who draws pays
 
