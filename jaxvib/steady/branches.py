@@ -32,9 +32,9 @@ __all__ = ["Branches", "branches"]
 
 
 class Branches(AbstractJam):
-    """The branch diagram: the arrays of `AbstractJam` along the load speed Omega, ascending, a leading axis over the points.
+    """Branch diagram: the arrays of `AbstractJam` along the load speed Omega, ascending, with a leading axis over the points.
 
-    Adds `resonances` (nd,) rad/s, the `folds`, and the `scene`.
+    **Additional attributes**: `resonances` (nd,), rad/s, the `folds` of the branch, and the `scene`.
     """
 
     outer_axes = ("point",)
@@ -44,7 +44,7 @@ class Branches(AbstractJam):
     scene: Scene = eqx.field(metadata=SCENE)
 
     def summary(self) -> str:
-        """The ranges of the branch, its resonances and its folds, for a person to read."""
+        """Return the ranges of the branch, its resonances and its folds as text."""
         folds = zip(
             *(np.asarray(x)[np.asarray(self.folds.exists)] for x in (self.folds.omega, self.folds.rotor_speed)), strict=True
         )
@@ -59,15 +59,19 @@ class Branches(AbstractJam):
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,
     ) -> Drawn:
-        """Load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable dashed;
-        where the scene's rotor speed crosses them, jams stand with the numbers of their modes.
+        """Plot load speed, amplitudes (zero to peak) and foundation force over the rotor's speed; stable solid, unstable
+        dashed.
 
-        **Arguments**: `unit` of the speeds on the axes, "rad/s", "rpm" or "Hz"; `most` the greatest rotor speed shown, rad/s (a
-        third above the scene's unless said otherwise); `show` which panels, such as `("force",)`; `ax` axes to draw onto, as
-        many as there are panels.
+        Jams at the scene's rotor speed are marked with the numbers of their modes.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or
-        number of axes.
+        **Arguments**
+
+        - `unit` of the speeds on the axes, "rad/s", "rpm" or "Hz"
+        - `most`: the greatest rotor speed shown, rad/s; default: a third above the scene's
+        - `show`: names of the panels, such as `("force",)`
+        - `ax`: axes to draw onto, as many as there are panels
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit, panel or number of axes.
         """
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
@@ -103,15 +107,23 @@ def branches(
     least: Number | None = None,
     accuracy: float = 1e-8,
 ) -> Branches | ExactBranches:
-    """The branch n(Omega) of jams of coincident loads through all its folds: of light loads, or `exact`.
+    """Return the branch n(Omega) of jams of coincident loads through all its folds: of light loads, or `exact`.
 
-    For light loads n(Omega) is explicit (`jam_rotor_speed`); either way every point is computed for itself: nothing is
-    followed, nothing missed.
+        n(Omega) = Omega + (mean braking torque of the vibration on the loads) / sum b_W R^2      (light loads, no dry friction)
 
-    **Arguments**: `points` along Omega, crowded about the resonances; `most` the greatest load speed, rad/s or text (a third
-    above the scene's rotor speed unless said otherwise); `exact` the periodic motions of the full equations in place of their
-    limit for light loads, with Floquet multipliers and all special points: then also `least` load speed (a fifth of the lowest
-    resonance) and relative `accuracy` of the rotor speeds.
+    For light loads n(Omega) is explicit (`jam_rotor_speed`). Every point is computed on its own, also of the exact branch: no
+    continuation, so no part of the branch is missed.
+
+    **Arguments**
+
+    - `scene`; its rotor speed only determines the default of `most`
+    - `points` along Omega, crowded about the resonances, at least 2; typical: 200 to 2000 (the default). The time grows in
+      proportion
+    - `most`: the greatest load speed, rad/s or text; default: a third above the scene's rotor speed
+    - `exact`: True for the periodic motions of the full equations in place of their limit for light loads, with Floquet
+      multipliers and all special points
+    - `least`: the least load speed, with `exact`; default: a fifth of the lowest resonance
+    - `accuracy` of the rotor speeds, relative, with `exact`; typical: 1e-4 to 1e-8 (the default)
 
     **Returns** `Branches`, or `ExactBranches` if `exact`. **Raises** `InputError` for fewer than 2 points or a speed that is
     not positive.

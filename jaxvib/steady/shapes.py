@@ -27,9 +27,16 @@ __all__ = ["ModeShapes", "mode_shapes"]
 
 
 class ModeShapes(Result):
-    """Undamped free vibrations, ascending: `frequency` (nd,) rad/s; `shape` (nd, nd), a row a mode, the amplitude of each
-    coordinate relative to the largest, tilts in rad times their `lever` (nd,) m, the radius of gyration (1 for lengths);
-    `coordinates` (nd,)."""
+    """Undamped free vibrations, by ascending frequency.
+
+    **Attributes**
+
+    - `frequency` (nd,), rad/s
+    - `shape` (nd, nd), a row for each mode: the amplitude of each coordinate relative to the largest, tilts in rad times their
+      `lever`
+    - `lever` (nd,), m: the radius of gyration of a tilt (1 for lengths)
+    - `coordinates` (nd,): their names
+    """
 
     status = Computed.done
 
@@ -39,7 +46,7 @@ class ModeShapes(Result):
     coordinates: tuple[str, ...] = eqx.field(static=True)
 
     def summary(self) -> str:
-        """A line a mode, for a person to read."""
+        """Return a line of text for each mode."""
         rows = zip(np.asarray(self.frequency), np.asarray(self.shape), strict=True)
         parts = [
             f"{w:.6g} rad/s: " + ", ".join(f"{name} {x:+.3f}" for name, x in zip(self.coordinates, row, strict=True))
@@ -49,7 +56,7 @@ class ModeShapes(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """The shapes as bars, a group for each mode with its frequency in `unit`.
+        """Plot the shapes as bars, a group for each mode with its frequency in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -60,11 +67,15 @@ class ModeShapes(Result):
 
 @validated
 def mode_shapes(scene: Scene) -> ModeShapes:
-    """Natural frequencies and mode shapes of the machine with its loads on it, no damping, rotor at rest.
+    """Return the natural frequencies and mode shapes of the machine with its loads on it, no damping, rotor at rest.
 
         K X = w^2 (M + sum_j m_j B^T B) X
 
-    **Returns** `ModeShapes`. **Raises** `InputError` for what is no scene.
+    **Arguments**: `scene`; only its machine and its loads count.
+
+    **Returns** `ModeShapes`; typical: frequencies of 10 to 100 rad/s for platforms, 100 to 500 rad/s for rotors.
+
+    **Raises** `InputError` for an argument that is no scene.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -39,7 +39,7 @@ units of the rounding."""
 
 
 class WhirlStatus(eqx.Enumeration):
-    """Outcome of a computation of whirls; the members are the sentences a user reads."""
+    """Outcomes of a computation of whirls. Each member is the sentence shown to the user."""
 
     done = "the answer was computed"
     refused = REFUSED
@@ -82,9 +82,9 @@ class Whirl(Result):
     **Attributes** (ns rotor speeds, nd natural motions each, ascending in speed)
 
     - `rotor_speed`: (ns,) rad/s
-    - `speed`: (ns, nd) rad/s of the whirl, 0 where damping allows no oscillation
-    - `decay`: (ns, nd) 1/s, negative where the motion grows. An overdamped motion has two decays; this is the smaller, of the
-      displacement that creeps back. Several of them come by rising decay
+    - `speed`: (ns, nd) rad/s of the whirl, 0 if damping allows no oscillation
+    - `decay`: (ns, nd) 1/s, negative if the motion grows. An overdamped motion has two decays; this is the smaller, of the
+      displacement that creeps back. Several of them are ordered by rising decay
     - `forward`: (ns, nd) True if it goes round with the rotor, False if it turns against it or not at all
     - `critical`: the synchronous speeds
     - `status`: a `WhirlStatus`; motions that rounding hides are NaN
@@ -98,7 +98,7 @@ class Whirl(Result):
     critical: CriticalSpeeds = eqx.field(metadata=part(prefix="critical_"))
 
     def summary(self) -> str:
-        """The whirls at each rotor speed, and the critical speeds, for a person to read."""
+        """Return the whirls at each rotor speed, and the critical speeds, as text."""
         lines = []
         for n, *whirls in zip(*map(np.asarray, (self.rotor_speed, self.speed, self.forward)), strict=True):
             shown = ", ".join(f"{w:.6g}{_sense_word(w, f)}" for w, f in zip(*whirls, strict=True))
@@ -108,8 +108,11 @@ class Whirl(Result):
 
     @validated
     def plot(self, *, at: float | None = None, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """The Campbell diagram: whirl speeds over the rotor's speed, forward and backward, the synchronous line with the
-        critical speeds on it, and the speed `at` which the rotor runs, rad/s, where it is given. Speeds are drawn in `unit`.
+        """Plot the Campbell diagram: whirl speeds over the rotor's speed, forward and backward, with the synchronous line.
+
+        Critical speeds are marked on the synchronous line, and the rotor's working speed if `at` is given.
+
+        **Arguments**: `at`, rad/s; `unit` of the speeds; `ax`: axes to draw onto.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -124,16 +127,19 @@ class Whirl(Result):
 
 @validated
 def whirl(scene: Scene, rotor_speed: Numbers | None = None, *, loads: Weights = "fixed") -> Whirl:
-    """Whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
+    """Return the whirl speeds of the scene's rotor, with its damping, at each of some rotor speeds.
 
         (K + i w (C + n G) - w^2 M) X = 0,      q = Re(X exp(i w t)),  w complex
 
     The eigenvalues are those of the first-order form; n is the rotor's speed.
 
-    **Arguments**: `rotor_speed` rad/s, one or a list (the drive's unless said otherwise); `loads` "fixed" counts the loads'
-    masses where they run, "none" leaves them out.
+    **Arguments**
 
-    **Returns** `Whirl`. Gradients go through speeds and decays where no two are equal.
+    - `scene` with a machine that moves in two directions
+    - `rotor_speed`, rad/s, one or a list (default: the drive's); typical: 50 values from 0 to 500 for a Campbell diagram
+    - `loads`: "fixed" counts the loads' masses where they run (the default), "none" leaves them out
+
+    **Returns** `Whirl`. Gradients go through speeds and decays if no two are equal.
 
     **Raises** `InputError` for a machine that does not move in two directions or has a motion that no spring holds, and for
     values that are not allowed.
@@ -228,12 +234,14 @@ def _stopping(matrices: tuple[Array, Array, Array], values: Array, shapes: Array
 
 @validated
 def critical_speeds(scene: Scene, *, loads: Weights = "fixed") -> CriticalSpeeds:
-    """Synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
+    """Return the synchronous critical speeds: (K - w^2 (M - i G)) X = 0, the whirl turning at the rotor's own speed w.
 
-    The eigenproblem is Hermitian. On supports that are alike both ways, a forward tilt has the inertia A - C, a backward one
-    A + C.
+    The eigenproblem is Hermitian. On supports that are alike both ways, a forward tilt has the inertia A - C, a backward one A
+    + C.
 
-    **Arguments** as `whirl`. **Returns** `CriticalSpeeds`. **Raises** `InputError` as `whirl`.
+    **Arguments** as `whirl`: `scene`; `loads` "fixed" or "none".
+
+    **Returns** `CriticalSpeeds`; typical: 100 to 500 rad/s. **Raises** `InputError` as `whirl`.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=0.0)

@@ -37,12 +37,17 @@ __all__ = ["Criterion", "criterion", "criterion_functional", "criterion_table"]
 
 
 class Criterion(Result):
-    """The criterion's answer for one machine with its loads.
+    """Result of the criterion for one machine with its loads.
 
-    **Attributes**: `status` a `CriterionStatus`; `speeds` the `CharacteristicSpeeds`; intervals of rotor speed, rows
-    [from, to] in rad/s, `inf` where there is no end, NaN rows where there is no interval: `balancing` (nd, 2) where f
-    < 0 and auto-balancing is stable, `gathering` (nd, 2) where f > 0 and loads gather, with the machine's damping,
-    and `undamped_balancing`, `undamped_gathering` without.
+    **Attributes**
+
+    - `status`: a `CriterionStatus`
+    - `speeds`: the `CharacteristicSpeeds`
+    - `balancing` (nd, 2): intervals of rotor speed in which f < 0 and auto-balancing is stable, with the machine's damping
+    - `gathering` (nd, 2): intervals in which f > 0 and loads gather, with the machine's damping
+    - `undamped_balancing` and `undamped_gathering` (nd, 2): the same without damping
+
+    Intervals are rows [from, to] in rad/s. `inf` is an interval without an end; a row of NaN is no interval.
     """
 
     status: CriterionStatus
@@ -54,22 +59,22 @@ class Criterion(Result):
 
     @property
     def resonances(self) -> Array:
-        """Undamped, (nd,) rad/s."""
+        """Resonances without damping, (nd,) rad/s."""
         return self.speeds.resonances
 
     @property
     def additional(self) -> Array:
-        """Undamped, (nd - 1,) rad/s."""
+        """Additional speeds without damping, (nd - 1,) rad/s."""
         return self.speeds.additional
 
     @validated
     def balances(self, speed: Array) -> Array:
-        """True if the criterion predicts stable auto-balancing at a rotor speed (any shape, rad/s)."""
+        """Return True if the criterion predicts stable auto-balancing at a rotor `speed` (any shape, rad/s)."""
         w = jnp.asarray(speed)
         return jnp.any(jnp.stack([(start < w) & (w < end) for start, end in self.balancing]), axis=0)
 
     def summary(self) -> str:
-        """A table a person can read."""
+        """Return the characteristic speeds and intervals as a table in text."""
 
         def written(intervals: list[list[float | None]]) -> str:
             return ", ".join(f"{a:.6g} .. {'infinity' if b is None else f'{b:.6g}'}" for a, b in intervals)
@@ -81,7 +86,7 @@ class Criterion(Result):
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Characteristic speeds with damping, and the intervals between them, in `unit`.
+        """Plot the characteristic speeds with damping, and the intervals between them, in `unit`.
 
         **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
         """
@@ -134,13 +139,20 @@ CRITERION_TERMS = (
 
 @validated
 def criterion(scene: Scene) -> Criterion:
-    """Judges every rotor speed of a scene's machine: where its loads balance it, where they gather.
+    """Return the ranges of rotor speed in which loads balance a machine, and those in which they gather.
 
-    The functional f of `criterion_functional` changes sign at the characteristic speeds alone, from + to - at a
-    resonance and back at an additional speed, so these are the ends of the intervals.
+        f(q) = (s^2 q^2 / 2) Re of the port receptance averaged over a revolution;    f < 0: balancing,    f > 0: gathering
 
-    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`. **Raises** `InputError` as there, for a single
-    load, and for effects whose potential turns a load by itself (`Gravity`).
+    The functional f of `criterion_functional` changes sign at the characteristic speeds alone, from + to - at a resonance and
+    back at an additional speed, so these are the ends of the intervals.
+
+    **Arguments**: `scene` with at least two loads; typical: loads of 0.1 % to 1 % of the machine's mass. The share of right
+    predictions on random machines was 0.99 for loads of 0.1 %, and 0.55 for 10 %.
+
+    **Returns** `Criterion`; derivatives and `vmap` as `characteristic_speeds`.
+
+    **Raises** `InputError` as `characteristic_speeds`, for a single load, and for effects whose potential turns a load by
+    itself (`Gravity`).
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("criterion", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3,

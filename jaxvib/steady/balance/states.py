@@ -54,11 +54,15 @@ class BalanceStatus(eqx.Enumeration):
 class BalancedStates(Result):
     """Arrangements in which a set of loads cancels the rotor's imbalance, in the frame of the rotor.
 
-    **Attributes** (N loads): `status` a `BalanceStatus`; `angles` (k, N) rad, one arrangement a row, load 1 at angle
-    0 unless the rotor is out of balance (no rows where nothing cancels); `dimension` of the set of arrangements, the
-    common turn counted: N - 2, but 1 for two loads on a rotor in balance; `neutral` (k, N, d) orthonormal changes of
-    the angles that keep each arrangement balanced to first order; and their `names` (d,): "turn of all loads" first
-    (not where the rotor is out of balance), then "shape 1", ...; and the `scene`.
+    **Attributes** (N loads)
+
+    - `status`: a `BalanceStatus`
+    - `angles` (k, N), rad: one arrangement a row, load 1 at angle 0 unless the rotor has an imbalance; no rows if nothing
+      cancels
+    - `dimension` of the set of arrangements, including the common turn: N - 2, but 1 for two loads on a rotor without imbalance
+    - `neutral` (k, N, d): orthonormal changes of the angles that keep each arrangement balanced to first order
+    - `names` (d,) of these changes: "turn of all loads" first (not if the rotor has an imbalance), then "shape 1", ...
+    - `scene`
 
     Loads in one line have one neutral direction more than the family has dimensions.
     """
@@ -72,19 +76,36 @@ class BalancedStates(Result):
 
     @validated
     def stability(self, arrangement: int = 0, *, steps: int | None = None) -> BalancedStability:
-        """Stability of that arrangement, counted from 0, at the scene's rotor speed, see `balanced_stability`."""
+        """Return the stability of an arrangement at the scene's rotor speed, see `balanced_stability`.
+
+        **Arguments**: `arrangement`: its number, counted from 0; `steps` of Radau's method over one turn (default: as many as
+        the natural frequencies need); the time grows in proportion.
+        """
         return balanced_stability(self.scene, self._arranged(arrangement), steps=steps)
 
     @validated
     def growth(self, speeds: ArrayLike, arrangement: int = 0, *, steps: int | None = None) -> np.ndarray:
-        """Growth rate of its errors at rotor speeds, 1/s: stable where it is negative, see `balanced_growth`."""
+        """Return the growth rate of an arrangement's errors at rotor speeds, 1/s: stable if it is negative, see
+        `balanced_growth`.
+
+        **Arguments**: `speeds`, rad/s; `arrangement`: its number, counted from 0; `steps` as `stability`.
+        """
         return balanced_growth(self.scene, speeds, self._arranged(arrangement), steps=steps)
 
     @validated
     def intervals(
         self, low: float, high: float, arrangement: int = 0, *, points: int = 200, steps: int | None = None
     ) -> list[list[float]]:
-        """Intervals of rotor speed, rad/s, in which it is stable, see `balanced_intervals`."""
+        """Return the intervals of rotor speed, rad/s, in which an arrangement is stable, see `balanced_intervals`.
+
+        **Arguments**
+
+        - `low` and `high`: the range, rad/s
+        - `arrangement`: its number, counted from 0
+        - `points`: speeds that are computed in the range; typical: 200 (the default). An interval narrower than their spacing
+          can be missed, and the time grows in proportion
+        - `steps` as `stability`
+        """
         return balanced_intervals(self.scene, low, high, self._arranged(arrangement), points=points, steps=steps)
 
     def _arranged(self, arrangement: int) -> np.ndarray:
@@ -96,14 +117,14 @@ class BalancedStates(Result):
         return self.angles[arrangement]
 
     def summary(self) -> str:
-        """A table a person can read."""
+        """Return the arrangements and their neutral directions as text."""
         rows = ["  " + ", ".join(f"{np.degrees(a):.4g}" for a in row) + " deg" for row in self.angles]
         directions = f"neutral directions: {', '.join(self.names) or 'none'}"
         return "\n".join([self.message, *rows, directions])
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """The arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the arrangements in the rotor's frame, a circle each. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import phase_circles  # slow to import: only who draws pays
 
         return phase_circles([(f"arrangement {k + 1}", angles) for k, angles in enumerate(self.angles)], ax=ax)
@@ -111,18 +132,25 @@ class BalancedStates(Result):
 
 @validated
 def balanced_states(scene: Scene) -> BalancedStates:
-    """All arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`; ask each for its
-    `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
+    """Return all arrangements in which the scene's loads cancel each other and the rotor's `StaticImbalance`.
 
         sum_j m_j R_j exp(i alpha_j) + M e exp(i angle) = 0
 
-    Two loads cancel if equal, opposite each other. Three do in one triangle and its mirror image. From four on there
-    is a family with N - 2 dimensions; the arrangement given for it spreads the loads most (the sides m_j R_j of a
-    polygon inscribed in a circle: equal loads are evenly spaced), and its mirror image; `neutral` says where the
-    family goes. A rotor's imbalance is one more side of the polygon, and the loads then have no common turn.
+    - Two loads cancel if they are equal and opposite each other
+    - Three loads cancel in one triangle and its mirror image
+    - From four loads on there is a family with N - 2 dimensions. The returned arrangement spreads the loads most (the sides m_j
+      R_j of a polygon inscribed in a circle: equal loads are evenly spaced), with its mirror image; `neutral` gives the
+      directions of the family
+    - A rotor's imbalance is one more side of the polygon, and the loads then have no common turn
 
-    **Returns** `BalancedStates`. **Raises** `InputError` for loads that do not run on a circle at one point, and for an
-    imbalance that tilts the rotor, of a moment or static elsewhere on its axis, which they cannot cancel.
+    Each arrangement has its `stability()`, its `growth(speeds)` and the stable `intervals(low, high)` of rotor speed.
+
+    **Arguments**: `scene` with loads on a circle at one point; typical: 2 to 4 loads, an imbalance up to the sum of m_j R_j.
+
+    **Returns** `BalancedStates`.
+
+    **Raises** `InputError` for loads that do not run on a circle at one point, and for an imbalance that tilts the rotor, of a
+    moment or static elsewhere on its axis, which they cannot cancel.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -10,7 +10,7 @@ __all__ = ["PhasePattern", "phase_pattern"]
 
 
 class PhasePattern(eqx.Enumeration):
-    """Relative phases of loads that turn at one speed; the members are the words a user reads."""
+    """Relative phases of loads that turn at one speed. Each member is the sentence shown to the user."""
 
     together = "all together"
     opposite = "in two opposite groups"

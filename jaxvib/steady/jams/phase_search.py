@@ -57,8 +57,12 @@ _SAME, _CLOSE = 1e-6, 1e-5
 
 
 class PhaseJams(AbstractPhaseJam):
-    """Every jam that was found: the arrays of `AbstractPhaseJam` with a leading axis, by falling speed of the loads, stable
-    ones first where speeds are equal; `starts` (n,): how many of the starts led to each; and the `scene`."""
+    """All jams of a search: the arrays of `AbstractPhaseJam` with a leading axis over the n jams.
+
+    They are ordered by falling speed of the loads, stable ones first if speeds are equal.
+
+    **Additional attributes**: `starts` (n,): the number of starts that led to each; and the `scene`.
+    """
 
     outer_axes = ("jam",)
 
@@ -67,7 +71,7 @@ class PhaseJams(AbstractPhaseJam):
 
     @validated
     def select(self, index: int) -> PhaseJam:
-        """The jam of that place, counted from 0. **Raises** `InputError` where there are not so many."""
+        """Return the jam with an `index`, counted from 0. **Raises** `InputError` if there are fewer jams."""
         n = self.omega.shape[0]
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
             raise InputError("index", f"is {quoted(index)}; there are {n} jams, counted from 0")
@@ -76,19 +80,22 @@ class PhaseJams(AbstractPhaseJam):
 
     @validated
     def follow(self, index: int, omega: Array) -> PhaseBranch:
-        """The phase pattern of the jam of that place over load speeds `omega` (n,) rad/s, see `phase_branch`."""
+        """Return the phase pattern of the jam with an `index` over load speeds `omega` (n,), rad/s, see `phase_branch`."""
         return phase_branch(self.scene, self.select(index), omega)
 
     def summary(self) -> str:
-        """A table a person can read; amplitudes zero to peak, phases in degrees."""
+        """Return a table in text; amplitudes zero to peak, phases in degrees."""
         return "\n".join(self.select(k).summary() for k in range(self.omega.shape[0])) or "no jam"
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Axes | None = None) -> Drawn:
-        """Speeds of the loads over the drag, from a 30th of the scene's to 30 times it, of every pattern that jams at the
-        scene's, in colours by how the loads stand there; stable solid, unstable dashed, and the jams themselves as points.
+        """Plot the speeds of the loads over the drag, from a 30th of the scene's to 30 times it, for each pattern of these
+        jams.
 
-        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit.
+        Colours show the arrangement of the loads; stable solid, unstable dashed, the jams themselves as points.
+
+        **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for another unit than "rad/s", "rpm", "Hz"
+        (`unit`).
         """
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 
@@ -124,23 +131,31 @@ def phase_jams(scene: Scene, *, near: tuple[Array, Array]) -> PhaseJam: ...
 def phase_jams(
     scene: Scene, *, starts: int = 128, seed: int = 0, near: tuple[Array, Array] | None = None
 ) -> PhaseJams | PhaseJam:
-    """Every way in which the scene's light loads can jam at its rotor speed, whatever their phases.
+    """Return every way in which the scene's light loads can jam at its rotor speed, whatever their phases.
 
-    At each of many load speeds, closer together near resonances, phases are looked for at which all loads need the same
-    multiple of their drag, from `starts` random sets of phases and some regular ones; where that multiple passes 1 from one
-    load speed to the next, the speed is solved for as well (`phase_jam`). What differs by a common turn, or by which of
-    several equal loads stands where, is one jam. Loads that turn with the rotor and balance it are left out.
+        b_W R^2 (n - Omega) = mean braking torque of the vibration on load j,  for every load j, solved for Omega and the phases
 
-    A rotor out of balance (`StaticImbalance`, `MomentImbalance`) leaves a jam where it is: it shakes at the rotor's speed,
-    loads at theirs, so that no mean torque comes of it at this order. Its vibration and force come on top: the amplitudes and
-    the foundation force are the loads' alone. Where both count, ask `simulate`.
+    - At each of many load speeds, closer together near resonances, the search finds phases at which all loads need the same
+      multiple of their drag, from `starts` random sets of phases and some regular ones. If that multiple passes 1 from one load
+      speed to the next, the speed is solved for as well (`phase_jam`)
+    - Jams that differ by a common turn, or by an exchange of equal loads, are one jam
+    - Loads that turn with the rotor and balance it are left out
+    - A rotor with an imbalance (`StaticImbalance`, `MomentImbalance`) leaves a jam unchanged: it shakes at the rotor's speed,
+      loads at theirs, so that it has no mean torque at this order. Its vibration and force add to those of the loads; the
+      amplitudes and the foundation force are the loads' alone. If both count, use `simulate`
 
-    **Arguments**: `starts`: random sets of phases at each load speed; `seed` which. Stable jams are found with a few; unstable
-    ones close to where patterns part from each other take many. `near`: (omega, phase), a speed rad/s and the phases (count,)
-    rad of the loads, from which Newton's method finds one jam, see `phase_jam`; `jit`, `vmap` and `grad` go through it then.
+    **Arguments**
 
-    **Returns** `PhaseJams`, or `PhaseJam` with `near`. **Raises** `InputError` for loads without drag, drives without a given
-    speed, and effects that this theory leaves out.
+    - `scene` with a drive of given speed and loads with drag; typical: 2 to 4 loads
+    - `starts`: random sets of phases at each load speed; typical: 16 to 1024 (default 128). Stable jams are found with a few;
+      unstable ones close to the separation of two patterns take many. The time grows in proportion
+    - `seed` of these random phases
+    - `near`: (omega, phase), a speed rad/s and the phases (count,) rad of the loads, from which Newton's method finds one jam,
+      see `phase_jam`; `jit`, `vmap` and `grad` go through it then
+
+    **Returns** `PhaseJams`, or `PhaseJam` with `near`.
+
+    **Raises** `InputError` for loads without drag, drives without a given speed, and effects that this theory leaves out.
 
     >>> import jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)

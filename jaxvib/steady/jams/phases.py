@@ -42,7 +42,7 @@ _SAME_JAM_DISTANCE = 0.02
 
 
 class PhaseStatus(eqx.Enumeration):
-    """Outcomes of a jam; the members are the sentences a user reads."""
+    """Outcomes of a jam of loads at different angles. Each member is the sentence shown to the user."""
 
     found = "the loads can jam in this way"
     with_rotor = "the loads turn with the rotor and leave it at rest: they balance, and are not jammed"
@@ -86,15 +86,15 @@ class AbstractPhaseJam(Result):
 
 
 class PhaseJam(AbstractPhaseJam):
-    """A jam whose loads need not stand at one angle, see `AbstractPhaseJam`."""
+    """Jam whose loads may be at different angles, see `AbstractPhaseJam`."""
 
     @property
     def pattern_label(self) -> str:
-        """The pattern's own word: "together", "opposite", "spread" or "other"."""
+        """Short name of the pattern: "together", "opposite", "spread" or "other"."""
         return status_name(self.pattern)
 
     def summary(self) -> str:
-        """A line a person can read; phases in degrees."""
+        """Return one line of text; phases in degrees."""
         if not np.isfinite(self.omega):
             return self.message
         phases = ", ".join(f"{degrees(float(a)):.4g}" for a in self.phase)

@@ -43,7 +43,7 @@ fast as the loads, and an orbit would take seconds to hours."""
 
 
 class OrbitStatus(eqx.Enumeration):
-    """Outcome of a search for an exact jam; the members are the sentences a user reads."""
+    """Outcomes of a search for an exact jam. Each member is the sentence shown to the user."""
 
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"
@@ -56,25 +56,28 @@ class OrbitStatus(eqx.Enumeration):
 
 
 class Orbit(Result):
-    """An exact jam: phi = theta + psi(theta), theta = Omega t, psi periodic with mean 0; everything else follows it.
+    """Exact jam: phi = theta + psi(theta), theta = Omega t, psi periodic with mean 0; everything else follows from psi.
 
-    Numbers are NaN where the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
+    Numbers are NaN if the status is `absent` or `not_converged`. Signals are Re sum_k c_k exp(i k theta).
 
     **Attributes**
 
-    - `status` an `OrbitStatus`; `residual` of the torque balance, relative; `error` estimate of the relative error of the
-      speeds (and, rad, of psi) by the number of harmonics and by rounding
-    - `omega`, `rotor_speed` rad/s; `slope` dn/dOmega along the branch
-    - `amplitude` (nd,) m, of tilts rad, and `foundation_force` N: zero to peak, (max - min)/2 over the period; of two
-      directions of the force the root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
-    - `power` W: mean power that the loads take from the rotor, by drag and dry friction
-    - `stable`: every load keeps to this motion, that is `multiplier` < 1; `multiplier`: largest modulus of the non-trivial
-      Floquet multipliers; `multipliers` complex: all of them, those of loads that part from each other last; `trivial`:
-      the multiplier that is 1, as computed
-    - `deviation_harmonics` (G, J) rad, `displacement_harmonics` (nd, K) m, of tilts rad, `force_harmonics` (nb, K) N: the c_k;
-      loads that share every number have one deviation (G = 1), else each has its own (G = count)
-    - `units` (nd,): of the amplitudes, "m" or "rad"
-    - `deviation_orders`, `orders`: the k they belong to; `offsets` (count,) rad: how far each load is ahead of phi
+    - `status`: an `OrbitStatus`
+    - `residual` of the torque balance, relative
+    - `error`: estimate of the relative error of the speeds (and, rad, of psi), from the number of harmonics and from rounding
+    - `omega` and `rotor_speed`, rad/s; `slope`: dn/dOmega along the branch
+    - `amplitude` (nd,), m, of tilts rad, and `foundation_force`, N: zero to peak, (max - min)/2 over the period. For two
+      directions of the force: root of the summed squares of their peaks (sqrt 2 times the force of a circular whirl)
+    - `power`, W: mean power that the loads take from the rotor, by drag and dry friction
+    - `stable`: True if every load keeps to this motion, that is `multiplier` < 1
+    - `multiplier`: largest modulus of the non-trivial Floquet multipliers
+    - `multipliers`, complex: all of them, those of loads that separate from each other last
+    - `trivial`: the multiplier that is 1, as computed
+    - `deviation_harmonics` (G, J), rad, `displacement_harmonics` (nd, K), m, of tilts rad, `force_harmonics` (nb, K), N: the
+      c_k. Loads that share every number have one deviation (G = 1), otherwise each has its own (G = count)
+    - `deviation_orders` and `orders`: the k of these harmonics
+    - `offsets` (count,), rad: the angle by which each load is ahead of phi
+    - `units` (nd,) of the amplitudes, "m" or "rad"
     """
 
     status: OrbitStatus
@@ -100,22 +103,24 @@ class Orbit(Result):
 
     @property
     def harmonics(self) -> int:
-        """The highest harmonic of the carrier's motion that was used."""
+        """Highest harmonic of the carrier's motion that was used."""
         return self.orders[-1]
 
     @validated
     def at(self, theta: Array) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
-        """The motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',) rad/s.
+        """Return the motion at the angle `theta` = Omega t (scalar, rad): q (nd,) m, q' m/s, (phi,) (count,) rad, (phi',)
+        rad/s.
 
-        Tilts are in rad and rad/s. This is what a state of `vector_field` is made of: `jv.State(*orbit.at(0.0))` is a point of
-        the motion. For many angles use `jax.vmap(orbit.at)`. **Raises** `InputError` for an angle that is not finite, or so
-        large that its digits within a turn are lost.
+        Tilts are in rad and rad/s. A state of `vector_field` consists of these: `jv.State(*orbit.at(0.0))` is a point of the
+        motion. For many angles use `jax.vmap(orbit.at)`.
+
+        **Raises** `InputError` for an angle that is not finite, or so large that its digits within a turn are lost.
         """
         return _at(self, known_number(theta, "rad", "theta"))
 
     @validated
     def relative_amplitude(self, i: int, j: int) -> Array:
-        """Amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period.
+        """Return the amplitude of coordinate `i` relative to coordinate `j` (counted from 1), (max - min)/2 over the period.
 
         **Raises** `InputError` for a coordinate that the machine does not have.
         """
@@ -127,21 +132,24 @@ class Orbit(Result):
 
     @property
     def judgement(self) -> str:
-        """ "stable" or "unstable", or that the stability is not known."""
+        """Text "stable" or "unstable", or that the stability is not known."""
         if np.isnan(self.multiplier):
             return "stability not known"
         return "stable" if self.stable else "unstable"
 
     def force_peaks(self) -> Array:
-        """The greatest force on the bed in each of 16 equal parts of the period, N, (16,); the largest is `foundation_force`,
-        which bends where another one overtakes it. Of a force that does not turn its sign in half a period, or of two
-        directions, `foundation_force` alone, (1,)."""
+        """Greatest force on the foundation in each of 16 equal parts of the period, N, (16,); the largest is
+        `foundation_force`.
+
+        `foundation_force` has a kink where another peak becomes the largest; these do not. For a force that does not change its
+        sign in half a period, or for two directions, `foundation_force` alone, (1,).
+        """
         if self.force_harmonics.shape[0] > 1 or any(k % 2 == 0 for k in self.orders):
             return self.foundation_force[None]
         return _force_peaks(self.orders, self.force_harmonics)
 
     def summary(self) -> str:
-        """A few lines a person can read; amplitudes zero to peak."""
+        """Return the result as a few lines of text; amplitudes zero to peak."""
         kinds = {unit: [k for k, each in enumerate(self.units) if each == unit] for unit in dict.fromkeys(self.units)}
         amplitude = "; ".join(
             f"{', '.join(f'{float(self.amplitude[k]):.6g}' for k in places)} {unit}" for unit, places in kinds.items()
@@ -156,8 +164,10 @@ class Orbit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """A period of the motion over the angle Omega t: displacements, deviation of the loads, force on the bed; onto three
-        axes `ax` where they are given. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot a period over the angle Omega t: displacements, deviation of the loads, force on the foundation.
+
+        **Returns** a matplotlib figure, or the given `ax`, which has three axes.
+        """
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         theta = np.linspace(0.0, 2.0 * np.pi, 721)

@@ -54,12 +54,17 @@ class SpecialPoint(NamedTuple):
 
 
 class ExactBranches(Result):
-    """The branch n(Omega) of exact jams, ascending in Omega, a leading axis over its P points.
+    """Branch n(Omega) of exact jams, ascending in Omega, with a leading axis over its P points.
 
-    **Attributes**: `omega`, `rotor_speed` (P,) rad/s; `slope` dn/dOmega; `amplitude` (P, nd) m, of tilts rad, and
-    `foundation_force` (P,) N, zero to peak, as in `Orbit`; `power` (P,) W; `stable`, `multiplier` (P,) and `multipliers` (P,
-    ...) as in `Orbit`; `residual`, `error` (P,), `status` an `OrbitStatus` each; `special` the special points, ascending in
-    Omega; `scene`.
+    **Attributes**
+
+    - `omega` and `rotor_speed` (P,), rad/s; `slope`: dn/dOmega
+    - `amplitude` (P, nd), m, of tilts rad, and `foundation_force` (P,), N, zero to peak, as in `Orbit`
+    - `power` (P,), W
+    - `stable`, `multiplier` (P,) and `multipliers` (P, ...), as in `Orbit`
+    - `residual` and `error` (P,), and `status`, an `OrbitStatus` each
+    - `special`: the special points, ascending in Omega
+    - `scene`
     """
 
     outer_axes = ("point",)
@@ -80,7 +85,7 @@ class ExactBranches(Result):
     special: tuple[SpecialPoint, ...] = eqx.field(static=True, metadata=in_unit("", "special_point"))
 
     def summary(self) -> str:
-        """The ranges of the branch, its resonances and its special points, for a person to read."""
+        """Return the ranges of the branch, its resonances and its special points as text."""
         return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
 
     @validated
@@ -92,7 +97,10 @@ class ExactBranches(Result):
         show: Sequence[str] = ("speed", "amplitude", "force"),
         ax: Onto = None,
     ) -> Drawn:
-        """The diagram: stable solid, unstable dashed, special points by their kind; arguments as `Branches.plot`."""
+        """Plot the diagram: stable solid, unstable dashed, special points by their kind.
+
+        **Arguments**: `unit`, `most`, `show`, `ax` as `Branches.plot`.
+        """
         return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
 
 

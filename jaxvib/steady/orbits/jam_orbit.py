@@ -45,37 +45,40 @@ def jam_orbit(
     points: int | None = None,
     throw: bool = True,
 ) -> Orbit:
-    """The exact motion in which coincident loads jam: no assumption that they are light.
+    """Return the exact motion in which coincident loads jam: they need not be light.
 
         I Omega^2 psi'' = torque(phi, Omega (1 + psi'), n, a) - S e'(phi) . a,      a = B q''
         D(k Omega) q_k = S k^2 Omega^2 B^T e_k,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
     with phi = theta + psi(theta), S = sum m R, I = sum kappa m R^2, e_k the harmonics of e = (cos phi, sin phi). Solved by
-    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton from the leading order. Loads
-    that share every number are at one point, or side by side where they have a `ball_radius` (S is then
-    m R sin(N arcsin(r/R)) / (r/R); where they would have to pull at each other, on the average of a period, the status is
-    `held`). Loads that differ have a psi_j each: they take the places next to each other that their torques ask for.
-    The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. Where friction
-    can hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status says so.
+    trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton's method from the leading order.
 
-    **Arguments**, one of the first three
+    - Loads that share every number are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
+      arcsin(r/R)) / (r/R); if they would have to pull at each other, on the average of a period, the status is `held`)
+    - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
+    - The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. If friction can
+      hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status shows it
 
-    - `mode`: the number of a jam mode, see `jam_modes`: the motion at the scene's rotor speed that continues it. Where the
-      leading order lacks it or is too far from it, the whole exact branch is searched (not under a JAX transformation)
+    **Arguments**: `scene`; one of the first three; and the others
+
+    - `mode`: the number of a jam mode, see `jam_modes`: the motion at the scene's rotor speed that continues it; typical: 1, 3,
+      5. If the leading order lacks it or is too far from it, the whole exact branch is searched (not under a JAX
+      transformation)
     - `omega`: a load speed, rad/s or text: the motion with that speed; its rotor speed is a result, the scene's is not used
     - `near`: a load speed to start from: a motion at the scene's rotor speed
-    - `accuracy`: harmonics are added until the estimated relative error is below it (1e-9 unless said otherwise, in single
-      precision 1e-3)
-    - `points`: a fixed number of collocation points (on half a period without gravity, else on a period) in place of that.
-      Under `jit` and `vmap` shapes cannot follow numbers: there it is 16 (33) unless said otherwise, the status tells
-    - `throw`: raise where there is no such motion; else, and under a JAX transformation, the status says so
+    - `accuracy`: harmonics are added until the estimated relative error is below it; typical: 1e-4 to 1e-9 (the default; in
+      single precision 1e-3). A smaller value costs little, since the error falls exponentially with the number of harmonics
+    - `points`: a fixed number of collocation points (on half a period without gravity, otherwise on a period) in place of that;
+      typical: 12 to 32. The time grows with their square at least. Under `jit` and `vmap` shapes cannot follow numbers: there
+      the default is 16 (33), and the status shows if it is too small
+    - `throw`: raise if there is no such motion; otherwise, and under a JAX transformation, the status shows it
 
-    **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function
-    theorem, forward and reverse.
+    **Returns** `Orbit`; derivatives of its numbers with respect to every number of the scene by the implicit function theorem,
+    forward and reverse.
 
-    **Raises** `InputError` for wrong arguments, loads without drag, a `mode` of a machine with gyroscopic coupling (its
-    resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives
-    that at the lowest one); `ComputationError` with the status "absent" or "not_converged".
+    **Raises** `InputError` for wrong arguments, loads without drag, and a `mode` of a machine with gyroscopic coupling (its
+    resonances move with the rotor's speed; there a load speed may have motions at several rotor speeds, and `omega` gives that
+    at the lowest one); `ComputationError` with the status "absent" or "not_converged".
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
