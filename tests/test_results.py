@@ -217,6 +217,32 @@ def test_speeds_are_drawn_in_the_unit_that_is_asked_for(result):
             result.plot(unit="turns")
 
 
+def test_representation_is_the_summary_and_html_has_the_figure(result):
+    assert repr(result) == result.summary()
+    assert result._repr_html_().startswith("<pre>") and "data:image/png;base64," in result._repr_html_()
+
+
+def test_representation_of_a_batch_shows_shapes():
+    batch = jax.vmap(lambda n: jv.jam_modes(at_speed(n)))(jnp.array([40.0, 60.0]))
+    assert repr(batch).startswith("JamModes(") and "omega=f64[2,3]" in repr(batch) and "<img" not in batch._repr_html_()
+
+
+def test_pandas_table_has_a_row_for_each_point(result):
+    data = result.to_xarray()
+    if any(data[name].dims for name in data.data_vars):
+        table = result.to_pandas()
+        assert len(table) in data.sizes.values() and len(table.columns)
+    with pytest.raises(jv.InputError, match="axis is 'nowhere'; the axes of"):
+        result.to_pandas("nowhere")
+
+
+def test_pandas_table_of_jam_modes_holds_their_numbers():
+    modes = RESULTS["JamModes"]()
+    table = modes.to_pandas("mode")
+    np.testing.assert_array_equal(table["omega (rad/s)"], modes.omega)
+    np.testing.assert_array_equal(table["amplitude (m or rad)"], modes.amplitude[:, 0])
+
+
 def test_plain_data_is_json(result):
     plain = json.loads(json.dumps(result.as_dict(), allow_nan=False))
     assert plain["message"] == result.message

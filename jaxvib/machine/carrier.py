@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.machine.mount import Mount, Place
+from jaxvib.machine.numbers import Part
 
 __all__ = ["Carrier", "Machine"]
 
@@ -74,7 +75,7 @@ class Carrier(eqx.Module):
         return self.bed_stiffness @ displacement + self.bed_damping @ velocity
 
 
-class Machine(eqx.Module):
+class Machine(Part):
     """Machine in the designer's own numbers. A new kind of machine is a subclass with its matrices and its exciter's mount.
 
     `places` states how places on the machine are named, for effects and drawings:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
 __all__ = ["ConstantSpeed", "DCMotor", "Drive", "IdealDrive", "InductionMotor", "Motor", "RunUp", "SpinUp"]
@@ -22,7 +22,7 @@ Rotor = tuple[Array, Array] | None
 """Angle (rad) and speed (rad/s) of the rotor if they are states of the motion, otherwise None."""
 
 
-class Drive(eqx.Module):
+class Drive(Part):
     """Drive of the rotor; `speed` is its working speed without a load, rad/s; typical: 60 to 320 (600 to 3000 rpm).
 
     An `IdealDrive` prescribes the rotor speed. With a `Motor` the rotor's angle and speed are states.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
-from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number, Numbers, count
 from jaxvib.units.known import when_known
 
@@ -68,7 +68,7 @@ class DrillingSpin(NamedTuple):
     still: Array
 
 
-class Loads(eqx.Module):
+class Loads(Part):
     """Loads that move on the machine. A new kind of load is a subclass with its own position function.
 
     Arrays have one entry per load, or are scalars shared by all loads; functions act elementwise on (count,) arrays.

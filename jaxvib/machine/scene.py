@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import equinox as eqx
 import numpy as np
 
 from jaxvib.errors import InputError, quoted
@@ -13,6 +12,7 @@ from jaxvib.machine.drive import Drive
 from jaxvib.machine.effects.base import Effect, has_term
 from jaxvib.machine.effects.terms import DrillingSpinRelease, SlipRelease
 from jaxvib.machine.loads import Loads
+from jaxvib.machine.numbers import Part
 from jaxvib.units.known import when_known
 
 __all__ = ["Scene", "require_comparable"]
@@ -21,7 +21,7 @@ _MIN_RATIO = 1e-15
 """Ratio of two numbers below which double precision loses the smaller one in a sum."""
 
 
-class Scene(eqx.Module):
+class Scene(Part):
     """Complete description of a machine in motion; a frozen pytree of SI numbers.
 
     `jax.grad`, `jax.vmap` and `jax.jit` apply to every number in it; `equinox.tree_at` replaces one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import csv
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted, written
 from jaxvib.results.fields import Labels, columns, labels_of
 
-__all__ = ["write_csv"]
+__all__ = ["main_axis", "table_along", "write_csv"]
 
 
 @validated
@@ -35,10 +36,26 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
     >>> path.read_text().splitlines()[0]
     'rotor_speed (rad/s),speed 1 (rad/s),speed 2 (rad/s),decay 1 (1/s),decay 2 (1/s),forward 1,forward 2'
     """
+    table = table_along(result, axis)
+    path = Path(path)
+    with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(table)
+        writer.writerows([_shown(x) for x in row] for row in zip(*table.values(), strict=True))
+    return path
+
+
+def main_axis(result: eqx.Module) -> str:
+    """Return the axis along which a result has most arrays, "" if it has none."""
+    found = collections.Counter(axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes))
+    return max(found, key=lambda axis: found[axis], default="")
+
+
+def table_along(result: eqx.Module, axis: str) -> dict[str, np.ndarray]:
+    """Return the columns of the table of `write_csv` by their heads. **Raises** `InputError` for an axis that is not there."""
     labels = labels_of(result)
     units = labels.get("unit", ())
-    heads: list[str] = []
-    rows: list[np.ndarray] = []
+    table: dict[str, np.ndarray] = {}
     for name, axes, values, unit in columns(result):
         if axes[:1] != (axis,) or values.ndim != len(axes):
             continue
@@ -48,17 +65,11 @@ def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
             head, column = " ".join([name, *filter(None, places)]), values[(slice(None), *place)]
             parts = [("real ", np.real(column)), ("imaginary ", np.imag(column))] if np.iscomplexobj(column) else [("", column)]
             for part, numbers in parts:
-                heads.append(f"{part}{head}" + (f" ({own})" if own else ""))
-                rows.append(numbers)
-    if not rows:
+                table[f"{part}{head}" + (f" ({own})" if own else "")] = numbers
+    if not table:
         there = sorted({axes[0] for _, axes, values, _ in columns(result) if axes and values.ndim == len(axes)})
         raise InputError("axis", f"is {quoted(axis)}; the axes of {type(result).__name__} are: {', '.join(there) or 'none'}")
-    path = Path(path)
-    with written(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(heads)
-        writer.writerows([_shown(x) for x in row] for row in zip(*rows, strict=True))
-    return path
+    return table
 
 
 def _label(labels: Labels, axis: str, k: int, n: int) -> str:

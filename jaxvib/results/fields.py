@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import xarray
     from _typeshed import DataclassInstance
 
-__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "labels_of", "part", "plain", "to_xarray"]
+__all__ = ["as_dict", "as_text", "columns", "in_unit", "is_named_tuple", "is_single", "labels_of", "part", "plain", "to_xarray"]
 
 EACH = "*"
 """Stands for the `outer_axes` of the class that a field is in."""
@@ -157,6 +157,14 @@ def to_xarray(result: eqx.Module) -> xarray.Dataset:
 def columns(result: eqx.Module) -> Iterator[Column]:
     """Every array of a result: its name, the names of its axes, its values, its unit."""
     return _columns(result, None, "", (), {})
+
+
+def is_single(result: eqx.Module) -> bool:
+    """True if a result has known numbers and no axis of an outer `vmap`."""
+    try:
+        return all(value.ndim == len(axes) for _, axes, value, _ in columns(result))
+    except jax.errors.TracerArrayConversionError:
+        return False
 
 
 def labels_of(result: eqx.Module) -> Labels:

@@ -3,6 +3,9 @@
 # No postponed annotations here: Equinox knows an abstract field by its annotation itself.
 
 import abc
+import base64
+import html
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, final
 
@@ -11,9 +14,11 @@ import equinox as eqx
 from jaxvib.boundary import validated
 from jaxvib.errors import InputError, quoted
 from jaxvib.results import fields, files
+from jaxvib.results.csv import main_axis, table_along
 from jaxvib.results.status import sentence, status_name
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.figure import Figure
 
@@ -21,12 +26,16 @@ __all__ = ["Result"]
 
 
 class Result(eqx.Module):
-    """An answer to a question: numbers, and what there is to know about them.
+    """Base of all results: numbers with a status.
 
-    Every result has a `status`, its sentence `message`, a text for a person `summary()`, a figure `plot()`, plain values
-    `as_dict()`, a labelled dataset `to_xarray()`, and goes to a file and back by `save(path)` and `load(path)`. The last four
-    follow from the fields: the metadata of each says its unit and the names of its axes (`jaxvib.results.fields`).
-    A class that is a `Result` is final: none is made of another by inheritance.
+    - `status`, and its sentence `message`
+    - for a reader: `summary()`, which is also the representation, and a figure `plot()`
+    - as data: plain values `as_dict()`, a table `to_pandas()`, a labelled dataset `to_xarray()`
+    - in a file: `save(path)`, `load(path)`
+
+    Data and files follow from the fields: the metadata of each states its unit and the names of its axes
+    (`jaxvib.results.fields`).
+    A result class is final: no other class inherits from it.
     """
 
     outer_axes = ()
@@ -57,6 +66,23 @@ class Result(eqx.Module):
     def plot(self) -> "Figure":
         """Figure of the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
 
+    def __repr__(self) -> str:
+        """The summary; the shapes of the arrays for a batch of results and for one without known numbers."""
+        return self.summary() if fields.is_single(self) else super().__repr__()
+
+    def _repr_html_(self) -> str:
+        """The representation and, for a single result, its figure, for notebooks."""
+        text = f"<pre>{html.escape(repr(self))}</pre>"
+        if not fields.is_single(self):
+            return text
+        try:
+            figure = self.plot()
+        except InputError:  # a result without the points of a figure, such as a run saved without its trajectory
+            return text
+        data = io.BytesIO()
+        figure.savefig(data, format="png", dpi=80)
+        return f'{text}<img alt="figure" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":
         """The result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`."""
@@ -66,6 +92,22 @@ class Result(eqx.Module):
     def to_xarray(self) -> "xarray.Dataset":
         """The result as a labelled dataset with units, see `jaxvib.results.fields.to_xarray`."""
         return fields.to_xarray(self)
+
+    @final
+    @validated
+    def to_pandas(self, axis: str | None = None) -> "pandas.DataFrame":
+        """The arrays of the result along one axis as a table with a row for each point, as in `write_csv`.
+
+        **Arguments**: `axis`: its name, such as "time", "mode" or "rotor_speed"; default: the axis of most arrays.
+
+        **Raises** `InputError` for an axis that the result does not have, and if pandas is not installed
+        (`pip install '.[xarray]'`).
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("to_pandas", "needs pandas; install it with: pip install '.[xarray]'") from error
+        return pandas.DataFrame(table_along(self, main_axis(self) if axis is None else axis))
 
     @final
     @validated

@@ -15,7 +15,7 @@ from jaxvib.errors import InputError, quoted, require_one_of
 from jaxvib.machine.carrier import Machine
 from jaxvib.machine.effects.terms import ContactFriction, Coordinates, GravityField, LoadPotential, RotorImbalance, Term
 from jaxvib.machine.loads import Loads
-from jaxvib.machine.numbers import read_numbers, unit
+from jaxvib.machine.numbers import Part, read_numbers, unit
 from jaxvib.units import Number
 
 __all__ = [
@@ -80,7 +80,7 @@ def has_half_turn(effects: Iterable[Effect]) -> bool:
     return all(isinstance(term, ContactFriction) and term.is_half_turn_symmetric for term in terms)
 
 
-class Effect(eqx.Module):
+class Effect(Part):
     """Physical effect that a scene includes. A new effect is a subclass with its numbers and its `terms`."""
 
     kind: eqx.AbstractVar[str]

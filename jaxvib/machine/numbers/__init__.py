@@ -13,12 +13,14 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jaxvib.errors import InputError, quoted
 from jaxvib.units import Bounds, Numbers, number, numbers
+from jaxvib.units.known import when_known
 
-__all__ = ["PLAIN", "NumberSpec", "number_specs", "read_numbers", "unit"]
+__all__ = ["PLAIN", "NumberSpec", "Part", "number_specs", "read_numbers", "unit"]
 
 _KEY = "number"
 
@@ -113,3 +115,30 @@ def _read(spec: NumberSpec, value: Any, field: str, length: int | None) -> Array
         raise InputError(field, f"has {len(value)} values; {size} are needed")
     units = enumerate(spec.units)
     return jnp.stack([number(value[k], unit, f"{field}[{k}]", **bounds) for k, unit in units])
+
+
+class Part(eqx.Module):
+    """Base of the parts of a scene: its representation shows numbers with their units.
+
+    >>> import jaxvib as jv
+    >>> jv.ConstantSpeed("60 rad/s")
+    constant_speed(speed=60.0 rad/s)
+    """
+
+    def __repr__(self) -> str:
+        specs = number_specs(type(self))
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "kind"}
+        present = {name: value for name, value in values.items() if value is not None and np.shape(value) != (0,)}
+        shown = [f"{name}={_shown(value, specs.get(name, PLAIN))}" for name, value in present.items()]
+        name = getattr(self, "kind", type(self).__name__)
+        if any(isinstance(value, Part) for value in values.values()):
+            lines = ",\n".join(shown).replace("\n", "\n    ")
+            return f"{name}(\n    {lines},\n)"
+        return f"{name}({', '.join(shown)})"
+
+
+def _shown(value: object, spec: NumberSpec) -> str:
+    if not hasattr(value, "dtype"):
+        return repr(value)
+    text = when_known(lambda known: f"{np.asarray(known).tolist()} {spec.unit}".rstrip(), value)
+    return eqx.tree_pformat(value) if text is None else text
