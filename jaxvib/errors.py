@@ -52,10 +52,14 @@ def _shortened(text: str, most: int) -> str:
 
 
 class InputError(ValueError):
-    """A value that was given is not allowed.
+    """Error for an argument whose value is not allowed.
 
-    The message is one sentence that says which value it is, what is allowed and how to mend it.
-    `field` holds the dotted name of the value ("machine.mass[1]"), so that a file or a form can point at it.
+    The message is one sentence: the argument, its value, the allowed range and the change that fixes it.
+
+    **Arguments**, also attributes
+
+    - `field`: dotted name of the argument ("machine.mass[1]"), so that a file or a form can point at it
+    - `problem`: the rest of the sentence, "is 0; a machine needs at least 1 load"
 
     >>> raise InputError("loads.count", "is 0; a machine needs at least 1 load")
     Traceback (most recent call last):
@@ -187,9 +191,11 @@ def read_text(path: str | Path, what: str, most: int = MAX_TEXT_BYTES) -> str:
 
 
 class ComputationError(RuntimeError):
-    """The input is good, the computation still has no answer; `status` names why.
+    """Error for a computation without an answer although its input is allowed; `status` names the reason.
 
     Functions that raise it take `throw=False` to return the status in place of raising.
+
+    **Arguments**, also attributes: `status`, a name such as "absent" or "max_steps_reached"; `message`, a sentence.
 
     >>> raise ComputationError("max_steps_reached", "the run needs more than 16 steps")
     Traceback (most recent call last):

@@ -74,13 +74,17 @@ def html_report(
     scene: Scene | None = None,
     figures: Sequence[tuple[str, Figure]] | None = None,
 ) -> Path:
-    """Writes a result as one web page that holds all of it: numbers with units, figures, machine, what it is worth, versions.
+    """Write a result as one web page: numbers with units, figures, machine, accuracy of the result, versions.
 
-    The page asks no network for anything; it reads on a phone and prints.
+    The page loads nothing from a network; it reads on a phone and prints.
 
-    **Arguments**: `result` of any kind; `path` of the file, which is overwritten; `title`, the result's kind unless said
-    otherwise; `scene` whose parameters are listed, that of the result where it has one; `figures` with their names, the
-    result's own where none are given.
+    **Arguments**
+
+    - `result` of any kind
+    - `path` of the file, which is overwritten
+    - `title`; default: the result's kind
+    - `scene` whose parameters are listed; default: that of the result if it has one
+    - `figures`: pairs of a name and a matplotlib figure; default: the result's own
 
     **Returns** the path. **Raises** `InputError` for something that is no result, and for a path that cannot be written to.
 

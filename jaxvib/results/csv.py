@@ -19,12 +19,16 @@ __all__ = ["main_axis", "table_along", "write_csv"]
 
 @validated
 def write_csv(result: eqx.Module, axis: str, path: str | Path) -> Path:
-    """Writes everything that a result has along an axis into a CSV file, a row for each of its points.
+    """Write all quantities of a result along an axis into a CSV file, a row for each point of the axis.
 
     The head of a column is the name, the labels of the other axes and the unit: "displacement y1 (m)". Numbers have 9 digits,
     complex ones a column each for the real and the imaginary part.
 
-    **Arguments**: `axis` as in the metadata of the fields, such as "time" or "point"; `path` of the file, which is overwritten.
+    **Arguments**
+
+    - `result` of any kind
+    - `axis` as in the metadata of the fields, such as "time" or "point"
+    - `path` of the file, which is overwritten
 
     **Returns** the path. **Raises** `InputError` for an axis that the result does not have, and for a path that cannot be
     written to.

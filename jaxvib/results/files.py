@@ -62,10 +62,14 @@ def save(result: eqx.Module, path: str | Path) -> Path:
 
 @validated
 def load(path: str | Path) -> Any:
-    """Reads a result written by `save`, of whatever class it is.
+    """Read a result written by `save`, of whatever class it is.
 
-    **Raises** `InputError` for a file that is missing, was not written by `save` or was changed since, or holds a class that
-    there is no more.
+    **Arguments**: `path` of the file, ".npz".
+
+    **Returns** the result, bit for bit the same.
+
+    **Raises** `InputError` for a file that is missing, was not written by `save` or was changed since, or holds a class that no
+    longer exists.
 
     >>> import pathlib, tempfile, jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -60,11 +60,11 @@ class Result(eqx.Module):
 
     @abc.abstractmethod
     def summary(self) -> str:
-        """Text of the result for a reader."""
+        """Return the result as text for a reader."""
 
     @abc.abstractmethod
     def plot(self) -> "Figure":
-        """Figure of the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
+        """Plot the result by matplotlib; `plot(ax=axes)` draws onto given axes, one for each panel, and returns them."""
 
     def __repr__(self) -> str:
         """The summary; the shapes of the arrays for a batch of results and for one without known numbers."""
@@ -85,12 +85,12 @@ class Result(eqx.Module):
 
     @final
     def as_dict(self) -> "dict[str, fields.Plain]":
-        """The result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`."""
+        """Return the result as plain Python values, ready for JSON, see `jaxvib.results.fields.as_dict`."""
         return fields.as_dict(self)
 
     @final
     def to_xarray(self) -> "xarray.Dataset":
-        """The result as a labelled dataset with units, see `jaxvib.results.fields.to_xarray`."""
+        """Return the result as a labelled dataset with units, see `jaxvib.results.fields.to_xarray`."""
         return fields.to_xarray(self)
 
     @final
@@ -112,14 +112,14 @@ class Result(eqx.Module):
     @final
     @validated
     def save(self, path: str | Path) -> Path:
-        """Writes the result to a NumPy archive that `load` reads back bit for bit. **Returns** its path (".npz")."""
+        """Write the result to the NumPy archive `path` (".npz") that `load` reads back bit for bit. **Returns** the path."""
         return files.save(self, path)
 
     @classmethod
     @final
     @validated
     def load(cls, path: str | Path) -> Self:
-        """Reads a result of this class written by `save`.
+        """Read a result of this class written by `save` to the file `path`.
 
         **Raises** `InputError` for a file that is missing or that holds something else.
         """

@@ -21,19 +21,22 @@ _folder: list[Path] = []
 
 @validated
 def use_cache(folder: str | os.PathLike[str] | None = None, *, only_if_unset: bool = False) -> Path:
-    """Cache compiled programs on disk, so that the next process that asks the same question neither traces nor compiles.
+    """Cache compiled programs on disk, so that the next process that computes the same neither traces nor compiles.
 
-    There are two caches: jaxvib's own in `folder/programs` holds traced programs, JAX's compilation cache in `folder` itself
-    holds compiled ones (`jax_compilation_cache_dir` stays if it is set already). jaxvib calls this function with the default
-    folder, unless JAXVIB_AUTOMATIC=off in the environment. Programs that differ in shapes, in options, in a version of jaxvib
-    or JAX, or in the processor have different keys. The folder may be deleted at any time.
+    - There are two caches: jaxvib's own in `folder/programs` holds traced programs, JAX's compilation cache in `folder` itself
+      holds compiled ones (`jax_compilation_cache_dir` stays if it is set already)
+    - jaxvib calls this function with the default folder, unless JAXVIB_AUTOMATIC=off in the environment
+    - Programs that differ in shapes, in options, in a version of jaxvib or JAX, or in the processor have different keys. The
+      folder may be deleted at any time
+    - A program that calls back into Python, such as one with a progress bar, cannot be stored
+    - No program is stored or read while a function or a constant of the package is replaced (by a mock, for example), or after
+      a source file was edited since its import
 
-    A program that calls back into Python, such as one with a progress bar, cannot be stored. No program is stored or read
-    while a function or a constant of the package is replaced (by a mock, for example), or after a source file was edited
-    since its import.
+    **Arguments**
 
-    **Arguments**: `folder` is created if it does not exist; default: JAX's compilation cache if it is set, otherwise
-    `$XDG_CACHE_HOME/jaxvib`, otherwise `~/.cache/jaxvib`. `only_if_unset` keeps a folder that was chosen before.
+    - `folder`, which is created if it does not exist; default: JAX's compilation cache if it is set, otherwise
+      `$XDG_CACHE_HOME/jaxvib`, otherwise `~/.cache/jaxvib`
+    - `only_if_unset`: True keeps a folder that was chosen before
 
     **Returns** the folder. **Raises** `InputError` for a folder that cannot be created, that belongs to another user, or in
     which others may write: users with write access to it can run code as you.

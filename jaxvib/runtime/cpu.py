@@ -28,9 +28,9 @@ def prepare_cpu(devices: int | None = 1) -> str:
     """Set XLA's flags in the environment, before JAX computes anything.
 
     With jax before 0.12 the first use of a public name of jaxvib calls this function, unless JAXVIB_AUTOMATIC=off in the
-    environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest
-    loops as a chain of small functions, and time integration takes many times as long; steady answers hardly change. From
-    0.12 on XLA needs no flag, and jaxvib sets none by itself. The flags, in `XLA_FLAGS`:
+    environment: without `xla_cpu_small_while_loop_byte_threshold` XLA's CPU backend runs the body of all but the smallest loops
+    as a chain of small functions, and time integration takes many times as long; steady answers hardly change. From 0.12 on XLA
+    needs no flag, and jaxvib sets none by itself. The flags, in `XLA_FLAGS`:
 
     - `xla_cpu_small_while_loop_byte_threshold=1000000000`, jax before 0.12: compiles a whole time loop into one function
     - `--xla_cpu_use_fusion_emitters=false`, jax before 0.11: a code generator that needs two thirds of the compile time
@@ -38,10 +38,11 @@ def prepare_cpu(devices: int | None = 1) -> str:
     - `--xla_force_host_platform_device_count` for several `devices`: your own programs may use them; jaxvib uses all cores
       without it
 
-    Flags that are set already stay as they are. Flags that the installed jaxlib does not know are left out, since XLA would
-    end the process.
+    Flags that are set already stay as they are. Flags that the installed jaxlib does not know are left out, since XLA would end
+    the process.
 
-    **Arguments**: `devices`, default 1; None: the number of cores that this process may use.
+    **Arguments**: `devices`: number of CPU devices, at least 1; typical: 1 (the default); None: the number of cores that this
+    process may use.
 
     **Returns** the flags. **Raises** `InputError` if JAX has computed already, so that they would have no effect, or for a
     number of devices below 1.

@@ -56,25 +56,31 @@ def animate(
     magnify: float | None = None,
     width: float = 6.4,
 ) -> Film:
-    """A film of a run or of an exact jam in slow motion, with a clock: platforms, springs, rotor and loads move, arrows are the
-    forces of the supports on the bed (black: of all of them), below are the displacements and the force over time.
+    """Return a film of a run or of an exact jam in slow motion, with a clock.
+
+    Platforms, springs, rotor and loads move. Arrows are the forces of the supports on the foundation (black: of all of them).
+    Below are the displacements and the force over time.
 
     **Arguments**
 
     - `motion`: a `Run`, or an `Orbit` with the `scene` that it belongs to
-    - `path`: where to write it, as GIF (".gif") or as one HTML page with its pictures inside (".html"); None writes nothing
-    - `begin`, `end`: what is shown, s or text; the last four vibrations of a run, or as many of an orbit, unless said otherwise
-    - `seconds` that the film lasts: unless said otherwise so many that the rotor goes on by a tenth of a turn in a picture;
-      `fps` pictures a second
-    - `magnify`: how many times larger displacements are drawn than the loads' circle; so that the largest is well seen unless
-      said otherwise. Said in the picture
-    - `width` of the picture, inches of 100 dots
+    - `path` of the file, as GIF (".gif") or as one HTML page with its pictures inside (".html"); None writes nothing
+    - `begin`, `end`: the part that is shown, s or text; default: the last four vibrations of a run, or as many of an orbit
+    - `seconds` that the film lasts; typical: 5 to 10; default: so many that the rotor turns by a tenth of a turn in a picture
+    - `fps`: pictures per second; typical: 20 (the default)
+    - `magnify`: magnification of displacements relative to the loads' circle, stated in the picture; typical: 1 to 50; default:
+      the largest displacement is well seen
+    - `width` of the picture, inches of 100 dots; typical: 6.4 (the default). Drawing takes most of the time, in proportion to
+      `seconds` times `fps`
 
     **Returns** a matplotlib animation, whose `save` writes further files. The same call gives the same file.
 
-    **Raises** `InputError` for a stretch that the run does not keep, too few samples in it, a film in which loads or rotor
-    would go on by nearly half a turn from one picture to the next, an orbit without its scene, and a file that is no GIF or
-    HTML or cannot be written.
+    **Raises** `InputError` for
+
+    - a part that the run does not keep, or too few samples in it
+    - a film in which loads or rotor would turn by nearly half a turn from one picture to the next
+    - an orbit without its scene
+    - a file that is no GIF or HTML or cannot be written
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -21,14 +21,15 @@ _INCH = 0.62
 
 @validated
 def sketch(scene: Scene, *, ax: Axes | None = None) -> Drawn:
-    """Draws a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
+    """Draw a scene at rest: its masses, springs, dampers, rotor and loads, with their numbers and units.
 
-    Platforms stand above each other, numbered from the bed upward; a rotor is seen along its axis, one that tilts from the side
-    too. Loads are spread over their circle so that each is seen. Sizes are not to scale but for the loads on their circle.
+    Platforms stand above each other, numbered from the foundation upward; a rotor is seen along its axis, and one that tilts
+    also from the side. Loads are spread over their circle so that each is seen. Sizes are not to scale, except for the loads on
+    their circle.
 
-    **Arguments**: `scene`, of any machine; `ax` axes to draw onto.
+    **Arguments**: `scene`, of any machine; `ax`: axes to draw onto.
 
-    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for what is no scene, or one
+    **Returns** a matplotlib figure, or the given `ax`. **Raises** `InputError` for an argument that is no scene, or a scene
     whose numbers are not known (within `jit`, `grad`).
 
     >>> import jaxvib as jv

@@ -39,7 +39,7 @@ def identify(value: object) -> Plain:
 
 
 class CaseStatus(eqx.Enumeration):
-    """Outcome of a case; the members are the sentences a user reads. Their order is part of the format of a store."""
+    """Outcomes of a case. Each member is the sentence shown to the user. Their order is part of the format of a store."""
 
     missing = "the case was not computed yet"
     done = "the case was computed"
@@ -54,7 +54,7 @@ CASE_STATUSES = enumeration_names(CaseStatus)
 
 
 class SweepStatus(eqx.Enumeration):
-    """Progress of a study; the members are the sentences a user reads."""
+    """Progress of a study. Each member is the sentence shown to the user."""
 
     done = "every case was computed"
     partly = "not every case was computed yet; run the study again to go on"

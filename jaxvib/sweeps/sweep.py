@@ -49,11 +49,17 @@ class CaseCount(NamedTuple):
 
 
 class Sweep(Result):
-    """A study's store, and how far it is; the numbers themselves stay on disk.
+    """Store of a study and its progress; the numbers themselves stay on disk.
 
-    **Attributes**: `status` a `SweepStatus`; `store` its path; `cases` how many there are; `counts` how many ended with each
-    status; `computed` cases in this call, in `seconds`, compiling included; `damaged` cases whose files were found damaged, or
-    cut off while they were written: `sweep` has computed them again, `open_sweep` counts them as missing.
+    **Attributes**
+
+    - `status`: a `SweepStatus`
+    - `store`: its path
+    - `cases`: their number
+    - `counts`: number of cases with each status
+    - `computed`: cases computed in this call, in `seconds`, compilation included
+    - `damaged`: cases whose files were damaged, or cut off while they were written: `sweep` has computed them again,
+      `open_sweep` counts them as missing
     """
 
     status: SweepStatus
@@ -66,7 +72,7 @@ class Sweep(Result):
 
     @property
     def data(self) -> xarray.Dataset:
-        """The labelled numbers, read from disk as far as they are asked for; `xarray.open_zarr(found.store)` gives them too.
+        """Labelled numbers, an xarray dataset that reads from disk on demand; `xarray.open_zarr(found.store)` gives them too.
 
         **Raises** `InputError` if xarray is not installed, or a chunk of the store is damaged.
         """
@@ -79,7 +85,7 @@ class Sweep(Result):
 
     @property
     def scene(self) -> Scene:
-        """The scene that the cases are made of."""
+        """Scene that all cases have in common."""
         return scene_from_toml(Store(Path(self.store)).record["scene"])
 
     def summary(self) -> str:
@@ -97,7 +103,7 @@ class Sweep(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """The figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot the figure that fits the study, see `plot_sweep`. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.sweeps.figures import plot_sweep
 
         return plot_sweep(self.store, ax=ax)
@@ -124,37 +130,48 @@ def sweep(
     timeout: Number = "30 s",
     report: Report | None = None,
 ) -> Sweep:
-    """Computes every case of a study and keeps it in a store on disk; where the store is there already, goes on with it.
+    """Compute every case of a study and keep it in a store on disk; an existing store of the same study is continued.
 
-    Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask. A finished chunk
-    is written at once and kept, whatever ends the process; one whose files are damaged is computed again. A case's numbers
-    depend on the case alone: not on the cases beside it, on the order, on how many workers there are, or on restarts.
+    - Cases are computed in chunks by one compiled program, on all cores of this process or by workers of Dask
+    - A finished chunk is written at once and kept, whatever ends the process; one whose files are damaged is computed again
+    - A case's numbers depend on the case alone: not on the cases beside it, on the order, on the number of workers, or on
+      restarts
 
     **Arguments**
 
-    - `scene`: what all cases have in common
-    - `axes`: what changes: a number of the scene by the name that designs have for it ("machine.stiffness[0]", "loads.drag",
-      "drive.speed"), or of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]"
-      m/s; without an entry of all alike), each with a list of values, or a table of `from`, `to`, `count` and `scale` ("even"
-      or "log"). Cases are all combinations. Numbers whose table has no `count` are sampled together, `samples` times for each
-      combination of the others
-    - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of what is read
-      off a run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
-      "run.foundation_force", "run.settling_time", ... ; or a mapping of names that they shall have
-    - `store`: a folder, by custom with the ending ".zarr"
-    - `tier`: how quantities of a jam are computed: "leading", "exact" or "time"; their own unless said otherwise
-    - `until`, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in it,
-      to `until`, s, by so many equal steps, the same in all cases; by default one for each radian of what moves fastest
-    - `samples`, `seed`, `sampling`: how many, and how they are drawn: "low_discrepancy" or "random"
-    - `chunk`: cases that are computed and written together; it is part of the store's record
-    - `workers`: so many processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
+    - `scene`: the part that all cases have in common
+    - `axes`: a mapping from names to values, see below; typical: 1 to 3 axes of 10 to 100 values
+    - `measure`: a list of quantities of `optimize`, functions of your own as `optimize.Quantity`, and names of measures of a
+      run (`jaxvib.sweeps.measures.RUN_MEASURES`): "run.regime", "run.mode", "run.load_speed", "run.amplitude",
+      "run.foundation_force", "run.settling_time", ... ; or a mapping from the names that they shall have
+    - `store`: a folder, usually with the ending ".zarr"
+    - `tier` of quantities of a jam: "leading", "exact" or "time"; default: that of each quantity
+    - `until`, s, `start`, `mode`, `steps`: runs go from the start ("rest", or "jam" near a `mode`), with the axes' numbers in
+      it, to `until`, by this number of equal steps, the same in all cases; default: one for each radian of the fastest motion
+    - `samples`, `seed`, `sampling`: number and kind of samples, "low_discrepancy" or "random"; typical: 1000 to 100,000
+    - `chunk`: cases that are computed and written together; it is part of the store's record; typical: the default, about a
+      second's work. Smaller chunks lose less at an interrupt and cost more file operations
+    - `workers`: number of processes on this machine; or `scheduler`, the address of a Dask scheduler ("tcp://10.0.0.1:8786"),
       which has `timeout`, s, to answer. They need the extra `cluster`
-    - `report`: is called with a `Progress` after each chunk
+    - `report`: a function that is called with a `Progress` after each chunk
+
+    Names of `axes`:
+
+    - a number of the scene by the name that designs have for it ("machine.stiffness[0]", "loads.drag", "drive.speed")
+    - a number of the start ("start.rate" rad/s, "start.angle" rad, "start.displacement[0]" m, "start.velocity[0]" m/s; without
+      an entry, all alike)
+
+    Values of an axis are a list, or a table of `from`, `to`, `count` and `scale` ("even" or "log"). Cases are all combinations.
+    Numbers whose table has no `count` are sampled together, `samples` times for each combination of the others.
 
     **Returns** `Sweep`. A case that fails raises nothing: its status and its sentence are in the store.
 
-    **Raises** `InputError` for values that are not allowed, a store of another study (any value that its results depend on is
-    another one, those in functions of your own too), a store into which another sweep writes, and one that cannot be written.
+    **Raises** `InputError` for
+
+    - values that are not allowed
+    - a store of another study (any value that its results depend on makes another study, including those in functions of your
+      own)
+    - a store into which another sweep writes, and one that cannot be written
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import pathlib, tempfile, jaxvib as jv
@@ -252,9 +269,20 @@ def _cases(new_study: Study, chunk: int) -> int:
 
 @validated
 def open_sweep(store: str | Path) -> Sweep:
-    """Read the store of a study that was run, or is being run: every file once, so that damaged chunks are known and counted.
+    """Read the store of a finished or running study: every file once, so that damaged chunks are known and counted.
+
+    **Arguments**: `store`: the folder of the study.
 
     **Returns** `Sweep`. **Raises** `InputError` for a folder that is no store, or a store whose metadata are damaged.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> from optimize import jam_frequency
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=100.0),
+    ...                  jv.balls(count=2, mass=0.25, radius=0.1, drag=0.25), jv.ConstantSpeed("60 rad/s"))
+    >>> store = pathlib.Path(tempfile.mkdtemp()) / "study.zarr"
+    >>> _ = jv.sweep(scene, {"drive.speed": [20.0, 60.0]}, [jam_frequency(mode=1)], store)
+    >>> jv.open_sweep(store).status_name
+    'done'
     """
     opened = Store(Path(store))
     states = opened.states()

@@ -44,8 +44,16 @@ class CostRow(NamedTuple):
 
 
 class Cost(Result):
-    """Cost of a quantity: the `quantity`, its `reference` values (a list), how far these may be wrong themselves
-    (`reference_error`, relative), the `rows`, and which tiers are `left_out`, a sentence with the reason for each."""
+    """Cost of a quantity by every method.
+
+    **Attributes**
+
+    - `quantity`: its name
+    - `reference`: its reference values, a list
+    - `reference_error`: the error that these may have themselves, relative
+    - `rows`: a row for each tier, method, tolerance and dtype, with its error and seconds
+    - `left_out`: the tiers that cannot answer, a sentence with the reason for each
+    """
 
     status = Computed.done
 
@@ -57,14 +65,17 @@ class Cost(Result):
 
     @validated
     def cheapest(self, error: float) -> CostRow | None:
-        """The fastest way to that relative error; None if there is none here, or the reference is not good enough to tell."""
+        """Return the row of the fastest method with that relative `error`, such as 1e-4.
+
+        None if no row is as accurate, or if the reference is not accurate enough to tell.
+        """
         if not self.reference_error < error:
             return None
         able = [row for row in self.rows if row.error + self.reference_error <= error]
         return min(able, key=lambda row: row.seconds, default=None)
 
     def summary(self) -> str:
-        """The cheapest way to each of the errors `WANTED`, and what is left out, for a person to read."""
+        """Return the fastest method for each of the errors `WANTED`, and the tiers left out, as text."""
         lines = [f"{self.quantity.replace('_', ' ')}: {len(self.rows)} ways, reference known to {self.reference_error:.1e}"]
         for wanted in WANTED:
             row = self.cheapest(wanted)
@@ -74,8 +85,9 @@ class Cost(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Error against seconds, a line for each method; see `cost_figure`; onto axes `ax` if given. **Returns** a
-        matplotlib figure, or the given `ax`.
+        """Plot error against seconds, a line for each method, onto axes `ax` if given; see `cost_figure`.
+
+        **Returns** a matplotlib figure, or the given `ax`.
         """
         return cost_figure({"": self}, ax=ax)
 

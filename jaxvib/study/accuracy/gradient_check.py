@@ -44,7 +44,7 @@ _LARGE, _TINY = 1e-2, 1e4 * float(np.finfo(float).eps)
 
 
 class GradientStatus(eqx.Enumeration):
-    """Outcomes of a check; the members are the sentences a user reads."""
+    """Outcomes of a check. Each member is the sentence shown to the user."""
 
     agree = "every derivative agrees with finite differences"
     differ = "derivatives differ from finite differences by more than was asked for and these may be off"
@@ -54,10 +54,11 @@ class GradientStatus(eqx.Enumeration):
 
 
 class ImplicitRoute(NamedTuple):
-    """A quantity read off what solves an equation: `read(scene, x)` where `residual(scene, x)` = 0, with `solution(scene)` = x.
+    """Quantity that is computed from the solution of an equation.
 
-    Its derivative by the implicit function theorem is d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp). x is an array
-    (n,) or a scalar, the residual as long.
+    `read(scene, x)` is the quantity, where `residual(scene, x)` = 0, with `solution(scene)` = x. Its derivative by the implicit
+    function theorem is d read/dp - (d read/dx) (d residual/dx)^-1 (d residual/dp). x is an array (n,) or a scalar, the residual
+    as long.
     """
 
     solution: Callable[[Scene], Array]
@@ -68,13 +69,20 @@ class ImplicitRoute(NamedTuple):
 class GradientCheck(Result):
     """Derivatives of a quantity by the numbers p of a scene, route by route, against finite differences.
 
-    All derivatives are p dq/dp, the change per relative change of the number, in the quantity's own unit; of a number that is
-    0, p is its typical size (an angle's is 1 rad, a position's 0.1 m). **Attributes**
-    (n numbers, r routes, k steps): `value` of the quantity; `numbers`: their names (n,), `at` their values (n,) in SI;
-    `routes`: their names (r,); `gradient` (r, n); `difference` (n,) by finite differences, `noise` (n,) what these may be off,
-    `step` (n,) relative, the best one; `error` (r, n) of each route against them, relative; `steps` (k,) of the sweep and
-    `sweep` (n, k) the central differences at each; `tolerance`; `left_out`: numbers so near to a bound that no step can
-    be made.
+    All derivatives are p dq/dp, the change per relative change of the number, in the quantity's own unit. For a number that is
+    0, p is its typical size (an angle's is 1 rad, a position's 0.1 m).
+
+    **Attributes** (n numbers, r routes, k steps)
+
+    - `value` of the quantity
+    - `numbers` (n,): their names, and `at` (n,): their values in SI
+    - `routes` (r,): their names
+    - `gradient` (r, n) by each route
+    - `difference` (n,) by finite differences, `noise` (n,): the error that these may have, `step` (n,): the best one, relative
+    - `error` (r, n) of each route against the differences, relative
+    - `steps` (k,) of the series, and `sweep` (n, k): the central differences at each
+    - `tolerance` of the check
+    - `left_out`: numbers so near to a bound that no step can be made
     """
 
     status: GradientStatus
@@ -93,7 +101,7 @@ class GradientCheck(Result):
     left_out: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """A line for each number, the worst first, for a person to read."""
+        """Return a line of text for each number, the worst first."""
         scale = _scale(self.difference)
         with np.errstate(invalid="ignore"):
             worst = np.max(np.where(np.isfinite(self.error), self.error, np.inf), axis=0)
@@ -107,15 +115,18 @@ class GradientCheck(Result):
         return "\n".join(lines)
 
     def require(self) -> GradientCheck:
-        """Itself where every derivative agrees. **Raises** `ComputationError` with the summary elsewhere: `differ`, `noisy`,
-        `not_finite`, `chaotic`."""
+        """Return the check itself if every derivative agrees.
+
+        **Raises** `ComputationError` with the summary otherwise: `differ`, `noisy`, `not_finite`, `chaotic`.
+        """
         if not bool(self.status == GradientStatus.agree):
             raise ComputationError(self.status_name, self.summary())
         return self
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Central differences against the first route over their step, a line for each number, and where they were best.
+        """Plot the central differences relative to the first route over their step, a line for each number, with the best
+        steps.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -142,23 +153,29 @@ def check_gradients(
 
         D(h) = (q(p + h p) - q(p - h p)) / (2 h),      E(h) = D(h/r) + (D(h/r) - D(h)) / (r^2 - 1),      r = sqrt 10
 
-    are extrapolated once, E. Best is the step where E agrees best with those at the next larger and the next smaller one; the
-    larger of both differences is what E may be off, the noise: truncation at large steps, rounding (eps |q|/h at least) and
-    the quantity's own tolerance at small ones. A derivative differs where it is away from E by more than `tolerance` and three
-    times the noise. Where steps of 1e-5 to 1e-7 change the quantity about as much as the largest does, and a derivative claims
-    that the smallest step alone would change it as much, disturbances have grown by more than 1e5 on the way: the status is
-    `chaotic`, whatever the routes agree on. `growth` tells after which time a run comes to that.
+    are extrapolated once, E.
+
+    - The best step is the one at which E agrees best with those at the next larger and the next smaller one. The larger of both
+      differences is the possible error of E, the noise: truncation at large steps, rounding (eps |q|/h at least) and the
+      quantity's own tolerance at small ones
+    - A derivative differs if its distance from E is more than `tolerance` and three times the noise
+    - If steps of 1e-5 to 1e-7 change the quantity about as much as the largest does, and a derivative claims that the smallest
+      step alone would change it as much, disturbances have grown by more than 1e5 on the way: the status is `chaotic`, whatever
+      the routes agree on. `growth` gives the time after which a run comes to that
 
     **Arguments**
 
-    - `quantity`: a function of a `Scene` that gives one number, such as `lambda s: jv.jam_modes(s).select(3).foundation_force`
+    - `scene` in double precision
+    - `quantity`: a function of a `Scene` that returns one number, such as `lambda s:
+      jv.jam_modes(s).select(3).foundation_force`
     - `free`: names of the numbers, such as "machine.stiffness", "loads.drag" or "effects.stop[0].gap": all their entries;
-      default: all numbers of the scene. A number that is 0 is moved by steps of its typical size; one at a bound, such as a
-      damping of 0, is left out
+      default: all numbers of the scene; typical: 5 to 20. A number that is 0 is moved by steps of its typical size; one at a
+      bound, such as a damping of 0, is left out. Each number takes 22 evaluations
     - `routes`: "forward" and "reverse" mode of JAX through the quantity; name those that it has (`simulate` has reverse unless
       it is given `diffrax.ForwardMode()`, and then forward)
-    - `implicit`: a third route for a quantity that reads off what solves an equation, see `ImplicitRoute`
-    - `tolerance`: relative, of each derivative; of those below a thousandth of the largest (as p dq/dp) relative to that
+    - `implicit`: a third route for a quantity that is computed from the solution of an equation, see `ImplicitRoute`
+    - `tolerance`: relative, of each derivative; of those below a thousandth of the largest (as p dq/dp) relative to that;
+      typical: 1e-4 to 1e-6 (default 1e-5)
 
     **Returns** `GradientCheck`; its `require()` is the assertion. **Raises** `InputError` for a scene in single precision, a
     quantity that is no number, unknown names and routes.

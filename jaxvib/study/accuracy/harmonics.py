@@ -67,9 +67,13 @@ class HarmonicConvergence(Result):
 def harmonic_convergence(
     scene: Scene, omega: Sequence[Number], *, points: Sequence[int] = (4, 6, 8, 10, 12, 16, 20, 24)
 ) -> HarmonicConvergence:
-    """The error of exact jams over the number of collocation points: it falls exponentially (spectral convergence).
+    """Return the error of exact jams over the number of collocation points: it falls exponentially (spectral convergence).
 
-    **Arguments**: `omega` load speeds, rad/s or text; `points` of the collocation, ascending, see `jam_orbit`.
+    **Arguments**
+
+    - `scene` of the jams
+    - `omega`: load speeds, rad/s or text; typical: 1 to 5 speeds on the branch
+    - `points` of the collocation, ascending, see `jam_orbit`; typical: 4 to 24 (the default)
 
     **Returns** `HarmonicConvergence`. **Raises** `InputError` for points that do not ascend, speeds not positive.
 

@@ -76,14 +76,18 @@ class Tiers(Result):
 
 @validated
 def compare_tiers(scene: Scene, factors: Sequence[float], *, mode: int) -> Tiers:
-    """A jam mode by the leading order and exactly, for loads heavier and lighter than the scene's by the given factors.
+    """Compare a jam mode by the leading order with the exact one, for loads heavier and lighter than the scene's.
 
-    Drag grows with the square of the mass, which leaves the leading-order balance n(Omega) as it is, but for the loads'
+    Drag grows with the square of the mass, which leaves the leading-order balance n(Omega) as it is, except for the loads'
     share in the mass of their platform. Dry friction grows as the mass does, as in a machine: with it the balance moves too.
 
-    **Arguments**: `factors` on the mass (and inertia) of the loads; `mode` a jam mode, see `jam_modes`.
+    **Arguments**
 
-    **Returns** `Tiers`. **Raises** `InputError` for a mode there can never be.
+    - `scene` of the jam
+    - `factors` on the mass (and inertia) of the loads; typical: 0.1 to 10
+    - `mode`: a jam mode, see `jam_modes`; typical: 1, 3, 5
+
+    **Returns** `Tiers`. **Raises** `InputError` for a mode out of 1 .. 2 nd + 1.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,

@@ -65,33 +65,35 @@ def work_precision(
     solvers: Sequence[str] = tuple(SOLVERS),
     repeats: int = 3,
 ) -> Cost:
-    """Computes a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time it takes.
+    """Compute a quantity of a scene by every tier, method, tolerance and dtype, with its error and the time that it takes.
 
-    - "amplitude", "foundation_force": of a jam mode, where the scene has jams that can be computed exactly; tiers leading
-      order, exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the
-      exact orbit with 32 points, its own error the difference to 24. Else (run-ups, imbalance, loads at different stations)
-      as measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error
-      the difference to 1e-11.
-    - "final_state": of the full equations at `until`, from rest; every solver, in double and in single precision. The
-      reference is a run to a tolerance of 1e-13, its own error estimated as every run's.
+    - "amplitude", "foundation_force": of a jam mode, if the scene has jams that can be computed exactly; tiers leading order,
+      exact orbit, averaged equations, and full integration, both from the leading order's motion. The reference is the exact
+      orbit with 32 points, its own error the difference to 24. Otherwise (run-ups, imbalance, loads at different stations) as
+      measured at the end of a run from rest; the reference is full integration to a tolerance of 1e-13, its own error the
+      difference to 1e-11
+    - "final_state": of the full equations at `until`, from rest; every solver, in double and in single precision. The reference
+      is a run to a tolerance of 1e-13, its own error estimated as every run's
     - "gradient": of the jam's largest amplitude with respect to the machine's stiffnesses; implicit derivatives of leading
-      order and exact orbit, forward and reverse mode and finite differences through the full integration.
+      order and exact orbit, forward and reverse mode and finite differences through the full integration
 
-    Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer
-    is left out, and the result says why.
+    Single precision is that of the leading order and of the default method of full integration. A tier that cannot answer is
+    left out, and the result states the reason.
 
     **Arguments**
 
-    - `quantity`: one of `QUANTITIES`
-    - `mode`: a jam mode; unless said otherwise the second highest there is with a rising slope, for in the highest the loads
-      turn with the rotor but for a small slip; where there is one only, that one
-    - `until`: s or text; unless said otherwise 20 slow periods, and for a jam besides as long as its slowest Floquet multiplier
-      needs to forget the start to the tolerance of the run
-    - `tolerances` of time integration, one at least; `solvers`: its methods, names from `SOLVERS`
-    - `repeats`: how often each is timed (less often where it takes seconds), the fastest counts
+    - `scene` in double precision
+    - `quantity`: one of `QUANTITIES`, the names above
+    - `mode`: a jam mode; default: the second highest with a rising slope, because in the highest the loads turn with the rotor
+      except for a small slip; if there is one only, that one
+    - `until`, s or text; default: 20 slow periods, and for a jam also as long as its slowest Floquet multiplier needs to forget
+      the start to the tolerance of the run
+    - `tolerances` of time integration, at least one; typical: 1e-3 to 1e-11 (the default)
+    - `solvers`: the methods, names from `SOLVERS`
+    - `repeats`: number of timings of each (less often if it takes seconds), the fastest counts; typical: 3 (the default)
 
     **Returns** `Cost`. **Raises** `InputError` for an unknown quantity or solver, no tolerance, a scene in single precision, a
-    gradient of a scene without an exact jam; as `jam_modes`, `simulate` besides.
+    gradient of a scene without an exact jam; further errors as `jam_modes`, `simulate`.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

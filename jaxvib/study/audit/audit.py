@@ -34,7 +34,7 @@ __all__ = ["Audit", "AuditStatus", "audit"]
 
 
 class AuditStatus(eqx.Enumeration):
-    """Outcomes of an audit; the members are the sentences a user reads."""
+    """Outcomes of an audit. Each member is the sentence shown to the user."""
 
     done = "what each effect changes was computed"
     unsettled = "the motion had not settled to the accuracy that was asked for: smaller changes cannot be told; run longer"
@@ -44,10 +44,15 @@ class AuditStatus(eqx.Enumeration):
 class Audit(Result):
     """Changes and cost of each effect and each tier on a scene.
 
-    **Attributes**: `accuracy` that was asked for, relative; `question` that was asked, in words; the scene's own `kind` of
-    motion, `omega` rad/s, `amplitude` (nd,) m, of tilts rad, `foundation_force` N and `fold` rad/s; `operations` of its
-    equations of motion, `seconds` of a run of 100 turns and `compile` (NaN where no time was taken); `effects`, `tiers` and
-    `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`; `coordinates`: their names.
+    **Attributes**
+
+    - `accuracy` that was requested, relative
+    - `question` that was computed, in words
+    - `kind` of the scene's own motion, `omega`, rad/s, `amplitude` (nd,), m, of tilts rad, `foundation_force`, N, and `fold`,
+      rad/s
+    - `operations` of its equations of motion, `seconds` of a run of 100 turns and `compile`, s (NaN if no time was taken)
+    - `effects`, `tiers` and `numbers`: lists of `EffectRow`, `TierRow`, `NumberRow`
+    - `coordinates`: their names
     """
 
     status: AuditStatus
@@ -68,7 +73,7 @@ class Audit(Result):
 
     @validated
     def advised(self, advice: str) -> list[str]:
-        """The names of the effects with that `advice`."""
+        """Return the names of the effects with that `advice`, "needed" or "negligible" for example."""
         return [row.effect for row in self.effects if row.advice == advice]
 
     def summary(self) -> str:
@@ -86,8 +91,10 @@ class Audit(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Plot the change by each effect against the requested accuracy, and its cost, onto two axes `ax` if given. **Returns**
-        a matplotlib figure, or the given `ax`."""
+        """Plot the change by each effect relative to the requested accuracy, and its cost, onto two axes `ax` if given.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
         from jaxvib.draw.comparison import audit_chart  # slow to import: only who draws pays
 
         plain_names = dict(zip(CHANGES, ("amplitude", "foundation force", "load speed", "end of the jam"), strict=True))
@@ -112,24 +119,26 @@ def audit(
 ) -> Audit:
     """Compute the change and the cost of each effect and each tier on a scene; find negligible and missing effects.
 
-    Each effect of the scene is taken out, each that it has not and could have is put in, with usual numbers
-    (`Effect.typical`), and the same question is asked of both scenes: of a scene that jams at a constant rotor speed, its jam,
-    by the exact orbit or, where that is refused, by the full equations until nothing changes; of any other, where a run has
-    come to. Judged is that motion, not the way to it. What couples a rotor's tilts, and the limit of a motor's power, are taken
-    out alike. Effects are asked for their properties, so that one of your own is audited as the package's are.
+    - Each effect of the scene is taken out; each that it lacks and could have is put in, with usual numbers (`Effect.typical`).
+      The same quantities of both scenes are computed
+    - For a scene that jams at a constant rotor speed this is its jam, by the exact orbit or, if that is refused, by the full
+      equations until nothing changes. For any other scene it is the end of a run. That motion is judged, not the way to it
+    - The coupling of a rotor's tilts and the limit of a motor's power are taken out in the same way
+    - Effects are characterized by their properties, so that one of your own is audited as the package's are
 
     **Arguments**
 
-    - `accuracy`: the relative change below which an effect is negligible
-    - `mode`: the jam mode, unless said otherwise the last but one that is stable by its slope
-    - `until`: s or text, the end of the run, where a run is asked for: unless said otherwise 100 slow periods, and besides
-      twice the time at which the drive's acceleration jumps last
-    - `start`: of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is asked
-      for in any case; unless said otherwise "turning" where the rotor's speed is constant, "rest" elsewhere
+    - `scene` to audit
+    - `accuracy`: the relative change below which an effect is negligible; typical: 0.001 to 0.05 (default 0.01)
+    - `mode`: the jam mode; default: the last but one that is stable by its slope
+    - `until`, s or text: the end of a run; default: 100 slow periods, and also twice the time at which the drive's acceleration
+      jumps last
+    - `start` of the run: "rest", "turning" (loads evenly spread, as fast as the rotor) or a `State`. With it a run is computed
+      in any case; default: "turning" if the rotor's speed is constant, otherwise "rest"
     - `possible`: effects to put in, in place of those that the package knows; `()` for none
-    - `tiers`: whether every tier is asked as well
-    - `repeats`: how often a run of 100 turns is timed, the fastest counts; 0 for no times, which saves a compilation for each
-      effect
+    - `tiers`: True to compute every tier as well
+    - `repeats`: number of timings of a run of 100 turns, the fastest counts; typical: 3 (the default); 0 for no times, which
+      saves a compilation for each effect
 
     **Returns** `Audit`. **Raises** `InputError` for an accuracy that is not between 0 and 1 and as `jam_modes`, `simulate`;
     `ComputationError` (status "absent") for a mode that does not exist.

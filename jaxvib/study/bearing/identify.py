@@ -42,7 +42,7 @@ _CONTRADICTS = 0.05
 
 
 class IdentifyStatus(eqx.Enumeration):
-    """Outcomes of a fit; the members are the sentences a user reads."""
+    """Outcomes of a fit. Each member is the sentence shown to the user."""
 
     found = "the fit explains the record up to noise"
     patterned = "what the fit leaves of the record is no noise: the law of friction misses something, intervals are false"
@@ -53,22 +53,27 @@ class IdentifyStatus(eqx.Enumeration):
 
 
 class Identified(Result):
-    """A bearing's friction and how well it is known.
+    """Friction of a bearing, with its uncertainty.
 
     **Attributes**
 
-    - `status` an `IdentifyStatus`; `notes`: sentences on what a reader should know besides
-    - `viscous` mu1 N m s, `dry` mu2 (None where it was not asked for): an `Estimate` each, instruments' share in the interval
+    - `status`: an `IdentifyStatus`
+    - `notes`: sentences with further advice for the reader
+    - `viscous` mu1, N m s, and `dry` mu2 (None if it was not requested): an `Estimate` each, instruments' share in the
+      interval; typical: 3e-4 to 2e-3 N m s and 0.001 to 0.005
     - `correlation` of the errors of mu1 and mu2 (NaN without mu2)
-    - `frequency` rad/s of small swings, `offset` rad of the record's zero, `angle` rad and `rate` rad/s at the first sample: an
-      `Estimate` each; `inertia` kg m^2: J that the frequency asks for with the pendulum's mass and length
-    - `noise` rad, standard deviation of a sample; `pattern`: correlation of neighbouring residuals, 0 for noise
+    - `frequency`, rad/s, of small swings, `offset`, rad, of the record's zero, `angle`, rad, and `rate`, rad/s, at the first
+      sample: an `Estimate` each
+    - `inertia`, kg m^2: J that follows from the frequency with the pendulum's mass and length
+    - `noise`, rad, standard deviation of a sample
+    - `pattern`: correlation of neighbouring residuals, 0 for noise
     - `structure`: F statistic of the residuals at the swing's frequency, its multiples and its slow changes, about 1 for noise
-    - `fitted` (n,) rad, the record as the model has it; `until` s, after which the record was left out: at rest;
-      `stopped_at` s, NaN where the pendulum swings to the end
-    - `width` rad/s that dry friction was smoothed with (NaN without mu2)
-    - `decrement`: the formula of ten periods on the same record, None where the record is too short for it
-    - `record`, `pendulum`: what was asked about
+    - `fitted` (n,), rad: the record as the model has it
+    - `until`, s, after which the record was left out: at rest
+    - `stopped_at`, s, NaN if the pendulum swings to the end
+    - `width`, rad/s, over which dry friction was smoothed (NaN without mu2)
+    - `decrement`: the formula of ten periods on the same record, None if the record is too short for it
+    - `record` and `pendulum` of the fit
     """
 
     status: IdentifyStatus
@@ -93,7 +98,7 @@ class Identified(Result):
     pendulum: BearingPendulum
 
     def summary(self) -> str:
-        """The numbers with their intervals, for a person to read."""
+        """Return the numbers with their intervals as text."""
         lines = [f"mu1 {shown(self.viscous)} N m s"]
         if self.dry is not None:
             lines[0] += f", mu2 {shown(self.dry)}"
@@ -104,7 +109,10 @@ class Identified(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """The record with the fit, and what the fit leaves; onto two axes `ax` if given."""
+        """Plot the record with the fit, and its residuals, onto two axes `ax` if given.
+
+        **Returns** a matplotlib figure, or the given `ax`.
+        """
         from jaxvib.draw.record import record_chart  # slow to import: only who draws pays
 
         return record_chart(self.record.time, self.record.angle, self.fitted, self.noise, ax=ax)
@@ -119,20 +127,26 @@ def shown(estimate: Estimate) -> str:
 def identify(
     pendulum: BearingPendulum, record: Record, *, dry: bool = False, instrument: float = 0.0, throw: bool = True
 ) -> Identified:
-    """mu1, or mu1 and mu2, of a bearing from a whole recorded swing.
+    """Return mu1, or mu1 and mu2, of a bearing from a whole recorded swing.
 
         record(t_i) = offset + f(t_i) + noise,      J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
 
-    Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
-    Levenberg and Marquardt's method with forward-mode derivatives through the integration. The frequency is free, because a
-    pendulum's size is never known well enough for its phase; it is the factor g that gives way, and J is taken from
-    `pendulum`, so that mu1 is in proportion to it. Samples before the release and after the last clear turning point, where the
-    pendulum rests or its swing is below the noise, are left out: on which side of the dead zone it comes to rest is no smooth
-    function of the friction. `width` is 0.005 of the smallest swing's speed: dry friction on it is
-    0.001 % too small, on larger ones less.
+    - Least squares over the angle and rate at the first sample, the offset, the frequency of small swings and the friction, by
+      Levenberg and Marquardt's method with forward-mode derivatives through the integration
+    - The frequency is free, because a pendulum's size is never known well enough for its phase; the factor g absorbs the
+      difference, and J is taken from `pendulum`, so that mu1 is in proportion to it
+    - Samples before the release and after the last clear turning point, when the pendulum rests or its swing is below the
+      noise, are left out: the side of the dead zone on which it comes to rest is no smooth function of the friction
+    - `width` is 0.005 of the smallest swing's speed: dry friction on it is 0.001 % too small, on larger ones less
 
-    **Arguments**: `dry`: find mu2 as well (the pendulum needs `bearing`); `instrument`: relative uncertainty of J, from ruler
-    and scales (0.03 in the paper), added to the intervals in squares; `throw`: raise where no fit is found.
+    **Arguments**
+
+    - `pendulum`: a `BearingPendulum`
+    - `record` of its swing; typical: 250 to 10,000 samples over 10 to 60 s, first amplitude 3 to 60 deg
+    - `dry`: True to find mu2 as well (the pendulum needs `bearing`)
+    - `instrument`: relative uncertainty of J, from ruler and scales, added to the intervals in squares; typical: 0.01 to 0.03
+      (0.03 in the paper; default 0)
+    - `throw`: raise if no fit is found
 
     **Returns** `Identified`. **Raises** `InputError` for a record that cannot be fitted, `ComputationError` "not_converged".
 

@@ -47,9 +47,14 @@ _TAIL = re.compile(r"^(?P<name>.+?)[\s_.:-]+(?P<tail>[^\W_]+|°)$")
 
 
 class Record(eqx.Module):
-    """A swing as it was recorded.
+    """Recorded swing of a pendulum.
 
-    **Arguments**: `time` (n,) s, ascending, steps need not be equal; `angle` (n,) rad, from any zero; `name` for messages.
+    **Arguments**
+
+    - `time` (n,), s, ascending, at least 16 samples; steps need not be equal; typical: 25 to 200 samples per second over 10 to
+      60 s
+    - `angle` (n,), rad, from any zero; typical: 0.05 to 1
+    - `name` for messages
 
     **Raises** `InputError` for lengths that differ, fewer than 16 samples, times that do not ascend, values that are not
     finite, and angles that no swing has, which are probably degrees.
@@ -98,7 +103,7 @@ class Record(eqx.Module):
 
     @validated
     def between(self, start: float, stop: float) -> Record:
-        """The part of the record from `start` to `stop`, s. **Raises** `InputError` where too little is left."""
+        """Return the part of the record from `start` to `stop`, s. **Raises** `InputError` if too little is left."""
         kept = (self.time >= start) & (self.time <= stop)
         if np.count_nonzero(kept) < _MIN_SAMPLES:
             span = f"{self.time[0]:g} s to {self.time[-1]:g} s"
@@ -110,17 +115,21 @@ class Record(eqx.Module):
 
 @validated
 def read_record(path: str | Path, *, columns: Sequence[str] | None = None, angle_unit: str | None = None) -> Record:
-    """Reads a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
+    """Read a record from a table of text: CSV, or columns between semicolons, tabs or blanks.
 
-    Lines that begin with # and empty lines are skipped. A first line of names may carry units, `time (s), angle (deg)`,
-    `t [ms]`, `ANGLE_DEG`, or the line below it may; letters of any size. Columns called time and angle (t, phi, theta, ...)
-    without a unit are s and rad; any other column needs a unit. Between semicolons, tabs or blanks numbers may have a decimal
-    comma.
+    - Lines that begin with # and empty lines are skipped
+    - A first line of names may carry units, `time (s), angle (deg)`, `t [ms]`, `ANGLE_DEG`, or the line below it may; letters
+      of any size
+    - Columns called time and angle (t, phi, theta, ...) without a unit are s and rad; any other column needs a unit
+    - Between semicolons, tabs or blanks numbers may have a decimal comma
 
-    **Arguments**: `columns`: names of the columns of time and angle, with or without their units, if they are not called time
-    and angle; `angle_unit`: "rad", "mrad", "deg", "gon" or "turn", in place of the header's.
+    **Arguments**
 
-    **Returns** `Record`. **Raises** `InputError` that says which line is wrong, or which column has no unit that is known.
+    - `path` of the file; typical: 250 to 10,000 lines
+    - `columns`: names of the columns of time and angle, with or without their units, if they are not called time and angle
+    - `angle_unit`: "rad", "mrad", "deg", "gon" or "turn", in place of the header's
+
+    **Returns** `Record`. **Raises** `InputError` with the wrong line, or the column without a known unit.
 
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "swing.csv"

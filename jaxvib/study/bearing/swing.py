@@ -32,15 +32,20 @@ __all__ = ["BearingPendulum", "Swing", "SwingStatus", "swing"]
 
 
 class BearingPendulum(eqx.Module):
-    """A pendulum on a bearing that stands still, its angle f counted from hanging.
+    """Pendulum on a bearing at rest, its angle f counted from hanging.
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) sign(f'),      J = m l^2 + J_C,      N = m (l f'^2 + g cos f)
 
     mu1 and mu2 are the bearing's viscous and dry friction; N is its radial load, along the rod.
 
-    **Arguments**: `mass` m kg; `length` l m, from the bearing's axis to the mass centre; `inertia` J_C kg m^2 about the mass
-    centre (0: a point mass; a rod of length L has m L^2/12); `bearing` its diameter d m, needed for dry friction only;
-    `g` m/s^2.
+    **Arguments** (SI or texts with a unit)
+
+    - `mass` m, kg; typical: 0.1 to 1
+    - `length` l from the bearing's axis to the mass centre, m; typical: 0.1 to 0.5
+    - `inertia` J_C about the mass centre, kg m^2 (default 0: a point mass; a rod of length L has m L^2/12); typical: 1e-3 to
+      0.05
+    - `bearing`: its diameter d, m, needed for dry friction only; typical: 0.005 to 0.02
+    - `g`, m/s^2; typical: 9.81 (the default)
 
     **Raises** `InputError` for wrong units and values that are not positive.
 
@@ -77,16 +82,19 @@ class BearingPendulum(eqx.Module):
         return jnp.sqrt(self.mass * self.g * self.length / self.total_inertia)
 
     def radial_load(self, angle: Array, rate: Array) -> Array:
-        """N = m (l f'^2 + g cos f), N: what the bearing bears along the rod."""
+        """Return N = m (l f'^2 + g cos f), N: the load of the bearing along the rod.
+
+        **Arguments**: `angle` f, rad, and its `rate` f', rad/s.
+        """
         return self.mass * (self.length * rate**2 + self.g * jnp.cos(angle))
 
     def dead_zone(self, dry: Array) -> Array:
-        """The angle, rad, up to which dry friction mu2 holds the pendulum at rest: tan f = mu2 d/(2 l)."""
+        """Return the angle, rad, up to which dry friction mu2 (`dry`) holds the pendulum at rest: tan f = mu2 d/(2 l)."""
         return jnp.arctan(dry * _diameter(self) / (2.0 * self.length))
 
 
 class SwingStatus(eqx.Enumeration):
-    """Outcomes of a swing; the members are the sentences a user reads."""
+    """Outcomes of a swing. Each member is the sentence shown to the user."""
 
     swinging = "the pendulum still swings at the last time"
     stopped = "dry friction brought the pendulum to a stop and holds it"
@@ -95,10 +103,16 @@ class SwingStatus(eqx.Enumeration):
 
 
 class Swing(Result):
-    """A decaying swing.
+    """Decaying swing of a pendulum.
 
-    **Attributes**: `status` a `SwingStatus`; `time` (n,) s; `angle` (n,) rad from hanging and `rate` (n,) rad/s; `stopped_at`
-    s, NaN where it still swings; `width` rad/s that dry friction was smoothed with, NaN without; `steps` taken.
+    **Attributes**
+
+    - `status`: a `SwingStatus`
+    - `time` (n,), s
+    - `angle` (n,), rad from hanging, and `rate` (n,), rad/s
+    - `stopped_at`, s, NaN if it still swings
+    - `width`, rad/s, over which dry friction was smoothed, NaN without
+    - `steps` taken
     """
 
     status: SwingStatus
@@ -117,7 +131,7 @@ class Swing(Result):
 
     @validated
     def plot(self, *, ax: Onto = None) -> Drawn:
-        """Angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
+        """Plot angle and rate over time, onto two axes `ax` if given. **Returns** a matplotlib figure, or the given `ax`."""
         from jaxvib.draw.results import signals_chart  # slow to import: only who draws pays
 
         angle, rate = (np.asarray(x)[:, None] for x in (self.angle, self.rate))
@@ -141,25 +155,30 @@ def swing(
     max_steps: int = 2**17,
     throw: bool = True,
 ) -> Swing:
-    """The pendulum's motion at the times `time`, from `angle` and `rate` at the first of them.
+    """Return the pendulum's motion at the times `time`, from `angle` and `rate` at the first of them.
 
         J f'' = - m g l sin f - mu1 f' - mu2 |N| (d/2) tanh(f'/width)
 
-    Where the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it: it stays there for good.
+    If the pendulum turns within the dead zone |tan f| < mu2 d/(2 l), dry friction holds it: it stays there for good.
 
-    **Arguments**
+    **Arguments** (SI or texts with a unit)
 
-    - `time` (n,) s, ascending; `angle` rad from hanging, `rate` rad/s at time[0]
-    - `viscous` mu1, N m s; `dry` mu2, no unit (about 0.0015 for ball bearings); left out, there is no dry friction
-    - `width` rad/s of the passage through 0 of the sign of sliding; unless said otherwise a twentieth of the dead zone's
-      angle times the natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less
-    - `stepsize_controller`: `Tolerance` of a step, relative, and in rad (the default is 1e-9, in single precision 1e-5), or a
-      controller of diffrax; `solver`, `adjoint`, `max_steps` diffrax's
-    - `throw`: raise where the steps do not suffice; otherwise, and under a JAX transformation, the status says so
+    - `pendulum`: a `BearingPendulum`
+    - `time` (n,), s, ascending; typical: 10 to 200 s
+    - `angle` from hanging, rad, and `rate`, rad/s (default 0), at time[0]; typical: 3 to 60 deg
+    - `viscous` mu1, N m s; typical: 3e-4 to 2e-3
+    - `dry` mu2, no unit; typical: about 0.0015 for ball bearings; default: no dry friction
+    - `width`, rad/s, of the passage through 0 of the sign of sliding; default: a twentieth of the dead zone's angle times the
+      natural frequency, so that a swing as small as the dead zone loses 0.1 % too little, a larger one less. A smaller width
+      needs more steps
+    - `stepsize_controller`: `Tolerance` of a step, relative, and in rad; typical: 1e-6 to 1e-9 (the default; in single
+      precision 1e-5). Or a controller of diffrax
+    - `solver`, `adjoint`, `max_steps`: those of diffrax
+    - `throw`: raise if the steps do not suffice; otherwise, and under a JAX transformation, the status shows it
 
     **Returns** `Swing`; gradients, forward (with `adjoint=diffrax.ForwardMode()`) and reverse, `jit` and `vmap` go through it.
 
-    **Raises** `InputError` for wrong values, dry friction without the bearing's diameter; `ComputationError`.
+    **Raises** `InputError` for wrong values and for dry friction without the bearing's diameter; `ComputationError`.
 
     >>> import numpy as np, jaxvib as jv
     >>> rod = jv.BearingPendulum(mass=0.3, length=0.25, inertia=0.00625, bearing=0.02)

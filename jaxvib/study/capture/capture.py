@@ -45,7 +45,7 @@ _SCAN = 32
 
 
 class CaptureStatus(eqx.Enumeration):
-    """Outcomes of a search for a threshold; the members are the sentences a user reads."""
+    """Outcomes of a search for a threshold. Each member is the sentence shown to the user."""
 
     found = "from the threshold up every start was captured"
     all_captured = "every start was captured: the threshold lies below the speeds that were tried"
@@ -54,18 +54,23 @@ class CaptureStatus(eqx.Enumeration):
 
 
 class Capture(Result):
-    """Success from initial speeds of the loads relative to the rotor.
+    """Captures from initial speeds of the loads relative to the rotor.
 
-    **Attributes** (S speeds, each tried from `starts` perturbed positions): `speed` (S,) ascending, (psi')/w, -1 for loads at
-    rest in space, 0 for loads that turn with the rotor; `captured` (S, starts) whether all loads turned with the rotor at
-    the end; `finite` (S, starts) whether the motion stayed so; `detached` (S, starts) whether a load did not press on its wall
-    on the way, where it was kept on it all the same; `threshold`, the least speed from which on all starts were captured,
-    halfway to the next lower speed that was tried, and `uncertainty`, half the distance to that speed or to the highest speed
-    at which half of the starts fail, whichever is more, and at least the move, NaN where there is no threshold; `moved`, by how
-    much the last doubling of the steps moved the threshold, infinite if it appeared or vanished, NaN without a doubling;
-    `steps` and `turns` of the rotor that each run took; `status` a `CaptureStatus`.
+    **Attributes** (S speeds, each tried from `starts` perturbed positions)
 
-    Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` says how often.
+    - `status`: a `CaptureStatus`
+    - `speed` (S,), ascending, (psi')/w: -1 for loads at rest in space, 0 for loads that turn with the rotor
+    - `captured` (S, starts): True if all loads turned with the rotor at the end
+    - `finite` (S, starts): True if the motion stayed finite
+    - `detached` (S, starts): True if a load did not press on its wall at some time, although the equations kept it there
+    - `threshold`: the least speed from which on all starts were captured, halfway to the next lower speed that was tried
+    - `uncertainty`: half the distance to that speed or to the highest speed at which half of the starts fail, whichever is
+      more, and at least the move; NaN if there is no threshold
+    - `moved`: change of the threshold by the last doubling of the steps, infinite if it appeared or vanished, NaN without a
+      doubling
+    - `steps` and `turns` of the rotor that each run took
+
+    Below the threshold outcomes may be chaotic, captures standing alone among failures: there `fraction` gives their share.
     """
 
     speed: np.ndarray = eqx.field(metadata=in_unit("", "speed"))
@@ -81,24 +86,23 @@ class Capture(Result):
 
     @property
     def fraction(self) -> np.ndarray:
-        """The share of starts captured at each speed, (S,)."""
+        """Share of starts captured at each speed, (S,)."""
         return np.mean(self.captured, axis=1)
 
     @property
     def border(self) -> float:
-        """The threshold, but -1 if every start was captured."""
+        """Threshold, or -1 if every start was captured."""
         return -1.0 if np.all(self.captured) else float(self.threshold)
 
     @property
     def standard_error(self) -> np.ndarray:
-        """Standard error of the fraction, (S,), by Agresti and Coull: also where all starts, or none, were captured it is not
-        0."""
+        """Standard error of the fraction, (S,), by Agresti and Coull: it is not 0 if all starts, or none, were captured."""
         n = self.captured.shape[1]
         share = (np.sum(self.captured, axis=1) + 2.0) / (n + 4.0)
         return np.sqrt(share * (1.0 - share) / (n + 4.0))
 
     def summary(self) -> str:
-        """The threshold with its uncertainty, and what stands below it, for a person to read."""
+        """Return the threshold with its uncertainty, and the outcomes below it, as text."""
         n = self.captured.shape[1]
         head = f"{self.message} ({self.speed.size} speeds, {n} starts each, {int(self.turns)} turns)"
         doubled = "" if np.isnan(self.moved) else f"; their last doubling moved the threshold by {float(self.moved):.1e}"
@@ -117,7 +121,7 @@ class Capture(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """The share of starts captured over the initial speed, and the threshold; onto the axes `ax` where they are given.
+        """Plot the share of starts captured over the initial speed, and the threshold, onto the axes `ax` if given.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -164,27 +168,36 @@ def capture(
 ) -> Capture:
     """Find the initial speeds from which the balls of a torus come to turn with the rotor, and the least such speed.
 
-    Each speed is tried from `starts` positions of the loads along the ring, and each run taken to its end: a run without
-    progress may still be captured late, so that none is cut short. With a `resolution` the stretch between the threshold and
-    the next lower speed is tried again, finer and finer. Above the threshold of the speeds tried first nothing is looked at
-    again: an island of failures narrower than their distance stays unseen. All of it is repeated with twice the steps until the
-    threshold moves by no more than the resolution, or the distance of the `speeds`.
+    - Each speed is tried from `starts` positions of the loads along the ring, and each run goes to its end: a run without
+      progress may still be captured late, so none is cut short
+    - With a `resolution` the range between the threshold and the next lower speed is tried again, finer and finer. The range
+      above the threshold of the first speeds is not refined: an island of failures narrower than their distance stays unseen
+    - All of it is repeated with twice the steps until the threshold moves by no more than the resolution, or the distance of
+      the `speeds`
 
     **Arguments**
 
-    - `speeds`: initial speeds relative to the rotor's, ascending, from -1 (at rest in space) to 0; 32 of them by default
-    - `turns` of the rotor that each run takes; a capture that needs more counts as a failure
-    - `starts` a speed; all but the first are moved along the ring, each load by itself, by up to `spread` rad, by `seed`
-    - `resolution`: how finely the threshold is looked for, relative to the rotor's speed
-    - `turning` "rolling", for balls that roll from the start, or "still", for balls that are thrown without turning, so that
+    - `scene` with `torus_balls` and an ideal drive
+    - `speeds`: initial speeds relative to the rotor's, ascending, from -1 (at rest in space) to 0; typical: 32 of them (the
+      default)
+    - `turns` of the rotor that each run takes; typical: 1000 to 3000 (default 2000). A capture that needs more counts as a
+      failure, and the time grows in proportion
+    - `starts` for each speed; typical: 1 (the default) to 32. All but the first are moved along the ring, each load by itself,
+      by up to `spread`
+    - `spread`, rad; typical: 1e-3 (the default)
+    - `seed` of these moves
+    - `resolution` of the threshold, relative to the rotor's speed; typical: 1e-2 to 1e-4. Each refinement takes a run of all
+      starts
+    - `turning`: "rolling", for balls that roll from the start, or "still", for balls that are thrown without turning, so that
       they slide until they roll; it needs the effect `Sliding`
     - `stepsize_controller`: `EqualSteps(n)` for the whole run, which are not doubled; the default begins with a step for each
-      radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time
-      constant of the fastest decay
-    - `doublings` of the default steps at most; 0 takes the first answer
+      radian of the fastest motion, two if that is a contact between balls or the end of a slip, and a third for a time constant
+      of the fastest decay; typical: 200 for each turn
+    - `doublings` of the default steps at most; typical: 2 (the default); 0 takes the first answer. One doubling takes three
+      times the work of none
     - `equations`: as `ensemble`
 
-    **Returns** `Capture`. **Raises** `InputError` for loads that are none of a torus, a motor, and numbers not allowed.
+    **Returns** `Capture`. **Raises** `InputError` for loads that are not in a torus, a motor, and numbers that are not allowed.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

@@ -31,12 +31,17 @@ __all__ = ["ThresholdCurve", "threshold_curve"]
 
 
 class ThresholdCurve(Result):
-    """The initial speed from which on balls are captured, over a number.
+    """Threshold of capture over a number of the scene.
 
-    **Attributes** (V values): `value` (V,); `threshold` and `uncertainty` (V,), those of `Capture` at each value: -1 if every
-    start was captured, NaN if not every start at the highest speed was; `least` (V,), the least speed at which any start was
-    captured, NaN if none was: between both, captures and failures alternate; `moved` (V,), by how much the last doubling of the
-    steps moved the threshold; `turns` of the rotor that each run took.
+    **Attributes** (V values)
+
+    - `value` (V,) of that number
+    - `threshold` and `uncertainty` (V,): those of `Capture` at each value: -1 if every start was captured, NaN if not every
+      start at the highest speed was
+    - `least` (V,): the least speed at which any start was captured, NaN if none was. Between both, captures and failures
+      alternate
+    - `moved` (V,): change of the threshold by the last doubling of the steps
+    - `turns` of the rotor that each run took
     """
 
     status = Computed.done
@@ -49,7 +54,7 @@ class ThresholdCurve(Result):
     turns: Array = eqx.field(metadata=in_unit(""))
 
     def summary(self) -> str:
-        """A line for each value, for a person to read."""
+        """Return a line of text for each value."""
         lines = [f"captured in {int(self.turns)} turns: from which initial speed on, and the least, in the rotor's speed"]
         for each in zip(self.value, self.threshold, self.uncertainty, self.least, strict=True):
             value, threshold, uncertainty, least = map(float, each)
@@ -82,9 +87,14 @@ def threshold_curve(
     turning: Turning = "rolling",
     equations: Equations = vector_field,
 ) -> ThresholdCurve:
-    """Capture thresholds of scenes that differ in one number.
+    """Return the capture thresholds of scenes that differ in one number.
 
-    **Arguments**: `make` gives the scene of a value; `values` (V,); all others as `capture`, which is asked for each of them.
+    **Arguments**
+
+    - `make`: a function that returns the scene of a value
+    - `values` (V,) of the number; typical: 5 to 20
+    - `speeds`, `turns`, `starts`, `spread`, `seed`, `resolution`, `turning`, `equations`: as `capture`, which computes each
+      value
 
     **Returns** `ThresholdCurve`. **Raises** `InputError` for no values, and as `capture`.
 

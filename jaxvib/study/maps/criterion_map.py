@@ -80,13 +80,18 @@ class CriterionMap(Result):
 def criterion_map(
     scene: Scene, *, speeds: Sequence[float], mass: Sequence[float], drag: Sequence[float], steps: int | None = None
 ) -> CriterionMap:
-    """Compares `criterion` with `balanced_growth` over rotor speed, load mass and drag.
+    """Compare `criterion` with `balanced_growth` over rotor speed, load mass and drag.
 
-    **Arguments**: `speeds` rad/s, ascending; `mass`, `drag` factors greater than 0, times the mass and the drag of
-    the scene's loads; `steps` as `balanced_stability`. The loads are in the first arrangement of `balanced_states`.
+    **Arguments**
 
-    **Returns** `CriterionMap`. **Raises** `InputError` for values that are not positive or not ascending, and as
-    `balanced_stability`.
+    - `scene`; its loads are in the first arrangement of `balanced_states`
+    - `speeds`, rad/s, ascending; typical: 50 to 200 from half the lowest to twice the highest resonance
+    - `mass` and `drag`: factors greater than 0, times the mass and the drag of the scene's loads; typical: 0.1 to 10
+    - `steps` as `balanced_stability`; default: as many as the natural frequencies need. The time grows in proportion
+
+    **Returns** `CriterionMap`.
+
+    **Raises** `InputError` for values that are not positive or not ascending, and as `balanced_stability`.
 
     >>> import jaxvib as jv
     >>> machine = jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0)

@@ -115,20 +115,26 @@ def run_ups(
     batch: int = 16,
     max_steps: int | None = None,
 ) -> RunUps:
-    """Runs the scene up from rest, at each drag from each of many initial angles of its loads, and names what comes out.
+    """Run the scene up from rest, at each drag from each of many initial angles of its loads, and name the regimes at the end.
 
     **Arguments**
 
-    - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`)
-    - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; the scene's unless said otherwise
-    - `starts`: so many sets of random angles, uniform over the circle, by `seed`; or `angles`: the sets themselves, (ns, count)
-      rad. Default: one set, at the bottom and as far `apart` as in `simulate`
+    - `scene`, with a drive that starts from rest for a run-up
+    - `until`: end time, s or text; regimes are named over the last turns before it (see `simulate`); typical: 5 to 20
+    - `drag`: values of the loads' drag b_W, N s/m, shared by all loads; default: the scene's; typical: 5 to 20 values from 0.05
+      to 5
+    - `starts`: number of sets of random angles, uniform over the circle, by `seed`; typical: 32 to 1000. From few starts a
+      share is known to 1 / sqrt(starts) only
+    - `seed` of the random angles
+    - `angles`: the sets themselves, (ns, count) rad, in place of `starts`. Default: one set, at the bottom and as far `apart`
+      as in `simulate`
+    - `apart`: angle between neighbouring loads of that set, rad; typical: 0.02
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
-    - `batch`: so many runs go side by side on each core
-    - `max_steps`: a run fails after so many steps; unless said otherwise as many as `simulate` allows, 2^20 at least
+    - `batch`: number of runs that go side by side on each core; typical: 16 (the default)
+    - `max_steps`: a run fails after this number of steps; default: as `simulate`, 2^20 at least
 
-    **Returns** `RunUps`, whose `fraction` says how many of the starts came to a kind of motion. From few starts a share is
-    known to 1 / sqrt(starts) only. A run that fails raises nothing: it is counted as "failed".
+    **Returns** `RunUps`, whose `fraction` gives the share of the starts that came to a kind of motion. A run that fails raises
+    nothing: it is counted as "failed".
 
     **Raises** `InputError` for values that are not allowed.
 
