@@ -67,7 +67,7 @@ def test_a_replaced_function_is_neither_stored_nor_ignored(folder):
 
 
 def replaces(x):
-    with mock.patch.object(jam, "JUDGED", "otherwise"):  # another thread could
+    with mock.patch.object(jam, "STABILITY_CRITERION", "otherwise"):  # another thread could
         return x + 1.0
 
 
@@ -93,7 +93,7 @@ def another(self, *args):
 CHANGES = {
     "a function": changed(linear, "peak_force", another),
     "an imported function": changed(jam, "peak_force", another),
-    "a constant": changed(jam, "JUDGED", "not at all"),
+    "a constant": changed(jam, "STABILITY_CRITERION", "not at all"),
     "a class": changed(drive, "ConstantSpeed", type("ConstantSpeed", (), {})),
     "a method": changed(loads.Loads, "position", another),
     "an inherited method": changed(drive.RunUp, "rotor_acceleration", another),

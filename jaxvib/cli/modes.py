@@ -45,8 +45,8 @@ def modes(
     import jax  # slow to import, as what follows, and --help needs none of it
     import numpy as np
 
-    from jaxvib.steady.jams.jam import JUDGED
-    from jaxvib.steady.jams.phases import growth_apart
+    from jaxvib.steady.jams.jam import STABILITY_CRITERION
+    from jaxvib.steady.jams.phases import growth_of_free_loads
 
     loaded = loaded_scene(scene, without, speed)
     if exact and phases:
@@ -64,16 +64,16 @@ def modes(
     if csv is not None:
         output.csv(csv, jv.branches(loaded), "point")
     jams = [found.select(k) for k in found.mode_numbers()]
-    growth = dict(zip(found.mode.tolist(), growth_apart(loaded, found.omega).tolist(), strict=True))
+    growth = dict(zip(found.mode.tolist(), growth_of_free_loads(loaded, found.omega).tolist(), strict=True))
     folds = [k for k, there in enumerate(np.asarray(found.folds.exists)) if there]
     document = {
         "rotor_speed": loaded.drive.speed,
         "resonances": found.resonances,
-        "judged": JUDGED,
+        "judged": STABILITY_CRITERION,
         "modes": [
             {
                 **fields_of(jam, "mode", "omega", "stable"),
-                "growth_apart": growth[int(jam.mode)],
+                "growth_of_free_loads": growth[int(jam.mode)],
                 "status": jam.message,
                 **fields_of(jam, "amplitude", "foundation_force"),
             }
@@ -88,8 +88,8 @@ def modes(
                 f"{int(jam.mode)}",
                 f"{float(jam.omega):.5g}",
                 f"{_RPM * float(jam.omega):.5g}",
-                {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "apart"),
-                _apart(growth[int(jam.mode)]),
+                {"stable by slope": "stable", "unstable by slope": "unstable"}.get(jam.judgement, "cannot stay"),
+                _stability_text(growth[int(jam.mode)]),
                 *(f"{1e3 * float(a):.4g}" for a in jam.amplitude),
                 f"{float(jam.foundation_force):.4g}",
             ]
@@ -108,13 +108,13 @@ def modes(
         ]
         lines = [
             f"rotor {speed:.5g} rad/s ({_RPM * speed:.5g} rpm); resonances {resonances}",
-            table("jam modes of light loads; amplitudes zero to peak, force on the bed in N", head, rows)
+            table("jam modes of light loads; amplitudes zero to peak, foundation force in N", head, rows)
             if rows
             else "no jam mode here",
         ]
         if rows:
             lines.append(
-                "by slope: of loads that stay together; loads free: each moves for itself (growth of a disturbance, 1/s)"
+                "by slope: for loads that stay together; loads free: for loads that can separate (growth of a disturbance, 1/s)"
             )
         if folds:
             pairs = [[f"{found.folds.omega[k]:.5g}", f"{found.folds.rotor_speed[k]:.5g}"] for k in folds]
@@ -124,9 +124,9 @@ def modes(
     output.done(document, text, "modes", found)
 
 
-def _apart(growth: float) -> str:
-    """Text about the separation of the loads of a jam."""
-    return "not known" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
+def _stability_text(growth: float) -> str:
+    """Text on the stability of a jam whose loads can separate."""
+    return "unknown" if math.isnan(growth) else f"{'stable' if growth < 0.0 else 'unstable'} ({growth:.2g})"
 
 
 def _left_out(scene: jv.Scene) -> list[str]:

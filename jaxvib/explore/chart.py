@@ -10,8 +10,8 @@ from jaxvib.draw.machine.svg import svg
 from jaxvib.draw.style import COLORS, GUIDE, speed_scale, together
 from jaxvib.explore.panel import APART, FIRST, LAST, OPERATING, ROTOR, TALL, WIDE, Panel, dot, legend
 from jaxvib.steady.branches import Branches
-from jaxvib.steady.jams.jam import JUDGED
-from jaxvib.steady.jams.picture import MARKS
+from jaxvib.steady.jams.branch_plot import MARKS
+from jaxvib.steady.jams.jam import STABILITY_CRITERION
 
 __all__ = ["chart"]
 
@@ -78,5 +78,5 @@ def chart(found: Branches, most: float) -> str:
     parts += [dot(*speeds.at(n, w), _FOLD) for n, w in folds]
     width = FIRST + 2.0 * WIDE + APART + LAST
     keys, names = legend({**_LEGEND, MARKS["fold"]: _FOLD} if folds else _LEGEND)
-    texts.append(Text(0.5 * width, -0.8, f"stable {JUDGED}", {"fontsize": "small", "ha": "center"}))
+    texts.append(Text(0.5 * width, -0.8, f"stable {STABILITY_CRITERION}", {"fontsize": "small", "ha": "center"}))
     return svg((0.0, width, -0.95, TALL + 1.1), [[*parts, *keys]], [[*texts, *names]], "", 1.0, 0.0)

@@ -19,9 +19,9 @@ from jaxvib.machine.scene_field import SCENE
 from jaxvib.machine.validation import validate_scene
 from jaxvib.results.fields import in_unit, part
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import Folds, fold_points
-from jaxvib.steady.jams.jam import JUDGED, AbstractJam, Jam, branch_points
-from jaxvib.steady.jams.picture import branch_summary, picture
+from jaxvib.steady.jams.jam import STABILITY_CRITERION, AbstractJam, Jam, branch_points
 from jaxvib.units import Number, count, number
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Branches(AbstractJam):
         folds = zip(
             *(np.asarray(x)[np.asarray(self.folds.exists)] for x in (self.folds.omega, self.folds.rotor_speed)), strict=True
         )
-        return branch_summary(self, [("fold", w, n) for w, n in folds], JUDGED)
+        return branch_summary(self, [("fold", w, n) for w, n in folds], STABILITY_CRITERION)
 
     @validated
     def plot(
@@ -76,7 +76,9 @@ class Branches(AbstractJam):
         folds = self.folds
         found = [k for k, there in enumerate(np.asarray(folds.exists)) if there]
         marks = [("fold", float(folds.omega[k]), float(folds.rotor_speed[k])) for k in found]
-        return picture(self, marks, unit, most, JUDGED, show, ax, np.asarray(self.mode), np.asarray(self.resonances))
+        return plot_branch(
+            self, marks, unit, most, STABILITY_CRITERION, show, ax, np.asarray(self.mode), np.asarray(self.resonances)
+        )
 
 
 @validated

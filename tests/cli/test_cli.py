@@ -25,7 +25,7 @@ def test_modes_json_has_the_promised_keys(typed):
     document = json.loads(out)
     assert code == 0 and err == ""
     assert set(document) == {"rotor_speed", "resonances", "judged", "modes", "folds"}
-    keys = {"mode", "omega", "stable", "growth_apart", "status", "amplitude", "foundation_force"}
+    keys = {"mode", "omega", "stable", "growth_of_free_loads", "status", "amplitude", "foundation_force"}
     assert set(document["modes"][0]) == keys and document["judged"] == "by slope, for light loads that stay together"
     assert set(document["folds"][0]) == {"omega", "rotor_speed"}
     modes = jv.jam_modes(scene("two_mass", speed=150.0))

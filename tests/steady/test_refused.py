@@ -48,7 +48,7 @@ def test_numbers_that_are_not_allowed_end_in_a_status(question):
     program = jax.jit(answer)
     values = [place(scene) for place in PLACES.values()]
     good = program(values)
-    assert set(np.ravel(status_names(good.status))) <= {"found", "absent", "done", "coarse"}
+    assert set(np.ravel(status_names(good.status))) <= {"found", "absent", "done", "under_resolved"}
     for k in range(len(values)):
         for wrong in (-values[k], values[k] * jnp.nan):
             found = program([wrong if j == k else value for j, value in enumerate(values)])

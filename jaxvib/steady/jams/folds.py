@@ -1,4 +1,4 @@
-"""The branch n(Omega) of light loads, cut at its folds into monotone pieces."""
+"""Branch n(Omega) of light loads, divided at its folds into monotone pieces."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from jaxvib.results.fields import in_unit
 __all__ = ["Folds", "branch_slope", "branch_tangent", "jam_rotor_speed", "light_rotor_speed", "rotor_speed_at"]
 
 _GRID_POINTS = 64
-"""Grid points on each side of each pole, where folds are looked for."""
+"""Number of grid points on each side of each pole in the search for folds."""
 
 
 class Folds(eqx.Module):
@@ -41,17 +41,18 @@ class Folds(eqx.Module):
 
 
 def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> Array:
-    """The rotor's speed n (rad/s) at which the loads jam at one angle at speed `omega` (scalar, rad/s), for light loads.
+    """Rotor speed n (rad/s) of a jam of light, coincident loads with load speed `omega` (scalar, rad/s).
 
         n(w) = w - S w^2 Im(e^H B Y(w)) / (2 sum_j b_Wj R_j^2)
 
-    with Y from `steady_displacement`: the drag's torque balances the mean torque of the vibration. It is explicit in
-    `omega`, and single-valued through the folds. Where the carrier couples through the rotor's speed, Y is that at `speed`.
-    Dry friction helps the drag with mu2 (d/2) N sign(n - w) a load; n is then the root of that balance between w and the
-    above, N = m R w^2 (the loads' weight left out: it adds nothing on the average of a turn unless it exceeds that). An
-    imbalance of the rotor shakes at n and not at w, and adds nothing here.
+    with Y from `steady_displacement`: the torque of the drag balances the mean torque of the vibration. The formula is explicit
+    in `omega` and single-valued through the folds. If the rotor speed couples the carrier's coordinates, Y is that at `speed`.
 
-    **Returns** n, a scalar. **Raises** `InputError` as `jam_modes` does for scenes it cannot judge.
+    Dry friction adds the torque mu2 (d/2) N sign(n - w) of each load to the drag; n is then the root of that balance between w
+    and the value above, with N = m R w^2. The weight of the loads is neglected, since its average over a turn is zero unless it
+    exceeds N. An imbalance of the rotor acts at the frequency n and not at w, and has no effect here.
+
+    **Returns** n, a scalar. **Raises** `InputError` for the same scenes as `jam_modes`.
 
     >>> import jaxvib as jv
     >>> form = jv.Dimensionless("antiphase", natural=(1/3, 1/3), damping=(0.01, 0.01), link_natural=2/3, link_damping=0.01,
@@ -65,15 +66,15 @@ def jam_rotor_speed(scene: Scene, omega: Array, speed: Array | None = None) -> A
 
 
 def rotor_speed_at(model: JammedModel, omega: Array, speed: Array | None = None) -> Array:
-    """`jam_rotor_speed` of a scene that is assembled already."""
+    """`jam_rotor_speed` for an assembled scene."""
     return _balance(model, omega, speed)[0]
 
 
 def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
-    """Rotor's speed of light loads at a load speed (rad/s), see `jam_rotor_speed`: a start for exact jams.
+    """Rotor speed of light loads at a load speed (rad/s), see `jam_rotor_speed`; the starting point for exact jams.
 
-    If the carrier's answer depends on the rotor's speed (gyroscopic), n = w + torque(w, n)/drag can have several roots:
-    it is the lowest one that a grid of rotor speeds from w to 1e4 w shows.
+    If the response of the carrier depends on the rotor speed (gyroscopic), n = w + torque(w, n)/drag can have several roots.
+    The result is the lowest one on a grid of rotor speeds from w to 1e4 w.
     """
     if model.mount.gyroscopic is None:
         return rotor_speed_at(model, omega)
@@ -88,9 +89,9 @@ def light_rotor_speed(model: JammedModel, omega: Array) -> Array:
 
 
 def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tuple[Array, Array]:
-    """`rotor_speed_at`, and the amplitudes of the carrier there."""
+    """Rotor speed of `rotor_speed_at` and the amplitudes of the carrier."""
     displacement = model.displacement(omega, speed)
-    # The drag's torque is opposite to that of the acceleration -w^2 Y.
+    # The torque of the drag is opposite to that of the acceleration -w^2 Y.
     torque = mean_torque(model.unbalance, omega**2 * jnp.sum(jnp.conj(model.force_direction) * displacement))
     free = omega + torque / model.drag
     effects = model.scene.effects
@@ -104,18 +105,18 @@ def _balance(model: JammedModel, omega: Array, speed: Array | None = None) -> tu
 
 
 def branch_tangent(model: JammedModel, omega: Array) -> tuple[Array, Array, Array]:
-    """The rotor's speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
+    """Rotor speed at a load speed, dn/dOmega along the branch, and the amplitudes (nd,) of the carrier."""
     return jax.jvp(lambda w: _balance(model, w), (omega,), (jnp.ones_like(omega),), has_aux=True)
 
 
 def branch_slope(model: JammedModel, omega: Array) -> Array:
-    """dn/dOmega along the branch."""
+    """Slope dn/dOmega of the branch."""
     return branch_tangent(model, omega)[1]
 
 
 class Pieces(NamedTuple):
-    """Monotone pieces of a branch: load speeds at their ends, the rotor's speeds there and mode numbers, (2 nd + 1,) each;
-    resonances and folds."""
+    """Monotone pieces of a branch: load speeds and rotor speeds at their ends and mode numbers, (2 nd + 1,) each; resonances
+    and folds."""
 
     low: Array
     high: Array
@@ -127,13 +128,13 @@ class Pieces(NamedTuple):
 
 
 def branch_pieces(model: JammedModel) -> Pieces:
-    """The branch cut at its folds into monotone pieces, each with its mode number; empty pieces have low = high."""
+    """Divide the branch at its folds into monotone pieces with mode numbers; empty pieces have low = high."""
     frozen = jax.lax.stop_gradient(model)
     grid, resonances = fold_points(model, _GRID_POINTS)
     nd = resonances.shape[0]
     grid, slopes = _with_close_folds(jax.vmap(lambda w: branch_slope(frozen, w)), grid, 2 * nd)
     falling = slopes < 0.0
-    change = _first_of(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
+    change = _first_places(falling[1:] != falling[:-1], 4 * nd, grid.shape[0] - 1)
     found = change < grid.shape[0] - 1
     change = jnp.minimum(change, grid.shape[0] - 2)
     ends = (grid[change], grid[change + 1], (slopes[change], slopes[change + 1]))
@@ -155,9 +156,9 @@ def branch_pieces(model: JammedModel) -> Pieces:
 
 
 def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
-    """Mode numbers (2 nd + 1,) of the pieces of a branch, which turns at load speeds `cuts` (2 nd,) where they are `found`.
+    """Mode numbers (2 nd + 1,) of the pieces of a branch with folds at the load speeds `cuts` (2 nd,), if `found` is True.
 
-    Each peak belongs to the resonance it is nearest to; two peaks never share one, and the last ones find one too.
+    Each peak belongs to the nearest resonance, except that two peaks never share a resonance and every peak has one.
     """
     nd = resonances.shape[0]
     owners: list[Array] = []
@@ -174,9 +175,10 @@ def piece_modes(cuts: Array, found: Array, resonances: Array) -> Array:
 
 
 def without_ripples(speeds: Array, count: Array, most: int) -> Array:
-    """Indices of the `most` folds that matter, of twice as many with rotor speeds `speeds`, of which the first `count` exist.
+    """Indices of the `most` relevant folds among twice as many with rotor speeds `speeds`, of which the first `count` exist.
 
-    A branch has a peak for each resonance; where it ripples besides, the neighbours that span least are left out.
+    A branch has one peak for each resonance. If it has additional ripples, the pairs of folds with the smallest ratio of rotor
+    speeds are dropped.
     """
     index = jnp.arange(2 * most)
 
@@ -193,11 +195,11 @@ def without_ripples(speeds: Array, count: Array, most: int) -> Array:
 
 
 def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
-    """Load speeds, `per_side` on each side of every pole, that crowd there as closely as its width asks, and the resonances,
-    of which alone there are derivatives.
+    """Grid of load speeds for the search for folds, and the resonances; only the resonances have derivatives.
 
-    Folds lie between some of these points. They crowd about the poles s of det(K + s^2 M + s C) = 0, not about undamped
-    resonances: a strong damper between two platforms locks them into one, whose sharp peak is at neither's resonance.
+    The grid has `per_side` points on each side of each pole s of det(K + s^2 M + s C) = 0, with a density that follows the
+    width of its peak. Undamped resonances would not do: a strong damper between two platforms locks them into one body, whose
+    sharp peak is at neither resonance.
     """
     resonances, _ = model.modes()
     matrices = (model.mass, model.damping(model.scene.drive.speed), model.carrier.stiffness)
@@ -211,7 +213,7 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
     def crowded(reach: Array) -> Array:
         return width * jnp.sinh(s * jnp.arcsinh(reach / width))
 
-    # Of a pair of poles one has the points above, the other one those below; a pole that is real has nothing below.
+    # One pole of a conjugate pair gets the points above, the other the points below; a real pole has no points below.
     centre = jnp.abs(poles.imag)[:, None]
     below, above = centre - crowded(jnp.maximum(centre - low, 0.0)), centre + crowded(jnp.full_like(width, 5.0 * top))
     points = jnp.where(poles.imag[:, None] >= 0.0, above, below)
@@ -219,26 +221,25 @@ def fold_points(model: LinearModel, per_side: int) -> tuple[Array, Array]:
 
 
 def _poles(mass: Array, damping: Array, stiffness: Array) -> Array:
-    """The 2 nd complex s with det(K + s C + s^2 M) = 0."""
+    """Poles: the 2 nd complex s with det(K + s C + s^2 M) = 0."""
     n = mass.shape[0]
     solved = small_solve(mass, jnp.concatenate([stiffness, damping], axis=1))
     shift = jnp.concatenate([jnp.zeros((n, n), mass.dtype), jnp.eye(n, dtype=mass.dtype)], axis=1)
     return jnp.linalg.eigvals(jnp.concatenate([shift, -solved]))
 
 
-def _first_of(there: Array, size: int, otherwise: int) -> Array:
-    """The first `size` places of what is there (n,), ascending, and where it is fewer `otherwise`, which comes after them."""
+def _first_places(there: Array, size: int, otherwise: int) -> Array:
+    """The first `size` indices at which `there` (n,) is True, ascending, padded with `otherwise`."""
     return jnp.sort(jnp.where(there, jnp.arange(there.shape[0]), otherwise))[:size]
 
 
 def _with_close_folds(slopes: Callable[[Array], Array], grid: Array, most: int) -> tuple[Array, Array]:
-    """The grid and the `slopes` at it, with points added where they come closest to 0 and turn back: two folds may hide in one
-    interval."""
+    """Grid and `slopes` on it, with points added at minima of |slope|, since one interval can contain two folds."""
     value = slopes(grid)
     sign, size = jnp.sign(value), jnp.abs(value)
     same = (sign[1:-1] == sign[:-2]) & (sign[1:-1] == sign[2:])
     dips = same & (size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:])
-    at = _first_of(dips, most, dips.shape[0] - 1)
+    at = _first_places(dips, most, dips.shape[0] - 1)
     step = (jnp.sqrt(jnp.asarray(5.0, grid.dtype)) - 1.0) / 2.0
 
     side, lowest = jnp.sign(value[at + 1]), jnp.abs(value[at + 1])

@@ -1,4 +1,4 @@
-"""Jam modes and folds followed from a machine to one that differs a little: a few steps of Newton's method each."""
+"""Continuation of jam modes and folds to a slightly different machine by a few Newton steps."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from jaxvib.steady.jams.jam import Jam, jam_at
 __all__ = ["follow_fold", "follow_jam"]
 
 _NEWTON_STEPS = 6
-"""Number of steps of Newton's method, which converges quadratically from a near machine; NaN without convergence."""
+"""Number of Newton steps; the method converges quadratically from a similar machine. The result is NaN without convergence."""
 
 
 def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
-    """The jam mode of that number whose load speed is near `near` (scalar, rad/s), at the scene's rotor speed n.
+    """Solve for the jam mode with number `mode` and a load speed near `near` (scalar, rad/s), at the scene's rotor speed n.
 
-    Newton's method on (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`: beside a resonance at w_r the left side is
-    close to a multiple of |w - w_r|, so that few steps lead far. `jam_modes` looks at the whole branch and takes a hundred
-    times as long; it says which number a mode has, and this does not: modes that exchange numbers on the way are not noticed.
+    Newton's method solves (n(w) - w)^(-1/2) = (n - w)^(-1/2), see `jam_rotor_speed`. Near a resonance w_r the left side is
+    almost proportional to |w - w_r|, therefore a few steps converge from far away. `jam_modes` computes the whole branch and
+    takes a hundred times as long. It determines the number of a mode; this function keeps the number, and does not notice modes
+    that exchange their numbers.
 
-    **Returns** `Jam`, its numbers NaN where the iteration has not converged or ended on a piece of the branch of the other
-    direction. First derivatives are exact.
+    **Returns** `Jam`, with NaN if the iteration has not converged or ended on a piece of the branch with the wrong sign of the
+    slope. First derivatives are exact.
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv
@@ -47,7 +48,7 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
     omega = _newton(gap, near, target)
     ahead, slope = jax.jvp(lambda w: rotor_speed_at(still, w), (omega,), (jnp.ones_like(omega),))
-    # The step from the root that this is has no length, and the root's derivatives.
+    # A Newton step from the root has length zero and the derivatives of the root.
     omega = omega - (rotor_speed_at(model, omega) - speed) / slope
     met = jnp.abs(ahead - target) < 1e-9 * (target + jnp.abs(slope) * omega)
     there = met & (omega > 0.0) & (omega < target) & ((slope > 0.0) == (mode % 2 == 1))
@@ -56,10 +57,12 @@ def follow_jam(model: JammedModel, mode: int, near: Array) -> Jam:
 
 
 def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
-    """Load speed and rotor speed, rad/s, of the fold near the load speed `near` (scalar, rad/s), see `Folds`.
+    """Solve for the fold near the load speed `near` (scalar, rad/s), see `Folds`.
 
-    Newton's method on n'(w)/(n(w) - w)^2 = 0, which is close to linear about a resonance. **Returns** NaN where it has not
-    converged; first derivatives are exact (that of the rotor's speed needs none of the load speed: the branch is flat there).
+    Newton's method solves n'(w)/(n(w) - w)^2 = 0, which is almost linear near a resonance.
+
+    **Returns** its load speed and rotor speed, rad/s, NaN without convergence. First derivatives are exact; that of the rotor
+    speed does not need that of the load speed, since the branch is flat at a fold.
     """
     still = jax.lax.stop_gradient(model)
 
@@ -75,7 +78,7 @@ def follow_fold(model: JammedModel, near: Array) -> tuple[Array, Array]:
 
 
 def _newton(f: Callable[[Array], Array], start: Array, most: Array) -> Array:
-    """Newton's method; no step is longer than a tenth of the unknown, and the unknown stays below `most`."""
+    """Root of `f` by Newton's method with steps of at most a tenth of the unknown, which stays below `most`."""
 
     def step(_: int, w: Array) -> Array:
         value, slope = jax.jvp(f, (w,), (jnp.ones_like(w),))

@@ -29,9 +29,9 @@ from jaxvib.units.known import when_known
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["JUDGED", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
+__all__ = ["STABILITY_CRITERION", "AbstractJam", "Jam", "JamModes", "JamStatus", "jam_at", "jam_modes"]
 
-JUDGED = "by slope, for light loads that stay together"
+STABILITY_CRITERION = "by slope, for light loads that stay together"
 """Criterion of the stability of a jam mode, and its condition."""
 
 
@@ -41,7 +41,7 @@ class JamStatus(eqx.Enumeration):
     found = "the loads can jam in this mode"
     absent = "this mode does not exist at this rotor speed"
     at_fold = "the rotor speed is that of a fold: the mode merges with its neighbour and has no gradient"
-    apart = "these loads cannot stay together here: one needs more torque than the vibration has at any phase"
+    cannot_stay_together = "these loads cannot jam at one angle: one needs more torque than the vibration has at any phase"
     unbounded = "the loads turn at a resonance that nothing damps: the vibration has no bound"
     refused = REFUSED
 
@@ -83,8 +83,8 @@ class Jam(AbstractJam):
 
     @property
     def judgement(self) -> str:
-        """ "stable" or "unstable" by slope, or that loads which differ cannot stay together."""
-        if bool(self.status == JamStatus.apart):
+        """ "stable" or "unstable" by slope, or "loads cannot stay together"."""
+        if bool(self.status == JamStatus.cannot_stay_together):
             return "loads cannot stay together"
         return f"{'stable' if self.stable else 'unstable'} by slope"
 
@@ -156,7 +156,9 @@ class JamModes(AbstractJam):
         """Return a table in text; amplitudes zero to peak."""
         lines = [f"rotor speed {np.asarray(self.rotor_speed)[0]:.6g} rad/s, resonances "]
         lines[0] += ", ".join(f"{w:.6g}" for w in np.asarray(self.resonances)) + " rad/s"
-        return "\n".join([*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {JUDGED}"])
+        return "\n".join(
+            [*lines, *(f"  {self.select(k).summary()}" for k in self.mode_numbers()), f"stable: {STABILITY_CRITERION}"]
+        )
 
     @validated
     def plot(self, *, unit: SpeedUnit = "rad/s", ax: Onto = None) -> Drawn:
@@ -226,7 +228,7 @@ def jam_modes(scene: Scene) -> JamModes:
 
 
 def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
-    """The jams at their load speeds, which are known; neither resonances nor folds."""
+    """Jams from their load speeds; without resonances and folds."""
     n, model, there = scene.drive.speed, jammed_model(scene), jams.status != JamStatus.absent
     omega = jax.vmap(lambda root: known_root(lambda w: rotor_speed_at(model, w) - n, root))(jnp.where(there, jams.omega, n))
     fields = _fields(model, jnp.where(there, omega, n), there, jams.status == JamStatus.at_fold)
@@ -235,7 +237,7 @@ def _from_jams(jams: JamModes, scene: Scene) -> JamModes:
 
 @cached(outputs_from_solution=_from_jams)
 def jams_of(scene: Scene) -> JamModes:
-    """`jam_modes` of a scene that is known to be right."""
+    """`jam_modes` for a validated scene."""
     n, model = scene.drive.speed, jammed_model(scene)
     pieces = branch_pieces(model)
     omega, exists = _solved_on_pieces(model, pieces)
@@ -246,7 +248,7 @@ def jams_of(scene: Scene) -> JamModes:
     chosen = jnp.argmax(hits, axis=1)
     omega = jnp.where(there, omega[chosen], n)
 
-    # Closer to a fold than this, its rotor speed cannot be told from the scene's, and a derivative has no digits left.
+    # Closer to a fold, rounding hides the difference between its rotor speed and the scene's, and derivatives have no digits.
     speeds = jax.lax.stop_gradient(jnp.where(pieces.folds.exists, pieces.folds.rotor_speed, jnp.inf))
     close = jnp.concatenate([jnp.zeros((1,), bool), jnp.abs(speeds - n) < 4096.0 * jnp.finfo(n.dtype).eps * n])
     close = (close | jnp.roll(close, -1))[chosen]
@@ -278,26 +280,28 @@ def _fields(model: JammedModel, omega: Array, there: Array, at_fold: Array) -> d
 def jam_at(
     model: JammedModel, number: Array, omega: Array, rotor_speed: Array | None = None, at_fold: Array | None = None
 ) -> Jam:
-    """The jam of mode `number` whose loads turn at `omega` rad/s, at a rotor speed (rad/s) at which it exists, all scalars;
-    `at_fold` whether it lies at its fold. Unless they are said these are the branch's rotor speed, and whether that hardly
-    changes there. Its status is never `absent`: who asks knows that it is there."""
+    """Jam of mode `number` with load speed `omega` rad/s at a rotor speed (rad/s) at which it exists, all scalars.
+
+    **Arguments**: `rotor_speed` (default: that of the branch); `at_fold`: True if it lies at its fold (default: if the slope
+    of the branch is almost zero). Never returns `absent`; the caller has established that the mode exists.
+    """
     speed, slope, displacement = branch_tangent(model, omega)
     rotor_speed = speed if rotor_speed is None else rotor_speed
     at_fold = jnp.abs(slope) < jnp.sqrt(jnp.finfo(omega.dtype).eps) if at_fold is None else at_fold
-    # Within a few units of the last digit of an undamped resonance the amplitude is rounding, not an answer.
+    # Within a few units of the last digit of an undamped resonance the amplitude consists of rounding errors.
     radius = model.unbalance / jnp.min(jnp.diagonal(model.mass))
     bounded = jnp.all(magnitude(displacement) * 100.0 * jnp.finfo(radius.dtype).eps < radius)
     displacement = jnp.where(bounded, displacement, jnp.nan)
     slope = jnp.where(bounded, slope, jnp.nan)
     status = JamStatus.where(at_fold, JamStatus.at_fold, JamStatus.found)
-    held = _held(model, omega, rotor_speed, displacement)
-    status = JamStatus.where(held, status, JamStatus.apart)
+    can_stay = _can_stay_together(model, omega, rotor_speed, displacement)
+    status = JamStatus.where(can_stay, status, JamStatus.cannot_stay_together)
     return Jam(
         mode=number,
         status=JamStatus.where(bounded, status, JamStatus.unbounded),
         omega=omega,
         rotor_speed=rotor_speed,
-        stable=held & (slope > 0.0),
+        stable=can_stay & (slope > 0.0),
         slope=slope,
         displacement=displacement,
         amplitude=magnitude(displacement),
@@ -306,9 +310,9 @@ def jam_at(
     )
 
 
-def _held(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
-    """True if the vibration, which is largest for coincident loads, has the torque S w^2 |e^H B Y| / 2 >= b_W R^2 (n - w) that
-    each load needs at some phase; equal loads share the torque."""
+def _can_stay_together(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Array) -> Array | bool:
+    """True if the torque of the vibration on each load at its best phase, S w^2 |e^H B Y| / 2, reaches the torque
+    b_W R^2 (n - w) of its drag; the vibration is largest for coincident loads. Always True for equal loads."""
     loads = model.loads
     if loads.alike:
         return True
@@ -318,7 +322,7 @@ def _held(model: JammedModel, omega: Array, rotor_speed: Array, displacement: Ar
 
 
 def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
-    """The jams at load speeds `omega` (any number, ascending), each at the rotor speed it belongs to, and the folds."""
+    """Jams at load speeds `omega` (any number, ascending), each at its own rotor speed, and the folds."""
     pieces = branch_pieces(model)
     cuts = jnp.where(pieces.folds.exists, pieces.folds.omega, jnp.inf)
     numbers = pieces.mode[jnp.searchsorted(cuts, omega)]
@@ -327,7 +331,7 @@ def branch_points(model: JammedModel, omega: Array) -> tuple[Jam, Folds]:
 
 
 def _solved_on_pieces(model: JammedModel, pieces: Pieces) -> tuple[Array, Array]:
-    """The load speeds on the monotone pieces at which the branch has the scene's rotor speed, and whether there is one."""
+    """Load speeds on the monotone pieces at which the branch has the scene's rotor speed, and True where there is one."""
     target = model.scene.drive.speed
     gaps = pieces.speed_low - target, pieces.speed_high - target
     exists = (pieces.high > pieces.low) & (gaps[0] * gaps[1] <= 0.0)

@@ -1,4 +1,4 @@
-"""Zeros of a few equations by Newton's method, from one start or from many together."""
+"""Roots of a few equations by damped Newton's method, from one start or from many at once."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ __all__ = ["damped_newton"]
 Given = TypeVar("Given", bound=PyTree[Array])
 Beside = TypeVar("Beside", bound=PyTree[Array])
 _State: TypeAlias = tuple[Array, Beside, Array, Array, Array, Array]
-"""The best unknowns so far, what was found beside, what is left of the equations there, the sum of its squares, the slopes, and
-the damping."""
+"""Best unknowns so far, auxiliary values, residuals, sum of the squared residuals, Jacobian and damping."""
 
 
 def damped_newton(
@@ -34,14 +33,15 @@ def damped_newton(
     *,
     on_numbers: bool = True,
 ) -> tuple[Array, Beside]:
-    """A zero of `balance`, by steps that are damped where they do not help (Levenberg, Marquardt), from `start`.
+    """Solve `balance(x, given) = 0` from `start` by Newton steps with the damping of Levenberg and Marquardt.
 
-    **Arguments**: `balance(x, given)` what is left of the equations, about 1 far from a zero or less (the steps end where
-    rounding is all that they can still change), and what else is wanted there; `iterations` how many steps at most;
-    `on_numbers` whether all of it may be written on single numbers, see `scalarize`: from many starts that takes a third of
-    the time.
+    **Arguments**
 
-    **Returns** the zero, and what `balance` finds beside.
+    - `balance(x, given)`: returns the residuals, of size 1 or less far from a root, and auxiliary values
+    - `iterations`: maximum number of steps; the iteration ends earlier if only rounding errors are left
+    - `on_numbers`: evaluate on single numbers, see `scalarize`, which takes a third of the time for many starts
+
+    **Returns** the root and the auxiliary values there.
 
     >>> x, two_x = damped_newton(lambda x, a: (x**2 - a, 2.0 * x), jnp.ones(1), jnp.full(1, 2.0))
     >>> round(float(x[0]), 5), round(float(two_x[0]), 5)
@@ -61,37 +61,37 @@ def damped_newton(
         new, by, found = jax.vmap(along, out_axes=(None, 1, None))(one)
         left = jnp.sum(new**2)
         better = left < size  # and not NaN
-        # A damping without bound says that this is the end.
+        # An infinite damping ends the iteration.
         more = jnp.where(size < tiny, jnp.inf, jnp.minimum(8.0 * damping, 1e8))
         then = trial, found, new, left, by, jnp.maximum(0.1 * damping, 1e-14)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), then, (x, beside, value, size, slopes, more))
 
     one = np.eye(start.shape[0], dtype=start.dtype)
     nothing = jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), jax.eval_shape(balance, start, given)[1])
-    # The first step goes nowhere: it looks at the start, which is better than nothing.
+    # The first iteration only evaluates the residuals at the start, since the initial residual is infinite.
     inf, tenth = jnp.asarray(jnp.inf, start.dtype), jnp.asarray(0.1, start.dtype)
     begin = start, nothing, jnp.zeros_like(start), inf, jnp.asarray(one), tenth
     leaves, structure = jax.tree.flatten(begin)
     small = on_numbers and sum(leaf.size for leaf in leaves) <= MAX_SCALARS
     program = scalarized_program(step, begin, given) if small else None
     if program is None:
-        return jax.tree.unflatten(structure, _repeated(_on_arrays(step, begin, given), leaves, iterations))[:2]
+        return jax.tree.unflatten(structure, _iterate(_on_arrays(step, begin, given), leaves, iterations))[:2]
     known = scalars_of(given)
-    numbers = iter(_repeated(lambda *now: fenced(program, [*now, *known]), scalars_of(begin), iterations))
+    numbers = iter(_iterate(lambda *now: fenced(program, [*now, *known]), scalars_of(begin), iterations))
     arrays = [jnp.stack([next(numbers) for _ in range(leaf.size)]).reshape(leaf.shape) for leaf in leaves]
     return jax.tree.unflatten(structure, arrays)[:2]
 
 
 def _on_arrays(step: Callable[[_State, Given], _State], begin: _State, given: Given) -> Callable[..., Sequence[Array]]:
-    """A step of the arrays of a state, with the sines and cosines of programs on single numbers where JAX allows."""
+    """Step on the arrays of a state, with the sine and cosine of programs on single numbers if JAX allows."""
     program, structure, known = arrays_program(step, begin, given), jax.tree.structure(begin), jax.tree.leaves(given)
     if program is None:
         return lambda *now: jax.tree.leaves(step(jax.tree.unflatten(structure, now), given))
     return lambda *now: jaxpr_as_fun(program)(*now, *known)
 
 
-def _repeated(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
-    """The state after so many steps and the first look, or fewer where its last number, the damping, is without bound."""
+def _iterate(step: Callable[..., Sequence[Array]], begin: Sequence[Array], times: int) -> Sequence[Array]:
+    """State after the first evaluation and `times` steps, or fewer if the damping, its last number, becomes infinite."""
 
     def going(now: tuple[Array, list[Array]]) -> Array:
         return (now[0] <= times) & (now[1][-1] < jnp.inf)

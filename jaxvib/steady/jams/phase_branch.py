@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PhaseBranch", "drag_curve"]
 
-_JUMP = 0.3
+_PHASE_JUMP = 0.3
 """Phases that move by more, rad, from one load speed to the next are drawn as another pattern's."""
 
 
@@ -78,5 +78,5 @@ class PhaseBranch(Result):
 def drag_curve(branch: PhaseBranch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drag factor, load speed and stability to be drawn: the factor is NaN where phases jump to another pattern."""
     turned = np.exp(1j * np.diff(np.asarray(branch.phase), axis=0))
-    jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _JUMP)
+    jump = np.append(False, np.max(np.abs(turned - 1.0), axis=1) > _PHASE_JUMP)
     return np.where(jump, np.nan, np.asarray(branch.drag_factor)), np.asarray(branch.omega), np.asarray(branch.stable)

@@ -25,14 +25,14 @@ from jaxvib.steady.jams.phase_branch import PhaseBranch, drag_curve
 from jaxvib.steady.jams.phase_starts import LOAD_SPEEDS, at_speed, distinct_rows, load_speeds, phases_near, starts_of
 from jaxvib.steady.jams.phases import (
     AbstractPhaseJam,
-    Parts,
     PhaseJam,
-    balanced,
+    TorqueBalance,
+    assemble_torque_balance,
     influence_of,
     jam_from,
     loads_with_drag,
-    parts_of,
     phase_jam,
+    solve_balance,
 )
 from jaxvib.units import count, random_numbers
 
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
 
 __all__ = ["PhaseJams", "phase_branch", "phase_jams"]
 
-_SHOWN = 30.0
-"""Range of the drag in a figure of all jams: this factor, and its inverse, times the scene's."""
+_SHOWN_DRAG_FACTOR = 30.0
+"""Drag range of a figure of all jams: from the scene's drag divided by this factor to the drag times it."""
 
-_SAME_LINE = 5e-3
+_SAME_LINE_DIFFERENCE = 5e-3
 """Unstable patterns whose drags differ by less, relative, are drawn once."""
 
-_STARTS, _JAMS = 256, 64
-"""Numbers of starts and of jams in one program: mostly some hundred starts and some tens of jams are left."""
+_STARTS_PER_PROGRAM, _JAMS_PER_PROGRAM = 256, 64
+"""Numbers of starts and of jams in one program; typical scenes need a few hundred starts and some tens of jams."""
 
-_SAME, _CLOSE = 1e-6, 1e-5
-"""Jams whose speeds differ by less, relative, and whose phases by less, rad, are one."""
+_SAME_SPEED_DIFFERENCE, _SAME_PHASE_DIFFERENCE = 1e-6, 1e-5
+"""Differences of speed (relative) and of phase (rad) below which two jams count as one."""
 
 
 class PhaseJams(AbstractPhaseJam):
@@ -100,21 +100,21 @@ class PhaseJams(AbstractPhaseJam):
         from jaxvib.draw.phases import drag_diagram  # slow to import: only who draws pays
 
         omega = np.asarray(self.omega)
-        speeds = np.unique(np.concatenate([load_speeds(parts_of(self.scene)), omega]))
+        speeds = np.unique(np.concatenate([load_speeds(assemble_torque_balance(self.scene)), omega]))
         branches: list[PhaseBranch] = []
         curves = []
         for k, place in enumerate(np.searchsorted(speeds, omega)):
             jam = self.select(k)
-            if not any(_passes(branch, place, jam.growth) for branch in branches):
+            if not any(_contains_jam(branch, place, jam.growth) for branch in branches):
                 branches.append(phase_branch(self.scene, jam, jnp.asarray(speeds)))
                 factor, at, stable = drag_curve(branches[-1])
                 for _, other, _, _ in curves:
                     # Dashes on other dashes would look like a line that is not broken.
-                    factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE * factor), np.nan, factor)
+                    factor = np.where(~stable & (np.abs(factor - other) < _SAME_LINE_DIFFERENCE * factor), np.nan, factor)
                 curves.append((sentence(jam.pattern), factor, at, stable))
         top, jams = float(self.scene.drive.speed), (omega, np.asarray(self.stable))
         label = "drag, times the scene's"
-        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN, unit=unit, ax=ax)
+        return drag_diagram(curves, top, label=label, at=1.0, jams=jams, within=_SHOWN_DRAG_FACTOR, unit=unit, ax=ax)
 
 
 @validated
@@ -171,20 +171,20 @@ def phase_jams(
         return phase_jam(scene, *near)
     loads = loads_with_drag(scene)
     number = count(starts, "starts", each=64.0 * loads.count * LOAD_SPEEDS)
-    parts = _parts(scene)
+    balance = _assembled_balance(scene)
     rng = random_numbers(seed)
-    return _jams_near(scene, parts, *starts_of(parts, rng.uniform(-np.pi, np.pi, (number, loads.count))))
+    return _jams_from_starts(scene, balance, *starts_of(balance, rng.uniform(-np.pi, np.pi, (number, loads.count))))
 
 
-def _jams_near(scene: Scene, parts: Parts, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
-    """The jams that are found from these load speeds (n,) and phases (n, count)."""
-    omega, phase = in_chunks(_STARTS, lambda w, a: _balanced_many(parts, w, a), omega, phase)
-    groups = _equal_loads(parts)
-    starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(parts.speed)))
+def _jams_from_starts(scene: Scene, balance: TorqueBalance, omega: np.ndarray, phase: np.ndarray) -> PhaseJams:
+    """Solve for jams from load speeds (n,) and phases (n, count)."""
+    omega, phase = in_chunks(_STARTS_PER_PROGRAM, lambda w, a: _solve_balances(balance, w, a), omega, phase)
+    groups = _equal_loads(balance)
+    starts_at = np.flatnonzero(np.isfinite(omega) & (omega > 0.0) & (omega < float(balance.speed)))
     places, reached = _distinct(omega[starts_at], phase[starts_at], np.ones(starts_at.size, dtype=int), groups)
-    # If a start was barely solved, the same jam comes out once more: only the jams themselves tell which are distinct.
+    # A start that was barely solved can give the same jam again, which only the converged jams reveal.
     first = starts_at[np.asarray(places, dtype=int)]
-    jams = in_chunks(_JAMS, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
+    jams = in_chunks(_JAMS_PER_PROGRAM, lambda w, a: _jams_from(scene, w, a), omega[first], phase[first])
     found = np.flatnonzero(status_names(jams.status) == "found")
     places, reached = _distinct(jams.omega[found], jams.phase[found], reached[found], groups)
     keep = found[np.asarray(places, dtype=int)]
@@ -197,17 +197,24 @@ def _jams_near(scene: Scene, parts: Parts, omega: np.ndarray, phase: np.ndarray)
 def _distinct(
     omega: np.ndarray, phase: np.ndarray, starts: np.ndarray, groups: list[np.ndarray]
 ) -> tuple[list[int], np.ndarray]:
-    """Places of jams (n,) that differ, by falling speed, and how many of the `starts` (n,) of all of them led to each."""
-    # Most are found many times: those that differ by less than half of what is close are taken together at once.
-    cells = np.concatenate([np.log(omega)[:, None] / _SAME, np.cos(phase) / _CLOSE, np.sin(phase) / _CLOSE], axis=1)
+    """Indices of distinct jams among n, by falling speed, and the sum of the `starts` (n,) that led to each."""
+    # Most jams occur many times: those in one cell of half the allowed difference are merged first.
+    cells = np.concatenate(
+        [
+            np.log(omega)[:, None] / _SAME_SPEED_DIFFERENCE,
+            np.cos(phase) / _SAME_PHASE_DIFFERENCE,
+            np.sin(phase) / _SAME_PHASE_DIFFERENCE,
+        ],
+        axis=1,
+    )
     once, which = distinct_rows(np.floor(2.0 * cells))
     starts = np.bincount(which, starts, once.size).astype(int)
     places: list[int] = []
     reached: list[int] = []
-    near = 0  # the first of `places` that is not too fast to be the same
+    near = 0  # first of `places` that is slow enough to be the same jam
     for m in np.argsort(-omega[once], kind="stable"):
         k = once[m]
-        while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME * omega[places[near]]:
+        while near < len(places) and not abs(omega[places[near]] - omega[k]) < _SAME_SPEED_DIFFERENCE * omega[places[near]]:
             near += 1
         place = next((i for i in range(near, len(places)) if _same(phase[places[i]], phase[k], groups)), None)
         if place is None:
@@ -218,7 +225,7 @@ def _distinct(
     return places, np.asarray(reached, dtype=int)
 
 
-_parts = cached(parts_of)
+_assembled_balance = cached(assemble_torque_balance)
 
 
 @cached
@@ -228,12 +235,12 @@ def _jams_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 @cached
-def _balanced_many(parts: Parts, omega: Array, phase: Array) -> tuple[Array, Array]:
-    """`balanced` from many speeds and phases."""
-    return jax.vmap(lambda w, a: balanced(parts, w, a, on_numbers=True))(omega, phase)
+def _solve_balances(balance: TorqueBalance, omega: Array, phase: Array) -> tuple[Array, Array]:
+    """`solve_balance` from many speeds and phases."""
+    return jax.vmap(lambda w, a: solve_balance(balance, w, a, on_numbers=True))(omega, phase)
 
 
-def _passes(branch: PhaseBranch, place: int, growth: Array) -> bool:
+def _contains_jam(branch: PhaseBranch, place: int, growth: Array) -> bool:
     """True if the branch has the jam of this growth, or its mirror image, at that place and the scene's own drag."""
     near = abs(float(branch.drag_factor[place]) - 1.0) < 1e-4
     return near and abs(float(branch.growth[place] - growth)) < 1e-3 * abs(float(growth))
@@ -268,36 +275,37 @@ def phase_branch(scene: Scene, jam: PhaseJam, omega: Array) -> PhaseBranch:
     # From the jam upward, then from the jam downward.
     places, cut = np.arange(speeds.size), int(np.searchsorted(speeds, float(jam.omega)))
     order = np.concatenate([places[cut:], places[:cut][::-1]])
-    followed = _followed(scene, jam.phase, jnp.asarray(speeds[order]), jnp.asarray(places == speeds.size - cut))
+    followed = _follow_pattern(scene, jam.phase, jnp.asarray(speeds[order]), jnp.asarray(places == speeds.size - cut))
     values = (value[np.argsort(order)] for value in followed)
     drag = jnp.broadcast_to(loads.drag, (loads.count,))
     return PhaseBranch(jnp.asarray(speeds), *values, rotor_speed=scene.drive.speed, drag=drag)
 
 
 @cached
-def _followed(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
-    """The pattern at load speeds (n,), each from that of the one before, or from `phase` itself where `anew` (n,)."""
-    parts = parts_of(scene)
+def _follow_pattern(scene: Scene, phase: Array, omega: Array, anew: Array) -> tuple[Array, ...]:
+    """Phases at load speeds (n,), each computed from the previous ones, or from `phase` where `anew` (n,) is True."""
+    balance = assemble_torque_balance(scene)
 
     def step(last: Array, at: tuple[Array, Array]) -> tuple[Array, tuple[Array, ...]]:
         w, begins = at
         start = jnp.where(begins, phase, last)
-        factor, angles, residual = phases_near(parts, at_speed(parts, w), start)
-        answer = influence_of(parts, w)[1]
+        factor, angles, residual = phases_near(balance, at_speed(balance, w), start)
+        answer = influence_of(balance, w)[1]
         good = (residual < jnp.sqrt(jnp.finfo(residual.dtype).eps)) & (factor > 0.0)
-        braked = eqx.tree_at(lambda field: field.drag, parts.averaged, factor * parts.drag)
-        growth = averaged_growth(braked, w, angles, w**2 * answer @ (parts.unbalance * jnp.exp(1j * angles)))
+        braked = eqx.tree_at(lambda field: field.drag, balance.averaged, factor * balance.drag)
+        growth = averaged_growth(braked, w, angles, w**2 * answer @ (balance.unbalance * jnp.exp(1j * angles)))
         factor, growth = (jnp.where(good, value, jnp.nan) for value in (factor, growth))
         return jnp.where(good, angles, start), (factor, jnp.where(good, angles, jnp.nan), growth, good & (growth < 0.0))
 
     return jax.lax.scan(step, phase, (omega, anew))[1]
 
 
-def _equal_loads(parts: Parts) -> list[np.ndarray]:
+def _equal_loads(balance: TorqueBalance) -> list[np.ndarray]:
     """Groups of loads that are alike in every number, by their places."""
-    direction = np.asarray(parts.direction)
+    direction = np.asarray(balance.direction)
     rows = np.concatenate(
-        [np.real(direction), np.imag(direction), np.stack([parts.unbalance, parts.drag, parts.averaged.inertia], 1)], axis=1
+        [np.real(direction), np.imag(direction), np.stack([balance.unbalance, balance.drag, balance.averaged.inertia], 1)],
+        axis=1,
     )
     _, which = np.unique(rows, axis=0, return_inverse=True)
     return [np.flatnonzero(which.ravel() == g) for g in range(int(np.max(which)) + 1)]
@@ -309,7 +317,7 @@ def _same(first: np.ndarray, second: np.ndarray, groups: list[np.ndarray]) -> bo
     def points(phase: np.ndarray, group: np.ndarray) -> np.ndarray:
         return np.exp(1j * phase[group])
 
-    if np.max(np.abs(np.exp(1j * first) - np.exp(1j * second))) < _CLOSE:  # mostly, and soon seen
+    if np.max(np.abs(np.exp(1j * first) - np.exp(1j * second))) < _SAME_PHASE_DIFFERENCE:  # the common case
         return True
     lead = points(first, groups[0])[0]
     for start in points(second, groups[0]):
@@ -324,6 +332,6 @@ def _match(first: np.ndarray, second: np.ndarray) -> bool:
     left = list(second)
     for point in first:
         near = int(np.argmin([abs(point - other) for other in left]))
-        if abs(point - left.pop(near)) > _CLOSE:
+        if abs(point - left.pop(near)) > _SAME_PHASE_DIFFERENCE:
             return False
     return True

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
     from jaxvib.draw.style import Drawn
 
-__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_apart", "phase_jam", "phase_torques"]
+__all__ = ["AbstractPhaseJam", "PhaseJam", "PhaseStatus", "degrees", "growth_of_free_loads", "phase_jam", "phase_torques"]
 
 _SAME_JAM_DISTANCE = 0.02
-"""Relative distance of load speeds up to which two theories speak of the same jam."""
+"""Relative difference of load speeds up to which jams of two theories count as the same."""
 
 
 class PhaseStatus(eqx.Enumeration):
@@ -52,7 +52,7 @@ class PhaseStatus(eqx.Enumeration):
 
 
 def degrees(angle: float) -> float:
-    """An angle in rad in degrees, for a person to read: what rounding leaves of 0 is 0.
+    """Angle in degrees of an angle in rad, rounded for display, so that rounding errors of 0 print as 0.
 
     >>> degrees(2.5e-19), degrees(3.141592653589793)
     (0.0, 180.0)
@@ -112,9 +112,12 @@ class PhaseJam(AbstractPhaseJam):
         return phase_circles([(f"{float(self.omega):.4g} rad/s", np.asarray(self.phase))], ax=ax)
 
 
-class Parts(eqx.Module):
-    """A scene as the balance of torques needs it: its linear model, its averaged equations at the working speed of the rotor,
-    and the `direction` (count, nd), complex, in which each load pushes the coordinates."""
+class TorqueBalance(eqx.Module):
+    """Balance of the mean torques on the loads of a scene.
+
+    **Attributes**: the linear `model`; the `averaged` equations at the rotor speed of the scene; `direction` (count, nd),
+    complex: the force of each load on the coordinates, per unit force of the load.
+    """
 
     model: LinearModel
     averaged: Averaged
@@ -132,31 +135,35 @@ class Parts(eqx.Module):
 
     @property
     def speed(self) -> Array:
-        """The rotor's, rad/s."""
+        """Rotor speed, rad/s."""
         return self.averaged.drive.speed
 
 
-def parts_of(scene: Scene) -> Parts:
-    """The scene's model, equations and directions, see `Parts`."""
+def assemble_torque_balance(scene: Scene) -> TorqueBalance:
+    """Assemble the torque balance of a scene."""
     model, loads = linear_model(scene), turning_loads(scene)
     averaged, rows = averaged_model(model), model.mount.load_rows(loads.count)
-    return Parts(
+    return TorqueBalance(
         model=model,
         averaged=eqx.tree_at(lambda field: field.drive, averaged, ConstantSpeed(scene.drive.speed)),
         direction=jnp.einsum("jka,k->ja", rows, turning(model.mount)),
     )
 
 
-def influence_of(parts: Parts, omega: Array) -> tuple[Array, Array]:
-    """A_jk (count, count) complex and D^-1 P^T (nd, count): what load k does to load j, and to the carrier, per throw."""
-    dynamic = parts.model.dynamic_stiffness(omega, parts.speed)
-    answer = small_solve(dynamic, parts.direction.T.astype(dynamic.dtype))
-    return parts.direction.conj() @ answer, answer
+def influence_of(balance: TorqueBalance, omega: Array) -> tuple[Array, Array]:
+    """Influence coefficients of the loads.
+
+    **Returns** A_jk (count, count), complex: response at load j per centrifugal force of load k; and D^-1 P^T (nd, count):
+    response of the carrier.
+    """
+    dynamic = balance.model.dynamic_stiffness(omega, balance.speed)
+    answer = small_solve(dynamic, balance.direction.T.astype(dynamic.dtype))
+    return balance.direction.conj() @ answer, answer
 
 
-def torques_at(parts: Parts, influence: Array, omega: Array, turn: Array) -> Array:
-    """The formula of `phase_torques`, (count,) N m, from what loads do to each other (count, count) and exp(i a) (count,)."""
-    return mean_torque(parts.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, parts.unbalance * turn))
+def torques_at(balance: TorqueBalance, influence: Array, omega: Array, turn: Array) -> Array:
+    """Torques (count,) N m of `phase_torques` from the influence coefficients (count, count) and exp(i a) (count,)."""
+    return mean_torque(balance.unbalance, -(omega**4) * jnp.conj(turn) * times(influence, balance.unbalance * turn))
 
 
 def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
@@ -183,8 +190,8 @@ def phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
 
 @cached
 def _phase_torques(scene: Scene, omega: Array, phase: Array) -> Array:
-    parts = parts_of(scene)
-    return torques_at(parts, influence_of(parts, omega)[0], omega, jnp.exp(1j * phase))
+    balance = assemble_torque_balance(scene)
+    return torques_at(balance, influence_of(balance, omega)[0], omega, jnp.exp(1j * phase))
 
 
 def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
@@ -219,54 +226,56 @@ def phase_jam(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
 
 
 def loads_with_drag(scene: Scene) -> CircularLoads:
-    """The scene's loads. **Raises** `InputError` where one has no drag."""
+    """The loads of a scene. **Raises** `InputError` if one has no drag."""
     loads = turning_loads(scene)
     require_drag(loads, each=True)
     return loads
 
 
-def balanced(parts: Parts, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
-    """Speed and phases (count,) of the balance that Newton's method finds, differentiable in the parts; `on_numbers` pays from
-    many starts, see `damped_newton`, and takes longer to compile."""
+def solve_balance(balance: TorqueBalance, omega: Array, phase: Array, *, on_numbers: bool = False) -> tuple[Array, Array]:
+    """Solve the torque balance for the load speed and the phases (count,) by Newton's method, differentiable by the balance.
 
-    def balance(x: Array, given: Parts) -> tuple[Array, None]:
+    `on_numbers`: evaluate on single numbers (`damped_newton`), which is faster for many starts and takes longer to compile.
+    """
+
+    def residuals(x: Array, given: TorqueBalance) -> tuple[Array, None]:
         w = x[0] * jax.lax.stop_gradient(given.speed)
         angles = jnp.concatenate([jnp.zeros(1, x.dtype), x[1:]])
         turn = jax.lax.complex(jnp.cos(angles), jnp.sin(angles))
         torque = torques_at(given, influence_of(given, w)[0], w, turn)
         return ((given.speed - w) + torque / given.drag) / given.speed, None
 
-    frozen = jax.lax.stop_gradient(parts)
-    start = jnp.concatenate([jnp.reshape(omega / parts.speed, (1,)), phase[1:] - phase[0]])
-    x, _ = damped_newton(balance, jax.lax.stop_gradient(start), frozen, on_numbers=on_numbers)
-    # One more step, whose derivative with respect to the scene is the implicit function theorem's.
-    x = x - eliminate(jax.jacfwd(balance, has_aux=True)(x, frozen)[0], balance(x, parts)[0])
+    frozen = jax.lax.stop_gradient(balance)
+    start = jnp.concatenate([jnp.reshape(omega / balance.speed, (1,)), phase[1:] - phase[0]])
+    x, _ = damped_newton(residuals, jax.lax.stop_gradient(start), frozen, on_numbers=on_numbers)
+    # One more Newton step: its derivative with respect to the scene is that of the implicit function theorem.
+    x = x - eliminate(jax.jacfwd(residuals, has_aux=True)(x, frozen)[0], residuals(x, balance)[0])
     return x[0] * frozen.speed, jnp.concatenate([jnp.zeros(1, x.dtype), jnp.arctan2(jnp.sin(x[1:]), jnp.cos(x[1:]))])
 
 
 @cached
 def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
-    """`phase_jam` of arguments that are known to be right."""
-    parts = parts_of(scene)
-    frozen = jax.lax.stop_gradient(parts)
-    w, angles = balanced(parts, omega, phase)
-    influence, answer = influence_of(parts, w)
+    """`phase_jam` for validated arguments."""
+    balance = assemble_torque_balance(scene)
+    frozen = jax.lax.stop_gradient(balance)
+    w, angles = solve_balance(balance, omega, phase)
+    influence, answer = influence_of(balance, w)
     turn = jnp.exp(1j * angles)
-    torque = torques_at(parts, influence, w, turn)
-    z = w**2 * answer @ (parts.unbalance * turn)
-    force = parts.model.carrier.bed_force(z, 1j * w * z)
-    residual = jnp.max(jnp.abs(parts.drag * (parts.speed - w) + torque)) / jnp.max(parts.drag * parts.speed)
+    torque = torques_at(balance, influence, w, turn)
+    z = w**2 * answer @ (balance.unbalance * turn)
+    force = balance.model.carrier.bed_force(z, 1j * w * z)
+    residual = jnp.max(jnp.abs(balance.drag * (balance.speed - w) + torque)) / jnp.max(balance.drag * balance.speed)
     tiny = jnp.sqrt(jnp.finfo(w.dtype).eps)
     slip = (frozen.speed - w) / frozen.speed
     good = (residual < tiny) & (w > 0.0) & (slip > -tiny)
     at_rest = good & (slip < tiny)
     status = PhaseStatus.where(good, PhaseStatus.found, PhaseStatus.not_converged)
     status = PhaseStatus.where(at_rest, PhaseStatus.with_rotor, status)
-    size = jnp.where(parts.unbalance > 0.0, parts.unbalance, 1.0) / jnp.min(jnp.diagonal(parts.model.mass))
+    size = jnp.where(balance.unbalance > 0.0, balance.unbalance, 1.0) / jnp.min(jnp.diagonal(balance.model.mass))
     bounded = jnp.all(magnitude(z) * 100.0 * jnp.finfo(w.dtype).eps < jnp.max(size))
     status = PhaseStatus.where(bounded | ~good, status, PhaseStatus.unbounded)
     there = good & bounded
-    # Of what is no jam, which has no growth, no eigenvalues are computed: they take as long as all else.
+    # NaN instead of a speed where there is no jam: eigenvalues take as long as everything else.
     growth = averaged_growth(frozen.averaged, *jax.lax.stop_gradient((jnp.where(there, w, jnp.nan), angles, z)))
 
     def kept(value: Array) -> Array:
@@ -275,7 +284,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     return PhaseJam(
         status=status,
         omega=kept(w),
-        rotor_speed=parts.speed,
+        rotor_speed=balance.speed,
         phase=kept(angles),
         pattern=phase_pattern(angles),
         growth=kept(growth),
@@ -288,7 +297,7 @@ def jam_from(scene: Scene, omega: Array, phase: Array) -> PhaseJam:
     )
 
 
-def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
+def growth_of_free_loads(scene: Scene, omega: Array) -> np.ndarray:
     """Growth of small disturbances of jams whose loads are together, every load moving for itself, (n,) 1/s.
 
     **Arguments**: `omega` (n,) rad/s of the jams that light coincident loads have.
@@ -299,7 +308,7 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
     >>> import jax.numpy as jnp, jaxvib as jv
     >>> machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     >>> scene = jv.Scene(machine, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
-    >>> [round(float(x), 1) for x in growth_apart(scene, jv.jam_modes(scene).omega[jnp.array([0, 1, 4])])]
+    >>> [round(float(x), 1) for x in growth_of_free_loads(scene, jv.jam_modes(scene).omega[jnp.array([0, 1, 4])])]
     [-0.4, 19.4, 23.3]
     """
     loads, speeds = turning_loads(scene, JAM_TERMS), np.asarray(omega)
@@ -307,7 +316,7 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
     if loads.ball_radius is not None or has_term(scene.effects, ContactFriction):
         return np.full(speeds.shape, np.nan)
     starts = np.where(known, speeds, float(scene.drive.speed))
-    found = _growths(scene, jnp.asarray(starts))
+    found = _growths_of_jams(scene, jnp.asarray(starts))
     near = (
         known
         & (np.abs(found.omega - starts) < _SAME_JAM_DISTANCE * starts)
@@ -317,6 +326,6 @@ def growth_apart(scene: Scene, omega: Array) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _growths(scene: Scene, omega: Array) -> PhaseJam:
+def _growths_of_jams(scene: Scene, omega: Array) -> PhaseJam:
     together = jnp.zeros(scene.loads.count, omega.dtype)
     return jax.vmap(lambda w: jam_from(scene, w, together))(omega)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["Orbit", "OrbitStatus", "orbits"]
 
 
-_MAX_STEPS = 2**17
+_MAX_INTEGRATION_STEPS = 2**17
 """Integration steps of a turn beyond which no multipliers are computed: the carrier's fastest motion is then some 3e4 times as
 fast as the loads, and an orbit would take seconds to hours."""
 
@@ -48,8 +48,8 @@ class OrbitStatus(eqx.Enumeration):
     found = "the loads can jam in this periodic motion"
     absent = "this mode does not exist at this rotor speed"
     not_converged = "no periodic motion was found: the torque balance could not be met"
-    coarse = "the periodic motion needs more harmonics than were used for the asked accuracy"
-    held = "the loads would have to pull at each other: this is their motion side by side, which nothing holds together"
+    under_resolved = "the periodic motion needs more harmonics for the requested accuracy; give more points"
+    would_separate = "the loads would have to pull at each other to stay side by side: nothing holds this motion together"
     at_fold = "the rotor speed is that of a fold: the motion merges with its neighbour and has no gradient"
     unresolved = "the motion was found, its stability was not: the carrier's fastest motion is too fast beside the loads'"
     refused = REFUSED
@@ -191,9 +191,9 @@ class Orbit(Result):
 @cached
 def _at(orbit: Orbit, theta: Array | np.ndarray) -> tuple[Array, Array, tuple[Array], tuple[Array]]:
     k, j = np.asarray(orbit.orders), np.asarray(orbit.deviation_orders)
-    wave, lag_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
-    phi = theta + (orbit.deviation_harmonics @ lag_wave).real
-    rate = orbit.omega * (1.0 + (orbit.deviation_harmonics @ (1j * j * lag_wave)).real)
+    wave, deviation_wave = jnp.exp(1j * k * theta), jnp.exp(1j * j * theta)
+    phi = theta + (orbit.deviation_harmonics @ deviation_wave).real
+    rate = orbit.omega * (1.0 + (orbit.deviation_harmonics @ (1j * j * deviation_wave)).real)
     return (
         (orbit.displacement_harmonics @ wave).real,
         orbit.omega * (orbit.displacement_harmonics @ (1j * k * wave)).real,
@@ -233,22 +233,22 @@ def orbits(
 
     def one(v: Array, s: Array, deviation: Array | None) -> tuple[PeriodicSolution, Harmonics, tuple[Array, ...]]:
         motion = periodic_motion(model, grid, given, v, s, deviation)
-        return motion, *_numbers(model, grid, motion)
+        return motion, *_all_quantities(model, grid, motion)
 
     if value.shape[0] == 1:  # a program without an axis of length one is a smaller one
         alone = one(*jax.tree.map(lambda x: x[0], (value, start, deviation)))
         motion, harmonics, measured = jax.tree.map(lambda x: x[..., None], alone)
     else:
         motion, harmonics, measured = jax.vmap(one, out_axes=-1)(value, start, deviation)
-    resolved = jnp.asarray(steps) <= _MAX_STEPS
-    limited = min(steps, _MAX_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
+    resolved = jnp.asarray(steps) <= _MAX_INTEGRATION_STEPS
+    limited = min(steps, _MAX_INTEGRATION_STEPS) if isinstance(steps, int) else jnp.where(resolved, steps, 1)
     growth = floquet(model, grid, motion, harmonics, limited, implicit=implicit)
     roots = growth.roots if growth.inner is None else jnp.concatenate([growth.roots, growth.inner])
     multipliers = roots**2 if grid.symmetric else roots
     trivial = growth.trivial**2 if grid.symmetric else growth.trivial
     largest = jnp.sqrt(jnp.max(multipliers.real**2 + multipliers.imag**2, axis=0))
 
-    slope, residual, speed_error, deviation_error, amplitude, force, power, push = measured
+    slope, residual, speed_error, deviation_error, amplitude, force, power, contact_torque = measured
     tiny = jnp.finfo(slope.dtype).eps
     relative = jnp.abs(slope) * motion.omega / motion.rotor_speed
     met = residual < 4096.0 * tiny
@@ -256,13 +256,13 @@ def orbits(
     error = jnp.maximum(speed_error / (jnp.maximum(relative, tiny) if given == "rotor_speed" else 1.0), deviation_error)
     flat = (relative < tiny**0.25) & (given == "rotor_speed")
 
-    parts = push < 0.0
+    parts = contact_torque < 0.0
 
     def status(is_met: Array, is_flat: Array, is_good: Array, pulls: Array) -> OrbitStatus:
-        known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.coarse)
+        known = OrbitStatus.where(is_good, OrbitStatus.found, OrbitStatus.under_resolved)
         known = OrbitStatus.where(resolved, known, OrbitStatus.unresolved)
         known = OrbitStatus.where(is_flat, OrbitStatus.at_fold, known)
-        known = OrbitStatus.where(pulls, OrbitStatus.held, known)
+        known = OrbitStatus.where(pulls, OrbitStatus.would_separate, known)
         return OrbitStatus.where(is_met, known, OrbitStatus.not_converged)
 
     def or_nan(values: Array) -> Array:
@@ -302,7 +302,7 @@ def numbers_of(
     x = jnp.where(there, orbit.omega if given == "rotor_speed" else orbit.rotor_speed, start)
     deviation = synthesized(jnp.where(there, orbit.deviation_harmonics, 0.0), deviation_synthesis(grid))
     motion = periodic_motion(model, grid, given, value, x, deviation, is_known=True)
-    harmonics, (slope, _, _, _, amplitude, force, power, _) = _numbers(model, grid, motion)
+    harmonics, (slope, _, _, _, amplitude, force, power, _) = _all_quantities(model, grid, motion)
     fields = {
         "omega": motion.omega,
         "rotor_speed": motion.rotor_speed,
@@ -317,18 +317,18 @@ def numbers_of(
     return {name: jnp.where(there, field, 0.0) for name, field in fields.items()}
 
 
-def _numbers(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
+def _all_quantities(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> tuple[Harmonics, tuple[Array, ...]]:
     """Harmonics of one motion; slope of the branch, residual, errors of the rotor's speed and of the deviation, and what is
-    `_measured`."""
+    `_motion_quantities`."""
     branch = branch_tangent(model, grid, motion)
-    harmonics = harmonics_of(model, grid, motion, branch.receptance)
-    return harmonics, (*branch[:-2], *_measured(model, grid, motion, harmonics, branch.acceleration))
+    harmonics = harmonics_of(model, grid, motion, branch.response)
+    return harmonics, (*branch[:-2], *_motion_quantities(model, grid, motion, harmonics, branch.acceleration))
 
 
-def _measured(
+def _motion_quantities(
     model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics, acceleration: Array
 ) -> tuple[Array, ...]:
-    """Amplitude, foundation force, power and push between loads of one motion.
+    """Amplitude, foundation force, power and contact_torque between loads of one motion.
 
     The power is the sum of what drag, friction and the carrier dissipate; n times the mean torque is the same, but loses its
     digits for strong drag, whose torque is that of a small difference n - phi'.
@@ -342,12 +342,13 @@ def _measured(
     swings = _swing(grid.orders, jnp.concatenate([harmonics.displacement, harmonics.force]))
     # Directions of the force on the bed are put together as those of a vector.
     force = jnp.sqrt(jnp.sum(swings[nd:] ** 2))
-    push = _least_push(model, grid, motion, harmonics)
-    return (swings[:nd], force, power, push)
+    contact_torque = _least_contact_torque(model, grid, motion, harmonics)
+    return (swings[:nd], force, power, contact_torque)
 
 
-def _least_push(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
-    """The least torque, N m, with which loads that lie side by side push the next one ahead, on the average of a period.
+def _least_contact_torque(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, harmonics: Harmonics) -> Array:
+    """The least torque, N m, with which loads that lie side by side contact_torque the next one ahead, on the average of a
+    period.
 
     Load j needs  m R e'(phi_j).a - torque_j  from its neighbours, the loads up to j the sum of these. The mean decides: no
     vibration that holds a jam presses the loads together at every instant.

@@ -24,8 +24,8 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.runtime.parallel import in_chunks
 from jaxvib.runtime.programs import cached
+from jaxvib.steady.jams.branch_plot import branch_summary, plot_branch
 from jaxvib.steady.jams.folds import fold_points, light_rotor_speed
-from jaxvib.steady.jams.picture import branch_summary, picture
 from jaxvib.steady.orbits.describe import OrbitStatus, orbits
 from jaxvib.steady.orbits.stability import Floquet, is_stiff, steps_for
 from jaxvib.units import Number, count, number
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
 __all__ = ["ExactBranches", "SpecialPoint", "exact_branches"]
 
-_LANES = 32
+_ORBITS_PER_BATCH = 32
 """Orbits that are computed side by side: enough to fill the machine's vectors, few enough to stay in its cache."""
 
 _COLLOCATION_POINTS = (16, 32, 64)
 
 
-_JUDGED = "by the multipliers of the full equations"
+_STABILITY_CRITERION = "by the multipliers of the full equations"
 
 
 class SpecialPoint(NamedTuple):
@@ -86,7 +86,7 @@ class ExactBranches(Result):
 
     def summary(self) -> str:
         """Return the ranges of the branch, its resonances and its special points as text."""
-        return f"{branch_summary(self, list(self.special), _JUDGED)}\n{self.message}"
+        return f"{branch_summary(self, list(self.special), _STABILITY_CRITERION)}\n{self.message}"
 
     @validated
     def plot(
@@ -101,7 +101,7 @@ class ExactBranches(Result):
 
         **Arguments**: `unit`, `most`, `show`, `ax` as `Branches.plot`.
         """
-        return picture(self, list(self.special), unit, most, _JUDGED, show, ax)
+        return plot_branch(self, list(self.special), unit, most, _STABILITY_CRITERION, show, ax)
 
 
 def exact_branches(
@@ -182,14 +182,14 @@ class _Solver:
             todo = np.flatnonzero(~(found.error <= self.accuracy))
             if todo.size == 0:
                 break
-            found = jax.tree.map(functools.partial(_put, todo), found, self._batches(omega[todo], many))
+            found = jax.tree.map(functools.partial(_replaced_rows, todo), found, self._batches(omega[todo], many))
         return found
 
     def _batches(self, omega: np.ndarray, many: int) -> _Values:
-        return in_chunks(_LANES, lambda w: _values(self.scene, w, many, self.accuracy, self.implicit), omega)
+        return in_chunks(_ORBITS_PER_BATCH, lambda w: _values(self.scene, w, many, self.accuracy, self.implicit), omega)
 
 
-def _put(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+def _replaced_rows(where: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
     old = old.copy()
     old[where] = new
     return old
@@ -215,7 +215,7 @@ def _values(scene: Scene, omega: Array, many: int, accuracy: float, implicit: bo
     return _Values(*(getattr(orbit, name) for name in _Values._fields[:-1]), tests=_tests(growth))
 
 
-_KINDS = ("torus", "half_turn", "half_turn", "symmetry")
+_KINDS_OF_TESTS = ("torus", "half_turn", "half_turn", "symmetry")
 """The bifurcation that a sign change of each test means; where there is no half-turn, s = -1 is a period doubling."""
 
 
@@ -232,9 +232,9 @@ def _tests(growth: Floquet) -> Array:
 
 def _special_points(solve: _Solver, grid: _Values) -> tuple[SpecialPoint, ...]:
     """Every sign change between neighbours that are both known, followed to its root."""
-    kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS)]
+    kinds = ["fold", *("symmetry" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
     if not has_half_turn(solve.scene.effects):
-        kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS)]
+        kinds = ["fold", *("period_doubling" if kind == "half_turn" else kind for kind in _KINDS_OF_TESTS)]
 
     def read(values: _Values) -> np.ndarray:
         return np.concatenate([values.slope[:, None], values.tests], axis=1)

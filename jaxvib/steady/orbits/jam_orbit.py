@@ -54,7 +54,8 @@ def jam_orbit(
     trigonometric collocation of psi, the carrier eliminated harmonic by harmonic, Newton's method from the leading order.
 
     - Loads that share every number are at one point, or side by side if they have a `ball_radius` (S is then m R sin(N
-      arcsin(r/R)) / (r/R); if they would have to pull at each other, on the average of a period, the status is `held`)
+      arcsin(r/R)) / (r/R); if they would have to pull at each other, on the average of a period, the status is
+      `would_separate`)
     - Loads that differ have a psi_j each: they lie next to each other in the order that their torques require
     - The torque is that of drag, gravity and dry friction, whose radial load follows the port's acceleration a. If friction can
       hold the loads to the rotor, they stick and slip, which no number of harmonics resolves: the status shows it
@@ -121,7 +122,7 @@ def _from_search(plan: OrbitPlan, mode: int) -> OrbitPlan:
 
 
 def _solve(plan: OrbitPlan, points: int, steps: int | None = None) -> Orbit:
-    return _solved(
+    return _solve_program(
         plan.scene,
         plan.value,
         plan.start,
@@ -148,12 +149,12 @@ def _outputs(
     *_: object,
 ) -> Orbit:
     """Outputs that follow from the motion, once it is solved: neither multipliers nor errors."""
-    untold = jax.tree.map(lambda _: None, orbit)
-    return dataclasses.replace(untold, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
+    empty = jax.tree.map(lambda _: None, orbit)
+    return dataclasses.replace(empty, **numbers_of(coincident_model(jammed_model(scene)), orbit, value, start, given, points))
 
 
 @cached(outputs_from_solution=_outputs)
-def _solved(
+def _solve_program(
     scene: Scene,
     value: Array,
     start: Array,

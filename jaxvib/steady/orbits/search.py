@@ -17,13 +17,13 @@ from jaxvib.steady.orbits.solve import branch_tangent, periodic_motion
 
 __all__ = ["branch_at", "exact_mode_speeds"]
 
-_BRANCH_POINTS, _BATCH = 800, 100
+_BRANCH_POINTS, _POINTS_PER_BATCH = 800, 100
 """Points of the exact branch that are computed, and of them at once."""
 
 _PARTS_PER_INTERVAL = 32
 """Parts into which cubics divide the interval between two of these points."""
 
-_NEAR_FOLD = 1e-6
+_NEAR_FOLD_DISTANCE = 1e-6
 """Relative distance of the rotor's speed from a fold of the cubics below which the fold itself is computed."""
 
 
@@ -41,9 +41,9 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     crowded, target, nd = np.asarray(crowded), float(scene.drive.speed), resonances.shape[0]
     crowded = np.unique(np.append(crowded, target))  # twice the same point would look like a turn
     omega = np.interp(np.linspace(0.0, 1.0, _BRANCH_POINTS), np.linspace(0.0, 1.0, crowded.size), crowded)
-    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _BATCH)))
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     known = np.isfinite(speed)
-    omega, speed = _between(omega[known], speed[known], slope[known])
+    omega, speed = _interpolated(omega[known], speed[known], slope[known])
     rising = speed[1:] > speed[:-1]
     turn = 1 + np.flatnonzero(rising[1:] != rising[:-1])[: 4 * nd]
     padded = np.pad(turn, (0, 4 * nd - turn.size))
@@ -52,7 +52,7 @@ def exact_mode_speeds(scene: Scene) -> dict[int, float]:
     cuts = np.where(there, omega[padded[main]], np.inf)
     modes = np.asarray(piece_modes(jnp.asarray(cuts), jnp.asarray(there), resonances))
     crossed = (speed[1:] - target) * (speed[:-1] - target) <= 0.0
-    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD * target]
+    near = turn[np.abs(speed[turn] - target) < _NEAR_FOLD_DISTANCE * target]
     close = []
     for k in near:
         around = np.clip([k - _PARTS_PER_INTERVAL, k + _PARTS_PER_INTERVAL], 0, omega.size - 1)
@@ -78,7 +78,7 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
     The fold is bracketed in ever smaller windows; the zero of its slope locates it to rounding.
     """
     omega = np.linspace(low, high, _BRANCH_POINTS)
-    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _BATCH)))
+    speed, slope = (np.ravel(x) for x in branch_at(scene, jnp.asarray(omega).reshape(-1, _POINTS_PER_BATCH)))
     (turns,) = np.nonzero(slope[1:] * slope[:-1] <= 0.0)
     if turns.size != 1:
         return False
@@ -87,11 +87,11 @@ def _ends_before(scene: Scene, low: float, high: float, target: float, looks: in
         low, high = (float(w) for w in omega[ends])
         return _ends_before(scene, low, high, target, looks - 1)
     rounding = 4096.0 * float(jnp.finfo(scene.drive.speed.dtype).eps)
-    fold = _between(omega[ends], speed[ends], slope[ends])[1]
+    fold = _interpolated(omega[ends], speed[ends], slope[ends])[1]
     return bool(np.max(fold) < target * (1.0 - rounding) if slope[turns[0]] > 0.0 else np.min(fold) > target * (1.0 + rounding))
 
 
-def _between(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interpolated(x: np.ndarray, y: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points of the cubics through (x, y) with these slopes, `_PARTS_PER_INTERVAL` an interval."""
     t, h = np.arange(_PARTS_PER_INTERVAL) / _PARTS_PER_INTERVAL, np.diff(x)[:, None]
     a, b, c, d = y[:-1, None], h * slope[:-1, None], y[1:, None], h * slope[1:, None]

@@ -19,13 +19,13 @@ __all__ = ["BranchTangent", "Harmonics", "Parameter", "PeriodicSolution", "branc
 Parameter = Literal["omega", "rotor_speed"]
 
 _MAX_NEWTON_STEPS = 60
-"""Newton steps, those that were refused included; ordinary points take 4 to 6."""
+"""Maximum number of Newton steps, rejected ones included; ordinary points take 4 to 6."""
 
 
-def receptance(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
-    """X_k = D(k w)^-1 B^T k^2 w^2, (K, nd, np): the carrier's k-th harmonic per k-th harmonic of sum_g S_g e(phi_g).
+def unbalance_response(model: CoincidentModel, omega: Array, speed: Array, orders: np.ndarray) -> Array:
+    """Response of the carrier to unbalance: its k-th harmonic per k-th harmonic of sum_g S_g e(phi_g), (K, nd, np).
 
-    D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G).
+    X_k = D(k w)^-1 B^T k^2 w^2,      D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
     """
     port = model.linear.mount.rows[0].T.astype(complex)
 
@@ -36,39 +36,44 @@ def receptance(model: CoincidentModel, omega: Array, speed: Array, orders: np.nd
     return jax.vmap(at)(jnp.asarray(orders, dtype=omega.dtype))
 
 
-def _answer(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
-    """A_k (K, np, np): the k-th harmonic of the port's acceleration per k-th harmonic of sum_g S_g e(phi_g)."""
-    return _at_port(model, grid, omega, receptance(model, omega, speed, grid.orders))
+def _port_response(model: CoincidentModel, grid: Grid, omega: Array, speed: Array) -> Array:
+    """Response A_k (K, np, np) of the port to unbalance: k-th harmonic of its acceleration per k-th harmonic of
+    sum_g S_g e(phi_g)."""
+    return _port_response_from(model, grid, omega, unbalance_response(model, omega, speed, grid.orders))
 
 
-def _at_port(model: CoincidentModel, grid: Grid, omega: Array, answer: Array) -> Array:
-    """`_answer` from the receptance at the orders of the grid, and others after these."""
+def _port_response_from(model: CoincidentModel, grid: Grid, omega: Array, response: Array) -> Array:
+    """`_port_response` from the response of the carrier, whose first orders are those of the grid."""
     w = jnp.asarray(grid.orders, dtype=omega.dtype) * omega
-    return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ answer[: w.size])
+    return -(w**2)[:, None, None] * (model.linear.mount.rows[0] @ response[: w.size])
 
 
-def _feedback(grid: Grid, answer: Array) -> Array:
-    """(np, np, M, M): the port's acceleration at the points, from sum_g S_g e(phi_g) at the points."""
-    by_distance = jnp.einsum("kab,dk->abd", answer.real, grid.cosine) - jnp.einsum("kab,dk->abd", answer.imag, grid.sine)
+def _feedback(grid: Grid, port_response: Array) -> Array:
+    """Matrix (np, np, M, M) from sum_g S_g e(phi_g) at the points to the acceleration of the port at the points."""
+    by_distance = jnp.einsum("kab,dk->abd", port_response.real, grid.cosine) - jnp.einsum(
+        "kab,dk->abd", port_response.imag, grid.sine
+    )
     return by_distance[:, :, grid.pairs]
 
 
 class _Balance(NamedTuple):
-    """The torques on the bodies at the points, per drag and load speed: what is left over (G, M), what it is judged by, and
-    what its derivative needs."""
+    """Torque balance of the bodies at the points, in units of drag times load speed: `residual` (G, M), the `scale` of its
+    terms, and the terms that its derivative needs."""
 
     residual: Array
     scale: Array
     acceleration: Array
     moving: Array
-    pull: Array
+    vibration_stiffness: Array
 
 
-def _balance(model: CoincidentModel, grid: Grid, answer: Array, deviation: Array, omega: Array, speed: Array) -> _Balance:
+def _balance(
+    model: CoincidentModel, grid: Grid, port_response: Array, deviation: Array, omega: Array, speed: Array
+) -> _Balance:
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     point, moving = model.circle(phi)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
-    acceleration = synthesized(jnp.einsum("kab,bk->ak", answer, force), grid.synthesis)
+    acceleration = synthesized(jnp.einsum("kab,bk->ak", port_response, force), grid.synthesis)
     size, unit = model.unbalance[:, None], (model.drag * omega)[:, None]
     vibration = size * jnp.einsum("agi,ai->gi", moving, acceleration)
     torque = model.torque(phi, rate, speed, acceleration)
@@ -84,27 +89,27 @@ def _balance(model: CoincidentModel, grid: Grid, answer: Array, deviation: Array
 
 
 def _jacobian(
-    model: CoincidentModel, grid: Grid, answer: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
+    model: CoincidentModel, grid: Grid, port_response: Array, balance: _Balance, deviation: Array, omega: Array, speed: Array
 ) -> Array:
-    """d residual / d deviation (G M, G M)."""
+    """Jacobian d residual / d deviation, (G M, G M)."""
     g, m = deviation.shape
     unit = (model.drag * omega)[:, None]
     phi, rate = grid.theta[None] + deviation, omega * (1.0 + deviation @ grid.first.T)
     by_angle, by_rate, by_acceleration = model.torque_slopes(phi, rate, speed, balance.acceleration)
     own = (
         (model.inertia * omega**2 / unit[:, 0])[:, None, None] * grid.second[None]
-        + (balance.pull - by_angle / unit)[:, :, None] * np.eye(m)[None]
+        + (balance.vibration_stiffness - by_angle / unit)[:, :, None] * np.eye(m)[None]
         - (omega * by_rate / unit)[:, :, None] * grid.first[None]
     )
     shake = model.unbalance[None, :, None] * balance.moving
-    # Dry friction answers to the acceleration that the others cause as well.
-    answers = (shake if by_acceleration is None else shake - by_acceleration) / unit[None]
-    coupling = jnp.einsum("agi,abij,bhj->gihj", answers, _feedback(grid, answer), shake)
+    # Dry friction depends on the acceleration that the other bodies cause, too.
+    torque_response = (shake if by_acceleration is None else shake - by_acceleration) / unit[None]
+    coupling = jnp.einsum("agi,abij,bhj->gihj", torque_response, _feedback(grid, port_response), shake)
     return (own[:, :, None, :] * np.eye(g)[:, None, :, None] + coupling).reshape(g * m, g * m)
 
 
 class PeriodicSolution(NamedTuple):
-    """A periodic motion on its grid: `deviation` psi (G, M) rad; `omega`, `rotor_speed` rad/s."""
+    """Periodic motion on a grid: `deviation` psi (G, M) rad; `omega`, `rotor_speed` rad/s."""
 
     deviation: Array
     omega: Array
@@ -121,35 +126,44 @@ def periodic_motion(
     *,
     is_known: bool = False,
 ) -> PeriodicSolution:
-    """The periodic motion psi_g(theta) of the loads' bodies, phi_g = theta + psi_g, theta = Omega t, psi with mean 0.
+    """Solve for the periodic motion psi_g(theta) of the bodies of loads, phi_g = theta + psi_g, theta = Omega t, mean psi = 0.
 
         I_g Omega^2 psi_g'' = torque_g(phi_g, Omega (1 + psi_g'), n, a) - S_g e'(phi_g) . a
         a_k = - k^2 Omega^2 B D(k Omega)^-1 B^T k^2 Omega^2 sum_g S_g (e(phi_g))_k
         D(w) = K - w^2 (M + sum m_j B^T B) + i w (C + n G)
 
-    at the M points of `grid`, with the index k for harmonics, a the port's acceleration, e the point of a load on the unit
-    circle. The unknowns are psi at the points and the one of Omega and n that is not `given`; `start` is where the latter
-    starts from, `deviation` (G, M) where psi does (0 unless said otherwise). Newton's steps are shortened until they lessen the
-    residual. Where it `is_known` that these are the motion, none are taken.
+    at the M points of `grid`, with the index k for harmonics, a the acceleration of the port, e the position of a load on the
+    unit circle. The unknowns are psi at the points and one of Omega and n; the other one is `given`.
 
-    Derivatives with respect to `value` and every number of the scene by the implicit function theorem, of any order.
+    **Arguments**
+
+    - `value`: the given speed, rad/s
+    - `start`: initial value of the unknown speed, rad/s
+    - `deviation`: initial psi (G, M); default 0
+    - `is_known`: if True, the initial values are the solution and no steps are taken
+
+    Newton steps are shortened until they reduce the residuals. Derivatives with respect to `value` and every number of the
+    scene, of any order, follow from the implicit function theorem.
     """
     if deviation is None:
         deviation = jnp.zeros((*model.unbalance.shape, grid.theta.size), dtype=value.dtype)
     frozen = jax.lax.stop_gradient((start, deviation))
     psi, x = _newton(model, value, *frozen, grid=(grid.theta.size, grid.symmetric), given=given, is_known=is_known)
-    return PeriodicSolution(psi, *_both(given, value, x))
+    return PeriodicSolution(psi, *_speed_pair(given, value, x))
 
 
-def _both(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
+def _speed_pair(given: Parameter, value: Array, x: Array) -> tuple[Array, Array]:
     """Load speed and rotor speed."""
     return (value, x) if given == "omega" else (x, value)
 
 
-class _State(NamedTuple):
-    """A step of Newton: the best unknowns so far with the size of their residual and the `scale` it is judged by, the change
-    that Newton asks for there, how much of it may be taken, and whether this is the end: because the whole change needs no look
-    at where it leads (`settled` alone), or because no part of it is any better (`lost` as well)."""
+class _NewtonState(NamedTuple):
+    """State of Newton's iteration.
+
+    **Attributes**: `steps` taken; the best unknowns so far, `deviation` and `x`; `norm` of their residuals and the `scale` of
+    the torques in it; `change`: the Newton step there; `length`: the largest fraction of it that may be taken; `done`: True if
+    the iteration ends; `stalled`: True if it ends because no fraction of the step reduces the residuals.
+    """
 
     steps: Array
     deviation: Array
@@ -158,8 +172,8 @@ class _State(NamedTuple):
     scale: Array
     change: Array
     length: Array
-    settled: Array
-    lost: Array
+    done: Array
+    stalled: Array
 
 
 @eqx.filter_custom_jvp
@@ -177,38 +191,38 @@ def _newton(
         return deviation, start
     on = grid_of(*grid)
     tiny = 128.0 * jnp.finfo(value.dtype).eps
-    # At a given load speed the carrier's answer is known, unless the rotor's speed is in it.
+    # At a given load speed the response of the carrier is known, unless it depends on the rotor speed.
     fixed = given == "omega" and model.linear.mount.gyroscopic is None
-    known = _answer(model, on, value, start) if fixed else None
+    known = _port_response(model, on, value, start) if fixed else None
     no = jnp.asarray(False)
 
-    def moved(now: _State) -> tuple[Array, Array]:
-        # A deviation changes by 1 rad at most in a step, a load speed by half of itself: beyond, the linear model says nothing.
+    def moved(now: _NewtonState) -> tuple[Array, Array]:
+        # A step changes deviations by at most 1 rad and the load speed by at most half: the linear model is useless beyond.
         most = 1.0 / jnp.maximum(jnp.max(jnp.abs(now.change[:-1])), 1e-300)
         if given == "rotor_speed":
             most = jnp.minimum(most, 0.5 * jnp.abs(now.x / now.change[-1]))
         change = jnp.minimum(now.length, most) * now.change
         return now.deviation + change[:-1].reshape(now.deviation.shape), now.x + change[-1]
 
-    def step(now: _State) -> _State:
+    def step(now: _NewtonState) -> _NewtonState:
         there = moved(now)
-        residual, matrix, scale = _linearised(model, on, given, value, *there, known)
+        residual, matrix, scale = _linearize(model, on, given, value, *there, known)
         norm = jnp.sqrt(jnp.mean(residual[:-1] ** 2))
-        # Newton squares the fall of the residual: where the next step would end below rounding, nobody needs to look. What the
-        # first step gains, from psi = 0, says nothing of that yet.
-        sure = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
+        # Newton's method squares the reduction of the residuals: if the next step will end below rounding, the residuals after
+        # it need no evaluation. The reduction by the first step, from psi = 0, allows no such prediction.
+        predicted_converged = (norm * (norm / now.norm) ** 2 < tiny / 16.0 * scale) & (now.steps > 0)
         change = -solve_in_turn(matrix, residual)
-        settled = (norm < tiny * scale) | sure
-        then = _State(now.steps + 1, *there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), settled, no)
-        lost = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
-        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, settled=lost, lost=lost)
+        done = (norm < tiny * scale) | predicted_converged
+        then = _NewtonState(now.steps + 1, *there, norm, scale, change, jnp.minimum(2.0 * now.length, 1.0), done, no)
+        stalled = (now.length < 4e-4) | ~jnp.all(jnp.isfinite(now.change)) | (now.norm < 16.0 * tiny * now.scale)
+        stay = now._replace(steps=now.steps + 1, length=now.length / 4.0, done=stalled, stalled=stalled)
         return jax.tree.map(lambda a, b: jnp.where(norm < now.norm, a, b), then, stay)
 
     one, change = jnp.ones_like(start), jnp.zeros(deviation.size + 1, deviation.dtype)
-    # The first step goes nowhere: it looks at where Newton starts, which is better than nothing.
-    begin = _State(jnp.asarray(-1), deviation, start, jnp.inf * one, one, change, one, no, no)
-    end = jax.lax.while_loop(lambda now: (now.steps < _MAX_NEWTON_STEPS) & ~now.settled, step, begin)
-    return moved(end._replace(change=jnp.where(end.settled & ~end.lost, end.change, 0.0)))
+    # The first iteration only evaluates the residuals at the start, since the initial norm is infinite.
+    begin = _NewtonState(jnp.asarray(-1), deviation, start, jnp.inf * one, one, change, one, no, no)
+    end = jax.lax.while_loop(lambda now: (now.steps < _MAX_NEWTON_STEPS) & ~now.done, step, begin)
+    return moved(end._replace(change=jnp.where(end.done & ~end.stalled, end.change, 0.0)))
 
 
 @_newton.def_jvp
@@ -218,73 +232,80 @@ def _newton_jvp(primals, tangents, *, grid: tuple[int, bool], given: Parameter, 
     on = grid_of(*grid)
 
     def equations(model: CoincidentModel, value: Array) -> Array:
-        omega, speed = _both(given, value, x)
-        residual = _balance(model, on, _answer(model, on, omega, speed), deviation, omega, speed).residual
-        return _then_zero(residual.ravel())
+        omega, speed = _speed_pair(given, value, x)
+        residual = _balance(model, on, _port_response(model, on, omega, speed), deviation, omega, speed).residual
+        return _append_mean_condition(residual.ravel())
 
     change = eqx.filter_jvp(equations, (model, value), tangents[:2])[1]
-    change = -jnp.linalg.solve(_linearised(model, on, given, value, deviation, x, None)[1], change)
+    change = -jnp.linalg.solve(_linearize(model, on, given, value, deviation, x, None)[1], change)
     return (deviation, x), (change[:-1].reshape(deviation.shape), change[-1])
 
 
-def _linearised(
+def _linearize(
     model: CoincidentModel, grid: Grid, given: Parameter, value: Array, deviation: Array, x: Array, known: Array | None
 ) -> tuple[Array, Array, Array]:
-    """The equations (G M + 1,), their derivative by the unknowns and the size they are judged by."""
+    """Residuals (G M + 1,), their Jacobian, and the scale of the torques in them."""
     if known is None:
-        answer, by_x = jax.jvp(lambda z: _answer(model, grid, *_both(given, value, z)), (x,), (jnp.ones_like(x),))
+        port_response, by_x = jax.jvp(
+            lambda z: _port_response(model, grid, *_speed_pair(given, value, z)), (x,), (jnp.ones_like(x),)
+        )
     else:
-        answer, by_x = known, jnp.zeros_like(known)
+        port_response, by_x = known, jnp.zeros_like(known)
 
-    def residual(z: Array, answer: Array) -> tuple[Array, _Balance]:
-        found = _balance(model, grid, answer, deviation, *_both(given, value, z))
+    def residual(z: Array, port_response: Array) -> tuple[Array, _Balance]:
+        found = _balance(model, grid, port_response, deviation, *_speed_pair(given, value, z))
         return found.residual.ravel(), found
 
-    at, column, found = jax.jvp(residual, (x, answer), (jnp.ones_like(x), by_x), has_aux=True)
-    matrix = _jacobian(model, grid, answer, found, deviation, *_both(given, value, x))
-    return jnp.append(at, jnp.mean(deviation)), _pinned(matrix, column), found.scale
+    at, column, found = jax.jvp(residual, (x, port_response), (jnp.ones_like(x), by_x), has_aux=True)
+    matrix = _jacobian(model, grid, port_response, found, deviation, *_speed_pair(given, value, x))
+    return jnp.append(at, jnp.mean(deviation)), _bordered(matrix, column), found.scale
 
 
 class BranchTangent(NamedTuple):
-    """`slope` dn/dOmega of the branch; `residual`: what is left of the torque balance at the points, relative to the torques in
-    it; `speed_error`, relative, of the rotor speed at this load speed and `deviation_error`, rad: an estimate of what the
-    number of points leaves; `receptance` (K, nd, np) of the carrier at the orders of the grid; `acceleration` (np, M) of the
+    """Tangent of a branch and errors of a point on it.
+
+    **Attributes**: `slope` dn/dOmega; `residual` of the torque balance at the points, relative to its torques; `speed_error`:
+    estimated relative error of the rotor speed at this load speed, by the number of points; `deviation_error`: that of psi,
+    rad; `response` (K, nd, np): `unbalance_response` of the carrier at the orders of the grid; `acceleration` (np, M) of the
     port at the points, m/s^2."""
 
     slope: Array
     residual: Array
     speed_error: Array
     deviation_error: Array
-    receptance: Array
+    response: Array
     acceleration: Array
 
 
 def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution) -> BranchTangent:
-    """Continuation of the branch from a periodic motion, and the error of the motion.
+    """Tangent of the branch at a periodic motion, and the error of the motion.
 
-    The error is what one Newton step would change that sees the residual at twice as many points, with the highest
-    harmonic of psi for the deviation.
+    The error is the change by one Newton step with the residuals at twice as many points; for the deviation the highest
+    harmonic of psi is added.
     """
     deviation, omega, speed = motion
-    # Its orders are those of the grid, and as many more.
+    # Its orders are those of the grid, followed by the higher ones.
     fine = grid_of(2 * grid.theta.shape[0], grid.symmetric)
 
     def residual(w: Array, n: Array) -> tuple[Array, tuple[Array, Array, _Balance]]:
-        received = receptance(model, w, n, fine.orders)
-        answer = _at_port(model, grid, w, received)
-        found = _balance(model, grid, answer, deviation, w, n)
-        return found.residual.ravel(), (received, answer, found)
+        response = unbalance_response(model, w, n, fine.orders)
+        port_response = _port_response_from(model, grid, w, response)
+        found = _balance(model, grid, port_response, deviation, w, n)
+        return found.residual.ravel(), (response, port_response, found)
 
     def along(by_omega: Array, by_speed: Array) -> tuple[Array, Array, tuple[Array, Array, _Balance]]:
         return jax.jvp(residual, (omega, speed), (by_omega, by_speed), has_aux=True)
 
     both = jnp.eye(2, dtype=omega.dtype)
-    at, (by_omega, by_speed), (received, answer, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
-    matrix = _pinned(_jacobian(model, grid, answer, found, deviation, omega, speed), by_speed)
+    at, (by_omega, by_speed), (response, port_response, found) = jax.vmap(along, out_axes=(None, 0, None))(*both)
+    matrix = _bordered(_jacobian(model, grid, port_response, found, deviation, omega, speed), by_speed)
     there = deviation @ resampling(grid, fine)
-    between = _balance(model, fine, _at_port(model, fine, omega, received), there, omega, speed).residual
-    seen = (between @ resampling(fine, grid)).ravel()
-    found_by = small_solve(matrix, jnp.stack([-_then_zero(by_omega), _then_zero(jax.lax.stop_gradient(seen))], axis=1))
+    between = _balance(model, fine, _port_response_from(model, fine, omega, response), there, omega, speed).residual
+    fine_residual = (between @ resampling(fine, grid)).ravel()
+    found_by = small_solve(
+        matrix,
+        jnp.stack([-_append_mean_condition(by_omega), _append_mean_condition(jax.lax.stop_gradient(fine_residual))], axis=1),
+    )
     slope, error = found_by[-1, 0], jax.lax.stop_gradient(found_by[:, 1])
     # The highest harmonic's real part, and its imaginary one.
     last = jnp.max(jnp.sum((deviation @ deviation_analysis(grid)[:, [grid.deviation_orders.size - 1, -1]]) ** 2, axis=1))
@@ -293,26 +314,26 @@ def branch_tangent(model: CoincidentModel, grid: Grid, motion: PeriodicSolution)
         jnp.max(jnp.abs(at)) / found.scale,
         jnp.abs(error[-1] / speed),
         jnp.maximum(jnp.max(jnp.abs(error[:-1])), jnp.sqrt(last)),
-        received[: grid.orders.size],
+        response[: grid.orders.size],
         found.acceleration,
     )
 
 
-def _then_zero(residual: Array) -> Array:
-    """The right side of the whole Jacobian: psi has the mean 0."""
+def _append_mean_condition(residual: Array) -> Array:
+    """Residuals followed by that of the condition mean psi = 0, which is zero."""
     return jax.lax.pad(residual, np.zeros((), residual.dtype), [(0, 1, 0)])
 
 
-def _pinned(by_lag: Array, by_unknown: Array) -> Array:
-    """The whole Jacobian: the equations' derivative by psi and by the last unknown, and the row mean psi = 0."""
-    m = by_lag.shape[0]
+def _bordered(by_deviation: Array, by_unknown: Array) -> Array:
+    """Bordered Jacobian: derivatives by psi and by the unknown speed, with the condition mean psi = 0 as last row."""
+    m = by_deviation.shape[0]
     pin = jnp.append(jnp.full((m,), 1.0 / m), 0.0)
-    return jnp.concatenate([jnp.concatenate([by_lag, by_unknown[:, None]], axis=1), pin[None, :]])
+    return jnp.concatenate([jnp.concatenate([by_deviation, by_unknown[:, None]], axis=1), pin[None, :]])
 
 
 class Harmonics(NamedTuple):
     """Harmonics c_k of a periodic motion, signal = Re sum_k c_k exp(i k theta): `deviation` (G, J) rad; `displacement` (nd, K)
-    m of the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the bed."""
+    m of the carrier, `acceleration` (np, K) m/s^2 of the port, `force` (nb, K) N on the foundation."""
 
     deviation: Array
     displacement: Array
@@ -320,13 +341,14 @@ class Harmonics(NamedTuple):
     force: Array
 
 
-def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, answer: Array | None = None) -> Harmonics:
-    """The harmonics of psi and of everything that the carrier does, whose receptance `answer` (K, nd, np) may be known."""
+def harmonics_of(model: CoincidentModel, grid: Grid, motion: PeriodicSolution, response: Array | None = None) -> Harmonics:
+    """Harmonics of psi and of the motion of the carrier; `response` (K, nd, np): its `unbalance_response`, if known."""
     carrier = model.linear.carrier
     point, _ = model.circle(grid.theta[None] + motion.deviation)
     force = analyzed(jnp.einsum("g,agi->ai", model.unbalance, point), grid.analysis)
-    answer = receptance(model, motion.omega, motion.rotor_speed, grid.orders) if answer is None else answer
-    displacement = jnp.einsum("kdp,pk->dk", answer, force)
+    if response is None:
+        response = unbalance_response(model, motion.omega, motion.rotor_speed, grid.orders)
+    displacement = jnp.einsum("kdp,pk->dk", response, force)
     w = jnp.asarray(grid.orders, dtype=motion.omega.dtype) * motion.omega
     return Harmonics(
         analyzed(motion.deviation, deviation_analysis(grid)),

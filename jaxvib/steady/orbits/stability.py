@@ -19,11 +19,11 @@ from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution
 
 __all__ = ["Floquet", "floquet", "is_stiff", "steps_for"]
 
-_PHASE = 0.7
+_PHASE_PER_STEP = 0.7
 """Phase of the carrier's fastest motion in an explicit step, rad; order 8 then leaves 1e-12 in the multipliers of loads as fast
 as the carrier, and 1e-10 if they are three times as fast."""
 
-_STIFF = 3.0
+_STIFF_DECAY_RATIO = 3.0
 """Decay so many times as fast as the fastest oscillation is left to the implicit method: explicit steps would have to resolve
 it, and from about 15 times on they diverge."""
 
@@ -84,7 +84,7 @@ def is_stiff(model: CoincidentModel, omega: Array, speed: Array) -> Array:
     """True if loads or carrier decay so fast, at load speeds `omega` and the rotor's `speed` (rad/s), that multipliers need the
     implicit method."""
     rates = _rates(model, omega, speed)
-    return jnp.maximum(rates.damping, rates.drag) > _STIFF * (rates.oscillation + 2.0 * omega)
+    return jnp.maximum(rates.damping, rates.drag) > _STIFF_DECAY_RATIO * (rates.oscillation + 2.0 * omega)
 
 
 def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: bool) -> Array:
@@ -96,7 +96,7 @@ def steps_for(model: CoincidentModel, omega: Array, speed: Array, *, implicit: b
     turn = np.pi if model.half_turn else 2.0 * np.pi
     if implicit:
         return radau.steps_for(turn * (rates.oscillation / omega + 2.0))
-    return jnp.ceil(turn * (jnp.maximum(rates.oscillation, rates.damping) / omega + 2.0) / _PHASE).astype(int)
+    return jnp.ceil(turn * (jnp.maximum(rates.oscillation, rates.damping) / omega + 2.0) / _PHASE_PER_STEP).astype(int)
 
 
 class _Coefficients(NamedTuple):
@@ -268,7 +268,7 @@ def floquet(
     transition = _implicit_transition if implicit else _explicit_transition
     whole, *relative = transition(equations, grid, harmonics, fields, sizes, h, steps)
     flip: Any = np.tile(np.concatenate([np.full(nd, -1.0 if model.half_turn else 1.0), np.ones(count)]), 2)
-    trivial, rest = jax.vmap(_deflated, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
+    trivial, rest = jax.vmap(_deflate, in_axes=-1)(flip[:, None, None] * whole, equations.along_orbit(grid, harmonics))
     roots = _eigenvalues(rest).T
     inner = _eigenvalues(jnp.moveaxis(relative[0], -1, 0)).T if relative else None
     return Floquet(roots, inner, trivial)
@@ -309,7 +309,7 @@ def _explicit_transition(
         return tuple(x + h * jnp.tensordot(weights, rate, 1) for x, rate in zip(state, rates, strict=True))
 
     begin = lambda: tuple(_units(2 * size, equations) for size in sizes)  # noqa: E731
-    return _stepped(equations, grid, harmonics, _NODES, h, steps, begin, step)
+    return _integrate(equations, grid, harmonics, _NODES, h, steps, begin, step)
 
 
 def _implicit_transition(
@@ -336,13 +336,13 @@ def _implicit_transition(
         return (jnp.einsum("abp,bcp->acp", over, state[0]),)
 
     begin = lambda: (_units(2 * total, equations),)  # noqa: E731
-    (end,) = _stepped(equations, grid, harmonics, radau.NODES, h, steps, begin, step)
+    (end,) = _integrate(equations, grid, harmonics, radau.NODES, h, steps, begin, step)
     both = end.reshape(2, total, 2, total, orbits)
     parts = np.split(np.arange(total), np.cumsum(sizes)[:-1])
     return tuple(both[:, k][:, :, :, k].reshape(2 * k.size, 2 * k.size, orbits) for k in parts)
 
 
-def _stepped(
+def _integrate(
     equations: _Disturbances,
     grid: Grid,
     harmonics: Harmonics,
@@ -411,7 +411,7 @@ def _eigenvalues(matrices: Array) -> Array:
     return jnp.linalg.eigvals(matrices) if matrices.shape[0] == 1 else jax.lax.map(jnp.linalg.eigvals, matrices)
 
 
-def _deflated(matrix: Array, known: Array) -> tuple[Array, Array]:
+def _deflate(matrix: Array, known: Array) -> tuple[Array, Array]:
     """The eigenvalue that belongs to the eigenvector `known`, and a matrix that has the others."""
     unit = known / jnp.linalg.norm(known)
     mirror = unit.at[0].add(jnp.where(unit[0] < 0.0, -1.0, 1.0))

@@ -90,9 +90,9 @@ class JamQuestion(NamedTuple):
         there = bool(np.isfinite(orbit.omega))
         kind = f"jam mode {self.mode}, {orbit.judgement}" if there else f"no jam mode {self.mode}"
         # Loads that nothing holds together move in another way; other statuses tell of the computation alone.
-        if there and bool(orbit.status == OrbitStatus.held):
+        if there and bool(orbit.status == OrbitStatus.would_separate):
             kind = f"{kind}, but the loads part"
-        computed = not there or bool(orbit.status == OrbitStatus.held) or bool(orbit.status == OrbitStatus.found)
+        computed = not there or bool(orbit.status == OrbitStatus.would_separate) or bool(orbit.status == OrbitStatus.found)
         return Values(
             kind,
             float(orbit.omega),

@@ -16,7 +16,7 @@ from jaxvib.results.fields import in_unit
 from jaxvib.results.result import Result
 from jaxvib.results.status import Computed
 from jaxvib.runtime.parallel import in_parallel
-from jaxvib.steady.jams.picture import MARKS
+from jaxvib.steady.jams.branch_plot import MARKS
 from jaxvib.steady.orbits.diagram import ExactBranches, SpecialPoint, exact_branches
 from jaxvib.units import number
 

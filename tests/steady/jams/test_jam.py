@@ -226,7 +226,7 @@ def test_loads_too_unlike_to_stay_together_are_not_called_stable():
         vibration = 0.5 * 0.1 * float(jam.omega) ** 2 * float(jam.amplitude[0]) / 2.0
         need = max(drag) * 0.01 * (60.0 - float(jam.omega))
         assert (vibration > need) == holds == bool(jam.stable), (vibration, need)
-        assert jam.status_name == ("found" if holds else "apart") and float(jam.slope) > 0.0
+        assert jam.status_name == ("found" if holds else "cannot_stay_together") and float(jam.slope) > 0.0
         assert ("stable by slope" in jam.summary()) == holds and ("cannot stay together" in jam.summary()) != holds
 
 

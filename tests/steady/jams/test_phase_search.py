@@ -8,8 +8,8 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.steady.jams import phase_search
-from jaxvib.steady.jams.phase_search import _equal_loads, _passes, phase_branch
-from jaxvib.steady.jams.phases import PhaseStatus, jam_from, parts_of, phase_jam
+from jaxvib.steady.jams.phase_search import _contains_jam, _equal_loads, phase_branch
+from jaxvib.steady.jams.phases import PhaseStatus, assemble_torque_balance, jam_from, phase_jam
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
 SCENE = jv.Scene(MACHINE, jv.pendulums(count=2, mass=0.05, radius=0.08, drag=0.04), jv.ConstantSpeed(460.0))
@@ -41,7 +41,7 @@ def test_a_branch_is_followed_from_its_jam_both_ways(monkeypatch):
         asked.append((np.asarray(phase), np.asarray(omega), np.asarray(anew)))
         return omega, omega, omega, omega
 
-    monkeypatch.setattr(phase_search, "_followed", followed)
+    monkeypatch.setattr(phase_search, "_follow_pattern", followed)
     jam = phase_jam(SCENE, 165.0, jnp.zeros(2))
     branch = phase_branch(SCENE, jam, jnp.array([150.0, 160.0, 168.0, 172.0]))
     ((phase, omega, anew),) = asked
@@ -59,16 +59,16 @@ def test_a_branch_has_the_jam_of_the_same_growth(growth):
     jam = phase_jam(SCENE, 165.0, jnp.zeros(2))
     branch = phase_branch(SCENE, jam, jnp.atleast_1d(jam.omega))
     branch = eqx.tree_at(lambda b: (b.growth, b.drag_factor), branch, (jnp.full(1, growth), jnp.ones(1)))
-    assert _passes(branch, 0, jnp.asarray(growth * (1.0 + 0.9e-3)))
-    assert not _passes(branch, 0, jnp.asarray(growth * (1.0 + 1.1e-3)))
-    assert not _passes(eqx.tree_at(lambda b: b.drag_factor, branch, jnp.full(1, 1.0002)), 0, jnp.asarray(growth))
+    assert _contains_jam(branch, 0, jnp.asarray(growth * (1.0 + 0.9e-3)))
+    assert not _contains_jam(branch, 0, jnp.asarray(growth * (1.0 + 1.1e-3)))
+    assert not _contains_jam(eqx.tree_at(lambda b: b.drag_factor, branch, jnp.full(1, 1.0002)), 0, jnp.asarray(growth))
 
 
 def test_loads_are_equal_that_are_alike_in_every_number():
     loads = jv.pendulums(count=5, mass=0.05, radius=0.08, drag=0.04)
     heavier, braked = jnp.array([0.05, 0.05, 0.05, 0.1, 0.05]), jnp.array([0.04, 0.08, 0.04, 0.04, 0.04])
     loads = eqx.tree_at(lambda x: (x.mass, x.drag), loads, (heavier, braked))
-    groups = _equal_loads(parts_of(jv.Scene(MACHINE, loads, jv.ConstantSpeed(460.0))))
+    groups = _equal_loads(assemble_torque_balance(jv.Scene(MACHINE, loads, jv.ConstantSpeed(460.0))))
     assert sorted(group.tolist() for group in groups) == [[0, 2, 4], [1], [3]]
 
 
@@ -114,9 +114,9 @@ def test_jams_come_by_falling_speed_and_stable_ones_first(monkeypatch):
         rate = growth[np.argmin(np.abs(phase[:, None, 1] - phases[None, :, 1]), axis=1)]
         return eqx.tree_at(lambda j: (j.omega, j.phase, j.growth, j.stable), jams, (omega, phase, rate, rate < 0.0))
 
-    monkeypatch.setattr(phase_search, "_balanced_many", lambda parts, omega, phase: (omega, phase))
+    monkeypatch.setattr(phase_search, "_solve_balances", lambda balance, omega, phase: (omega, phase))
     monkeypatch.setattr(phase_search, "_jams_from", solved)
-    found = phase_search._jams_near(SCENE, parts_of(SCENE), speeds, phases)
+    found = phase_search._jams_from_starts(SCENE, assemble_torque_balance(SCENE), speeds, phases)
     np.testing.assert_array_equal(found.omega, [410.0, 300.0, 200.0, 200.0])
     np.testing.assert_array_equal(found.stable, [False, True, True, False])
     np.testing.assert_array_equal(found.growth, [1.0, -1.0, -1.0, 1.0])

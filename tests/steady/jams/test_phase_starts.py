@@ -9,15 +9,15 @@ import pytest
 
 import jaxvib as jv
 from jaxvib.steady.jams.patterns import phase_pattern
-from jaxvib.steady.jams.phase_starts import _regular, at_speed, distinct_rows, load_speeds, phases_near, starts_of
-from jaxvib.steady.jams.phases import balanced, influence_of, parts_of, torques_at
+from jaxvib.steady.jams.phase_starts import _regular_phases, at_speed, distinct_rows, load_speeds, phases_near, starts_of
+from jaxvib.steady.jams.phases import assemble_torque_balance, influence_of, solve_balance, torques_at
 
 MACHINE = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
 RESONANCE = np.sqrt(1.16e6 / 37.1)
 
 
 def parts(count=2, drag=0.04):
-    return parts_of(
+    return assemble_torque_balance(
         jv.Scene(MACHINE, jv.pendulums(count=count, mass=0.1 / count, radius=0.08, drag=drag), jv.ConstantSpeed(460.0))
     )
 
@@ -41,9 +41,9 @@ def test_load_speeds_crowd_about_the_resonance():
 
 
 def test_regular_phases_are_every_split_into_two():
-    splits = _regular(parts(count=3))
+    splits = _regular_phases(parts(count=3))
     assert {tuple(np.round(row / np.pi).astype(int)) for row in splits} == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)}
-    five = {tuple(np.round(row / np.pi).astype(int)) for row in _regular(parts(count=5))}
+    five = {tuple(np.round(row / np.pi).astype(int)) for row in _regular_phases(parts(count=5))}
     assert five == {(*four, 0) for four in itertools.product((0, 1), repeat=4)}
 
 
@@ -112,9 +112,9 @@ def test_patterns_by_their_resultants(phases, pattern):
 def test_the_search_is_written_on_single_numbers():
     """Single numbers take a third of the time for thousands of starts."""
     machine = jv.two_mass(mass=(120.0, 95.0), stiffness=(5e4, 3e4), damping=(40.0, 20.0), link_stiffness=2e5, link_damping=60.0)
-    p = parts_of(jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0)))
+    p = assemble_torque_balance(jv.Scene(machine, jv.balls(count=3, mass=0.8, radius=0.12, drag=1.5), jv.ConstantSpeed(120.0)))
     w, start = jnp.asarray(100.0), jnp.zeros(3)
-    for search in (lambda: phases_near(p, at_speed(p, w), start), lambda: balanced(p, w, start, on_numbers=True)):
+    for search in (lambda: phases_near(p, at_speed(p, w), start), lambda: solve_balance(p, w, start, on_numbers=True)):
         loops = [e for e in jax.make_jaxpr(search)().jaxpr.eqns if e.primitive.name == "while"]
         newton = max(loops, key=lambda e: len(e.outvars))
         assert len(newton.outvars) > 10 and all(v.aval.shape == () for v in newton.outvars)

@@ -12,7 +12,7 @@ from stored_jit import stored_jit
 import jaxvib as jv
 from jaxvib.numerics.linalg import eliminate
 from jaxvib.steady.jams.phase_search import _same, phase_branch
-from jaxvib.steady.jams.phases import growth_apart, phase_jam, phase_torques
+from jaxvib.steady.jams.phases import growth_of_free_loads, phase_jam, phase_torques
 
 K1, K2, L1, L2 = 0.604e6, 0.555e6, 0.165, 0.155
 STATIONS = (0.28, 0.25, -0.25, -0.28)
@@ -274,7 +274,7 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     """On platforms only the jam below a resonance keeps free loads; in mode 5, which is stable by slope, they separate."""
     s = platforms()
     modes = jv.jam_modes(s)
-    growth = growth_apart(s, modes.omega)
+    growth = growth_of_free_loads(s, modes.omega)
     assert modes.stable.tolist() == [False, False, True, False, True]
     np.testing.assert_array_equal(np.isnan(growth), [True, True, False, False, False])
     assert growth[2] < 0.0 < growth[3] and growth[4] > 0.0

@@ -268,7 +268,7 @@ def test_limits_converge_or_say_why(form, omega):
         scene = eqx.tree_at(lambda s: s.drive.speed, form.scene(), orbit.rotor_speed)
         assert np.max(np.abs(integrate(scene, orbit, 1)[-1])) < 1e-8 * max(1.0, float(orbit.multiplier))
     else:
-        assert bool(orbit.status == jv.OrbitStatus.not_converged) or bool(orbit.status == jv.OrbitStatus.coarse)
+        assert bool(orbit.status == jv.OrbitStatus.not_converged) or bool(orbit.status == jv.OrbitStatus.under_resolved)
 
 
 def test_at_a_fold_the_status_says_so():

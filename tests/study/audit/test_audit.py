@@ -349,8 +349,8 @@ def test_every_variant_starts_from_a_state_that_it_takes(kind):
     ("status", "kind", "words"),
     [
         ("found", "jam mode 1, stable", "jam mode 1, stable"),
-        ("coarse", "jam mode 1, stable", "jam mode 1, stable (coarse)"),
-        ("held", "jam mode 1, stable, but the loads part", "jam mode 1, stable, but the loads part"),
+        ("under_resolved", "jam mode 1, stable", "jam mode 1, stable (under_resolved)"),
+        ("would_separate", "jam mode 1, stable, but the loads part", "jam mode 1, stable, but the loads part"),
     ],
 )
 def test_a_status_of_the_computation_is_no_kind_of_motion(status, kind, words, monkeypatch):

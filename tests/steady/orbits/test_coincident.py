@@ -15,7 +15,7 @@ from stored_jit import stored_jit
 import jaxvib as jv
 from jaxvib.numerics.fourier import grid_of
 from jaxvib.steady.jams.folds import jam_rotor_speed, light_rotor_speed
-from jaxvib.steady.orbits.describe import _least_push
+from jaxvib.steady.orbits.describe import _least_contact_torque
 from jaxvib.steady.orbits.solve import Harmonics, PeriodicSolution, periodic_motion
 
 
@@ -153,7 +153,7 @@ def test_loads_side_by_side_in_leading_order_and_files():
 
 def test_loads_that_would_have_to_pull_are_not_stable():
     orbit = jv.jam_orbit(side_by_side(), omega=40.0)
-    assert bool(orbit.status == jv.OrbitStatus.held) and not bool(orbit.stable)
+    assert bool(orbit.status == jv.OrbitStatus.would_separate) and not bool(orbit.stable)
 
 
 def test_contact_forces_are_those_that_trailing_loads_need():
@@ -164,7 +164,7 @@ def test_contact_forces_are_those_that_trailing_loads_need():
     answer = np.zeros((1, orders.size), complex)
     answer[0, [1, 2, 3]] = [20.0 + 70.0j, 30.0 - 5.0j, 4.0j]
     motion = PeriodicSolution(jnp.asarray(deviation(grid.theta))[None], jnp.asarray(omega), jnp.asarray(speed))
-    found = _least_push(model, grid, motion, Harmonics(None, None, jnp.asarray(answer), None))
+    found = _least_contact_torque(model, grid, motion, Harmonics(None, None, jnp.asarray(answer), None))
     theta = 2.0 * np.pi * np.arange(2000) / 2000.0
     acceleration = np.real(answer[0] @ np.exp(1j * orders[:, None] * theta))
     needed = []

@@ -1,4 +1,4 @@
-"""The picture of a branch, however exactly it was computed."""
+"""Diagram and summary of a branch of jams."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from jaxvib.machine.scene import Scene
 if TYPE_CHECKING:
     from jaxvib.draw.style import Drawn, Onto, SpeedUnit
 
-__all__ = ["MARKS", "branch_summary", "picture"]
+__all__ = ["MARKS", "branch_summary", "plot_branch"]
 
 
 class _Branch(Protocol):
-    """The arrays of a branch that are drawn, an entry a point along the load speed."""
+    """Arrays of a branch that are drawn, with one entry for each point along the load speed."""
 
     omega: Array
     rotor_speed: Array
@@ -31,8 +31,10 @@ class _Branch(Protocol):
 
 
 def branch_summary(branch: _Branch, marks: Sequence[tuple[str, float, float]], judged: str) -> str:
-    """The ranges of a branch and its special points (kind, load speed, rotor speed), for a person to read; how stability is
-    `judged`."""
+    """Text with the ranges of a branch and its special points.
+
+    **Arguments**: `marks`: special points (kind, load speed, rotor speed); `judged`: text on how stability is determined.
+    """
     omega, stable = np.asarray(branch.omega), np.asarray(branch.stable)
     natural = ", ".join(f"{float(w):.6g}" for w in estimated_frequencies(branch.scene))
     lines = [
@@ -52,7 +54,7 @@ MARKS = {
 """Meanings of special points, for a legend."""
 
 
-def picture(
+def plot_branch(
     branch: _Branch,
     marks: Sequence[tuple[str, float, float]],
     unit: SpeedUnit,
