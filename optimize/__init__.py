@@ -1,4 +1,4 @@
-"""Design: what may change, what is wanted, who searches."""
+"""Design of machines: free numbers of a scene, quantities and demands, and the search for the best machine."""
 # ruff: noqa: E402
 
 import sys

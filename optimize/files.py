@@ -32,7 +32,8 @@ _SECTIONS = ["scene", "free", "ties", "choices", "hold", "demand", "objective", 
 
 @dataclass(frozen=True)
 class Design:
-    """A design file: the `space`, the `objective`, the arguments of `synthesize` in `search`, and the demands `subject_to`."""
+    """Content of a design file: `space`, `objective`, the arguments of `synthesize` in `search`, and the demands
+    `subject_to`."""
 
     space: DesignSpace
     objective: Quantity
@@ -40,25 +41,28 @@ class Design:
     subject_to: tuple[Demand, ...] = ()
 
     def run(self, **more: Any) -> Synthesis:
-        """`synthesize` of this design; `more` of its arguments in place of those in `search`."""
+        """Return `synthesize` of this design; `more` are arguments in place of those in `search`."""
         return synthesize(self.space, self.objective, subject_to=self.subject_to, **{**self.search, **more})
 
 
 @validated
 def load_design(path: str | Path) -> Design:
-    """Reads a design file.
+    """Read a design file.
 
-    `scene` names the scene file, relative to the design file; `[free]` gives bounds for each number that may change;
-    `[ties]` what follows what, `[choices]` the values that can be had; every `[[hold]]` a quantity and, unless it shall stay as
-    it is, its value; every `[[demand]]` a quantity that is `at_most` or `at_least` a value; `[objective]` the quantity to make
-    small, or large with `maximize = true`. A quantity with `tolerances` is taken over machines that are off by these,
-    `statistic = "expected"` or `"worst"`; `[search]` the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`,
-    `polishing`, `searcher`.
+    **Arguments**: `path` of a TOML file with
 
-    **Arguments**: `path` of a TOML file.
+    - `scene`: the scene file, relative to the design file
+    - `[free]`: bounds for each number that may change
+    - `[ties]`: numbers that follow others
+    - `[choices]`: values of catalogues
+    - every `[[hold]]`: a quantity and, unless it keeps its present value, its value
+    - every `[[demand]]`: a quantity that is `at_most` or `at_least` a value
+    - `[objective]`: the quantity to make small, or large with `maximize = true`
+    - `[search]`: the arguments of `synthesize`: `starts`, `seed`, `iterations`, `rate`, `polishing`, `searcher`
 
-    **Returns** `Design`. **Raises** `InputError` for a file that cannot be read and for everything that is wrong in it, field
-    named.
+    A quantity with `tolerances` is taken over machines whose numbers deviate by these, `statistic = "expected"` or `"worst"`.
+
+    **Returns** `Design`. **Raises** `InputError` for a file that cannot be read and for every error in it, naming the field.
 
     >>> import pathlib, tempfile
     >>> from jaxvib.machine.files import TEMPLATES

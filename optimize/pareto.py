@@ -40,8 +40,11 @@ _NO_LIMIT = 1e100
 class Front(Result):
     """Machines of which none is better in one quantity without being worse in the other.
 
-    **Attributes** (P machines): `values` (P, 2) of the two quantities; `names`, `units` of these; `machines` the scenes as the
-    texts of scene files; `scene(k)` is one of them.
+    **Attributes** (P machines)
+
+    - `values` (P, 2) of the two quantities
+    - `names` and `units` of these
+    - `machines`: the scenes as the texts of scene files; `scene(k)` is one of them
     """
 
     status = Computed.done
@@ -53,13 +56,13 @@ class Front(Result):
 
     @validated
     def scene(self, k: int) -> Scene:
-        """The machine behind point `k`, counted from 0. **Raises** `InputError` for a point that the front does not have."""
+        """Return the machine of point `k`, counted from 0. **Raises** `InputError` for a point that the front does not have."""
         if count(k, "k", low=0) >= len(self.machines):
             raise InputError("k", f"is {k}; the points of this front are numbered 0 to {len(self.machines) - 1}")
         return scene_from_toml(self.machines[k])
 
     def summary(self) -> str:
-        """A line a machine, in the units of `plot`."""
+        """Return a line of text for each machine, in the units of `plot`."""
         labels, columns = self._shown()
         return "\n".join(
             [" against ".join(labels), *("  " + "  ".join(f"{x:.5g}" for x in row) for row in zip(*columns, strict=True))]
@@ -76,7 +79,7 @@ class Front(Result):
 
     @validated
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """The front, each point with the number by which `scene` gives its machine.
+        """Plot the front, each point with the number by which `scene` gives its machine.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -99,15 +102,35 @@ def pareto(
 ) -> Front:
     """Return the trade-off of two quantities that are both to be small.
 
-    Each end of the front is the least value of one quantity and, among the machines that have it, the least of the other one.
-    Between the ends, limits on the second quantity are spread evenly: each point is the least of the first under its limit,
-    then the least of the second at that value of the first. Every point is a search of its own (two, counting the second
-    step); all of them share their programs. Machines that another one beats are left out.
+    - Each end of the front is the least value of one quantity and, among the machines that have it, the least of the other one
+    - Between the ends, limits on the second quantity are spread evenly: each point is the least of the first under its limit,
+      then the least of the second at that value of the first
+    - Every point is a search of its own (two, counting the second step); all of them share their programs
+    - Machines that another one beats are left out
 
-    **Arguments**: `points` at most so many machines, the rest as `synthesize`.
+    **Arguments**
 
-    **Returns** `Front`, machines with the least `first` first; a single one if it is the best of both. **Raises** as
-    `synthesize`.
+    - `space`: a `DesignSpace`
+    - `first` and `second`: the two quantities
+    - `points`: at most this number of machines, at least 2; typical: 9 (the default). The time grows in proportion
+    - `subject_to`, `starts`, `seed` as `synthesize`; typical: 32 starts (the default) for each point
+
+    **Returns** `Front`, machines with the least `first` first; a single one if it is the best of both.
+
+    **Raises** as `synthesize`.
+
+    >>> import jax; jax.config.update("jax_enable_x64", True)
+    >>> import jaxvib as jv
+    >>> from optimize import DesignSpace, pareto, spring_cost, static_deflection
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed("600 rpm"))
+    >>> space = DesignSpace(scene, free={"machine.stiffness": (1e4, 1e5)})
+    >>> cost = spring_cost([("10 N/mm", 20.0), ("100 N/mm", 55.0)])
+    >>> print(pareto(space, static_deflection(), cost, points=3, starts=2).summary())
+    static deflection, mm against cost of the springs
+      5.0014  55
+      9.0934  37.5
+      50.014  20
     """
     count(points, "points", low=2)
     given = (subject_to,) if isinstance(subject_to, Demand) else tuple(subject_to)

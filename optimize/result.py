@@ -57,11 +57,15 @@ class SynthesisStatus(eqx.Enumeration):
 
 @dataclass(frozen=True)
 class Outcome:
-    """A machine in numbers, in one jam mode.
+    """Numbers of a machine in one jam mode, NaN if the mode does not exist.
 
-    **Attributes**: `parameters` the freed numbers by name, SI; `exists` whether the mode exists; `omega` rad/s; `amplitude` m,
-    of platform 1 (y1) first, and `foundation_force` N, zero to peak; `force_per_amplitude` N/m. NaN where the mode does not
-    exist.
+    **Attributes**
+
+    - `parameters`: the free numbers by name, SI
+    - `exists`: True if the mode exists
+    - `omega`, rad/s
+    - `amplitude`, m, of platform 1 (y1) first, and `foundation_force`, N, zero to peak
+    - `force_per_amplitude`, N/m
     """
 
     parameters: dict[str, float | list[float]]
@@ -72,7 +76,7 @@ class Outcome:
     force_per_amplitude: float
 
     def as_dict(self) -> dict[str, Plain]:
-        """The same for JSON: freed numbers beside the quantities, None where there is no number."""
+        """Return the same for JSON: free numbers beside the quantities, None in place of NaN."""
         shown = ("omega", "amplitude", "foundation_force", "force_per_amplitude")
         return {name: plain(value) for name, value in {**self.parameters, **{k: getattr(self, k) for k in shown}}.items()}
 
@@ -138,17 +142,18 @@ class Synthesis(Result):
 
     **Attributes**
 
-    - `status` a `SynthesisStatus`; `scene` the best design
-    - `before`, `after` its `Outcome` by the jam's equations, `verified` by time integration of the full equations from `run`
-      (both None where that was not done or failed: `unverified` says why)
+    - `status`: a `SynthesisStatus`; `scene`: the best design
+    - `before` and `after`: its `Outcome` by the jam's equations, `verified` by time integration of the full equations from
+      `run` (both None if that was not done or failed: `unverified` states the reason)
     - `table` of `Row`: every free number and quantity before and after, of the exact motion and in time
-    - `limits` of `Limit`: demands, what is held, and bounds that are active, with what moving each would gain
-    - `influences` of `Influence`: which number matters most; `machines` of `Machine`: the different ones found, how often
-    - `kkt` the residual of the Karush-Kuhn-Tucker conditions of the best design, relative
-    - `starts` searches made, from `drawn` random designs; `converged` how many of them ended where no free number can improve;
-      `same` how many ended at the best design
-    - `designs` (starts, d) in [0, 1] where each search ended, with their `values` and whether each is `done`; `history`
-      (iterations, starts) of the objective; `objective` and `unit` its name and unit
+    - `limits` of `Limit`: demands, held quantities, and active bounds, with the gain from moving each
+    - `influences` of `Influence`: the influence of each number
+    - `machines` of `Machine`: the different ones that were found, and how often
+    - `kkt`: the residual of the Karush-Kuhn-Tucker conditions of the best design, relative
+    - `starts`: searches made, from `drawn` random designs; `converged`: number of them that ended at a design that no free
+      number can improve; `same`: number that ended at the best design
+    - `designs` (starts, d) in [0, 1]: the end of each search, with their `values` and whether each is `done`
+    - `history` (iterations, starts) of the objective; `objective` and `unit`: its name and unit
     """
 
     status: SynthesisStatus
@@ -175,7 +180,7 @@ class Synthesis(Result):
     machines: tuple[Machine, ...] = ()
 
     def summary(self) -> str:
-        """Before, after and verified, what hinders, what matters, for a person to read."""
+        """Return the design before, after and verified, the active limits and the influences as text."""
         counted = f"{self.starts} starts ({self.drawn} drawn), {self.converged} converged, {self.same} to the best machine"
         lines = [f"{objective_text(self.objective)}: {self.message}", counted]
         lines += [" ".join(line) for line in _aligned([["", "before", "after", "exact", "verified"], *self.rows()])]
@@ -185,7 +190,8 @@ class Synthesis(Result):
         return "\n".join(line.rstrip() for line in lines)
 
     def rows(self) -> list[list[str]]:
-        """The table as text, units that a designer reads: what, before, after, of the exact motion, verified in time."""
+        """Return the table as text, in units that a designer reads: name, before, after, of the exact motion, verified in
+        time."""
         out = []
         for row in self.table:
             sizes = [abs(v) for v in row[2:] if math.isfinite(v)]
@@ -195,7 +201,7 @@ class Synthesis(Result):
         return out
 
     def findings(self) -> list[str]:
-        """Lines on demands, on what is held and bounds, on influences, and on the machines found."""
+        """Return lines of text on demands, held quantities and bounds, on influences, and on the machines that were found."""
         lines = []
         best = self.machines[0].value if self.machines else math.nan
 
@@ -224,7 +230,7 @@ class Synthesis(Result):
         return lines
 
     def plot(self, *, ax: Axes | None = None) -> Drawn:
-        """Every quantity after the search against before, by ratio on a logarithmic axis.
+        """Plot every quantity after the search relative to its value before, on a logarithmic axis.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """
@@ -237,7 +243,7 @@ class Synthesis(Result):
         return before_after(shown, title=f"search for {objective_text(self.objective)}", ax=ax)
 
     def plot_convergence(self, *, ax: Axes | None = None) -> Drawn:
-        """The objective of every start over the iterations.
+        """Plot the objective of every start over the iterations.
 
         **Returns** a matplotlib figure, or the given `ax`.
         """

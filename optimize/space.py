@@ -32,7 +32,7 @@ Source = str | tuple[str, float | Literal["keep"]]
 
 
 class Held(eqx.Module):
-    """A quantity that keeps its value during the search; made by `hold`."""
+    """Quantity that keeps its value during the search; made by `hold`."""
 
     quantity: Quantity = eqx.field(static=True)
     value: float | np.ndarray | None
@@ -40,11 +40,14 @@ class Held(eqx.Module):
 
 @validated
 def hold(quantity: Quantity, value: Number | None = None) -> Held:
-    """Holds a quantity at a value, or, without one, at what it is in the scene the search begins with.
+    """Return the condition that a quantity keeps a value during the search.
 
-    **Arguments**: `quantity` such as `jam_frequency(mode=3)`; `value` in its unit, or text.
+    **Arguments**
 
-    **Returns** `Held`. **Raises** `InputError` for a wrong unit, or a value of 0 (what is held is compared relative to it).
+    - `quantity` such as `jam_frequency(mode=3)`
+    - `value` in its unit, or text; default: its value in the scene from which the search begins; typical: not 0
+
+    **Returns** `Held`. **Raises** `InputError` for a wrong unit, or a value of 0 (held quantities are compared relative to it).
 
     >>> from optimize import hold, jam_frequency
     >>> hold(jam_frequency(mode=3), "600 rpm").quantity.name
@@ -76,25 +79,35 @@ class Choice(NamedTuple):
 
 
 class DesignSpace(eqx.Module):
-    """The numbers of a scene that may change, between bounds, and quantities that must keep their value.
+    """Numbers of a scene that may change, between bounds, and quantities that must keep their value.
 
     **Arguments**
 
-    - `scene`: the design the search begins with
-    - `free`: name to (low, high), SI or text with units; a name such as "machine.stiffness" frees every entry of an array
-      that is not 0 (each within the bounds), "machine.stiffness[0]" one of them, also a spring that is not there yet (0),
-      "loads.drag" the one number all loads share, "drive.speed" the rotor's speed; (low, high, "log") divides the range by
-      ratio, (low, high, "even") evenly
+    - `scene`: the design from which the search begins
+    - `free`: a mapping from names to (low, high), SI or text with units; typical: 2 to 20 numbers, from a half or a tenth to 2
+      or 10 times their values. More free numbers need more starts
     - `hold`: quantities that keep their value, made by `optimize.hold`; sums and products too (`total`, `product`)
-    - `ties`: name to what it follows: another number's name (equal), (name, factor), or (name, "keep") for the ratio that both
-      have in the scene; zeros of an array stay, as in `free`
-    - `choices`: name to the values that can be had, such as the springs of a catalogue; "loads.count" to numbers of loads
+    - `ties`: a mapping from a name to the number that it follows: another number's name (equal), (name, factor), or (name,
+      "keep") for the ratio that both have in the scene; zeros of an array stay, as in `free`
+    - `choices`: a mapping from a name to the available values, such as the springs of a catalogue; "loads.count" to numbers of
+      loads; typical: 2 to 20 values
 
-    Inside, a design is a vector z in [0, 1]^d; ranges over a factor of 10 or more are divided by ratio, others evenly, unless
-    said otherwise.
+    Names and bounds of `free`:
 
-    **Raises** `InputError` for a name the scene does not have, bounds the wrong way round, a number that is free twice or free
-    and tied, values of a catalogue that no scene can have, or more held quantities than free numbers.
+    - "machine.stiffness" frees every entry of an array that is not 0 (each within the bounds)
+    - "machine.stiffness[0]" frees one of them, also a spring that is not there yet (0)
+    - "loads.drag" frees the one number that all loads share, "drive.speed" the rotor's speed
+    - (low, high, "log") divides the range by ratio, (low, high, "even") evenly; default: by ratio for ranges over a factor of
+      10 or more, otherwise evenly
+
+    Inside, a design is a vector z in [0, 1]^d.
+
+    **Raises** `InputError` for
+
+    - a name that the scene does not have, and bounds the wrong way round
+    - a number that is free twice, or free and tied
+    - values of a catalogue that no scene can have
+    - more held quantities than free numbers
 
     >>> import jaxvib as jv
     >>> from optimize import DesignSpace
@@ -164,7 +177,7 @@ class DesignSpace(eqx.Module):
 
     @property
     def size(self) -> int:
-        """Number of free numbers."""
+        """Number d of free numbers."""
         return sum(each.size for each in self.free)
 
     def _bounds(self, like: np.ndarray | Array) -> tuple[ModuleType, np.ndarray | Array, np.ndarray | Array]:
@@ -180,7 +193,7 @@ class DesignSpace(eqx.Module):
             raise InputError(name, f"is {quoted(values)}; it must be an array with {self.size} numbers{axis}")
 
     def numbers(self, z: Numbers) -> Numbers:
-        """The free numbers (..., d), SI, of designs z (..., d) in [0, 1]; NumPy's arrays where z is one."""
+        """Return the free numbers (..., d), SI, of designs `z` (..., d) in [0, 1]; NumPy arrays if z is one."""
         self._require_size(z, "z")
         xp, low, high = self._bounds(z)
         log = np.asarray(self.logs)
@@ -188,12 +201,12 @@ class DesignSpace(eqx.Module):
         return xp.where(log, base * xp.where(log, high / base, 1.0) ** z, low + (high - low) * z)
 
     def at(self, z: Array) -> Scene:
-        """The scene of the design z (d,) in [0, 1]."""
+        """Return the scene of the design `z` (d,) in [0, 1]."""
         self._require_size(z, "z", single=True)
         return self.scene_of(self.numbers(z))
 
     def scene_of(self, values: Array) -> Scene:
-        """The scene with these free numbers (d,), SI."""
+        """Return the scene with the free numbers `values` (d,), SI."""
         self._require_size(values, "values", single=True)
         scene = put_numbers(self.scene, self.free, jnp.asarray(values))
         for tie in self.ties:
@@ -202,11 +215,11 @@ class DesignSpace(eqx.Module):
 
     @validated
     def where(self, scene: Scene) -> Array:
-        """The design z (d,) of a scene, moved into the bounds where it lies outside."""
+        """Return the design z (d,) of a `scene`, moved into the bounds if it lies outside."""
         return self.shares(jnp.concatenate([each.read(scene) for each in self.free]))
 
     def shares(self, numbers: Numbers) -> Numbers:
-        """The designs z (..., d) of free numbers (..., d), SI, moved into the bounds where they lie outside."""
+        """Return the designs z (..., d) of free `numbers` (..., d), SI, moved into the bounds if they lie outside."""
         self._require_size(numbers, "numbers")
         xp, low, high = self._bounds(numbers)
         value, log, width = xp.clip(numbers, low, high), np.asarray(self.logs), high - low
@@ -217,22 +230,23 @@ class DesignSpace(eqx.Module):
 
     @validated
     def parameters(self, scene: Scene) -> dict[str, float | list[float]]:
-        """The free numbers of a scene by name, in SI."""
+        """Return the free numbers of a `scene` by name, in SI."""
         return {n.name: (n.leaf(scene) if n.entry is None else n.leaf(scene)[n.entry]).tolist() for n in self.free}
 
     def words(self) -> list[tuple[str, str]]:
-        """Name in a designer's words and unit of each free number."""
+        """Name for a designer, and unit, of each free number."""
         return [(word, each.unit) for each in self.free for word in each.words(self.scene)]
 
     @validated
     def within(self, low: np.ndarray, high: np.ndarray) -> DesignSpace:
-        """The same space between other bounds (d,), SI; equal ones fix a number."""
+        """Return the same space between other bounds `low` and `high` (d,), SI; equal bounds fix a number."""
         for bounds, name in ((low, "low"), (high, "high")):
             self._require_size(bounds, name, single=True)
         return eqx.tree_at(lambda s: (s.low, s.high), self, (np.asarray(low, float), np.asarray(high, float)))
 
     def residuals(self, evaluation: Evaluation) -> Array:
-        """Deviation of each held quantity, relative to the value at which it is held (m,)."""
+        """Return the deviation of each held quantity, relative to the value at which it is held (m,), for an `evaluation` of a
+        scene."""
         off = [held.quantity.read(evaluation) / held.value - 1.0 for held in self.held if held.value is not None]
         return jnp.stack(off) if off else jnp.zeros((0,))
 

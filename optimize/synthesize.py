@@ -65,33 +65,41 @@ def synthesize(
     throw: bool = True,
     progress: Tell | None = None,
 ) -> Synthesis:
-    """Searches a design space from many random starts at once for the least value of a quantity, subject to demands.
+    """Search a design space from many random starts at once for the least value of a quantity, subject to demands.
 
-    Starts are drawn evenly from the bounds and moved onto what is held; Adam (optax) descends from all of them at once, each
-    step along what is held, demands by an augmented Lagrangian; sequential quadratic programming with exact first derivatives
-    polishes. Catalogues are chosen from by branch and bound, numbers of loads by trying each. Jam modes are followed from one
-    design to the next and looked up on the whole branch in the end.
+    - Starts are drawn evenly from the bounds and moved onto the held quantities
+    - Adam (optax) descends from all of them at once, each step along the held quantities, with an augmented Lagrangian for the
+      demands
+    - Sequential quadratic programming with exact first derivatives polishes
+    - Catalogues are chosen from by branch and bound, numbers of loads by trying each
+    - Jam modes are followed from one design to the next and looked up on the whole branch in the end
 
     **Arguments**
 
-    - `space`: a `DesignSpace`; `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`; what shall be large is written
-      `-quantity`
+    - `space`: a `DesignSpace`
+    - `objective`: a `Quantity` such as `force_per_amplitude(mode=3)`; write `-quantity` for one that shall be large
     - `subject_to`: demands such as `[amplitude(mode=3) > "2 mm", power(mode=3) < 500.0]`
-    - `starts`, `seed`: how many random starts, and which; `iterations` of the descent with first step `rate` (in parts of a
-      free number's range), then `polishing` steps of sequential quadratic programming
-    - `searcher`: what comes before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which asks for values
-      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `cma`); its few best designs
-      are polished
-    - `begin`: go on from where another search of this space ended, in place of random starts
-    - `verify`: compute the exact motion of the best design and, if it is stable, integrate the full equations until they have
-      settled, the loads at first up to 1e-3 rad beside that motion, and measure; `unverified` says why there is no such run
-    - `throw`: raise where demands contradict each other; otherwise the status and `limits` say so
-    - `progress`: called with what is being done and how much of it is (0 to 1). An interrupt (Ctrl-C) ends the search with the
-      best that it has
+    - `starts`: number of random starts; typical: 32 to 256 (the default). The time grows in proportion, and so does the chance
+      of the lowest valley
+    - `seed` of these starts
+    - `iterations` of the descent; typical: 50 to 200 (default 100)
+    - `rate`: first step of the descent, in parts of a free number's range; typical: 0.01 to 0.1 (default 0.05)
+    - `polishing`: steps of sequential quadratic programming; typical: 12 (the default)
+    - `searcher`: the method before the polishing, "gradients" (Adam from the starts), or "cma": CMA-ES, which computes values
+      alone, `starts` x `iterations` of them, and finds its way among many valleys (extra `cma`); its few best designs are
+      polished
+    - `begin`: a `Synthesis` of this space from which to continue, in place of random starts
+    - `verify`: True to compute the exact motion of the best design and, if it is stable, integrate the full equations until
+      they have settled, the loads at first up to 1e-3 rad beside that motion, and measure; `unverified` states why there is no
+      such run
+    - `throw`: raise if demands contradict each other; otherwise the status and `limits` show it
+    - `progress`: a function, called with the present step and its finished share (0 to 1). An interrupt (Ctrl-C) ends the
+      search with its best design
 
-    **Returns** `Synthesis`. **Raises** `InputError` for values that are not allowed, `ComputationError` (status
-    "no_feasible_start" if no design in the bounds has the objective, "contradictory" where no design meets all demands: it
-    names those that are not met, and by how much).
+    **Returns** `Synthesis`.
+
+    **Raises** `InputError` for values that are not allowed, `ComputationError` (status "no_feasible_start" if no design in the
+    bounds has the objective, "contradictory" if no design meets all demands: it names those that are not met, and by how much).
 
     >>> import jax; jax.config.update("jax_enable_x64", True)
     >>> import jaxvib as jv

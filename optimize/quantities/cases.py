@@ -156,13 +156,18 @@ class Robust(_OfPart):
 
 @validated
 def under(quantity: Quantity, name: str, changes: Mapping[str, Number]) -> Quantity:
-    """A quantity at another operating point or under another load: some numbers of the scene have other values.
+    """Return a quantity at another operating point or under another load: some numbers of the scene have other values.
 
-    **Arguments**: `quantity`; `name` of the case, for tables; `changes` the name of a number, such as "drive.speed" or
-    "machine.mass[0]", to its value, SI or text with a unit; the name of an array changes each of its entries that is not 0.
+    **Arguments**
 
-    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, where it is computed, a name that the
-    scene does not have.
+    - `quantity` of the changed scene
+    - `name` of the case, for tables
+    - `changes`: a mapping from the name of a number, such as "drive.speed" or "machine.mass[0]", to its value, SI or text with
+      a unit; the name of an array changes each of its entries that is not 0; typical: 1 or 2 numbers, 0.5 to 2 times their
+      values
+
+    **Returns** `Quantity`. **Raises** `InputError` for a value of another unit, and, when it is computed, a name that the scene
+    does not have.
 
     >>> from optimize import foundation_force, under
     >>> under(foundation_force(mode=3), "loaded", {"machine.mass[0]": "180 kg"}).words
@@ -194,13 +199,18 @@ def _robust(quantity: Quantity, tolerances: Mapping[str, float], samples: int, s
 
 @validated
 def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
-    """The mean of a quantity over machines whose numbers are off.
+    """Return the mean of a quantity over machines whose numbers deviate from the design.
 
-    **Arguments**: `quantity`; `tolerances` the name of a number or array of the scene to the relative tolerance that 95 of 100
-    machines keep (0.05: 5 %); each entry has an error of its own, normal, no more than one and a half tolerances;
-    `samples` how many machines are drawn, `seed` which (a Latin hypercube).
+    **Arguments**
 
-    **Returns** `Quantity`, NaN where one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
+    - `quantity` of each machine
+    - `tolerances`: a mapping from the name of a number or array of the scene to the relative tolerance that 95 of 100 machines
+      keep (0.05: 5 %); each entry has an error of its own, normal, no more than one and a half tolerances; typical: 0.01 to 0.1
+      for masses and springs, 0.3 to 0.5 for damping
+    - `samples`: number of machines that are drawn; typical: 16 to 256 (default 64). The time grows in proportion
+    - `seed` of the drawing (a Latin hypercube)
+
+    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
 
     >>> from optimize import expected, foundation_force
     >>> expected(foundation_force(mode=3), {"machine.stiffness": 0.05}).words
@@ -211,8 +221,13 @@ def expected(quantity: Quantity, tolerances: Mapping[str, float], *, samples: in
 
 @validated
 def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0) -> Quantity:
-    """The largest value of a quantity over machines whose numbers are off, see `expected`; of one that shall be large, take
-    `-worst(-quantity, ...)`.
+    """Return the largest value of a quantity over machines whose numbers deviate from the design, see `expected`.
+
+    For a quantity that shall be large, take `-worst(-quantity, ...)`.
+
+    **Arguments**: `quantity`, `tolerances`, `samples` and `seed` as `expected`; typical: 64 samples (the default).
+
+    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances.
 
     >>> from optimize import foundation_force, worst
     >>> worst(foundation_force(mode=3), {"machine.damping": 0.3}).unit
@@ -225,7 +240,15 @@ def worst(quantity: Quantity, tolerances: Mapping[str, float], *, samples: int =
 def quantile(
     quantity: Quantity, level: float, tolerances: Mapping[str, float], *, samples: int = 64, seed: int = 0
 ) -> Quantity:
-    """The value that a share `level` of the machines stays below, see `expected`.
+    """Return the value that a share of the machines stays below, see `expected`.
+
+    **Arguments**
+
+    - `quantity`, `tolerances`, `samples` and `seed` as `expected`
+    - `level`: the share, between 0 and 1; typical: 0.9 to 0.99. It needs some multiples of 1 / (1 - level) samples
+
+    **Returns** `Quantity`, NaN if one of the machines does not have it. **Raises** `InputError` for wrong tolerances or a wrong
+    level.
 
     >>> from optimize import foundation_force, quantile
     >>> quantile(foundation_force(mode=3), 0.95, {"machine.stiffness": 0.05}).words

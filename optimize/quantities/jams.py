@@ -89,13 +89,18 @@ def _pair(of: Pair | list[int]) -> Pair:
 
 @validated
 def amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
-    """Amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
+    """Return the amplitude in a jam mode, m zero to peak: of a platform, or of one relative to another (see `between`).
 
-    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them; `tier` "leading" (of light
-    loads, by algebra), "exact" (the exact periodic motion), "time" (the full equations, integrated for a while from the jam).
+    **Arguments**
 
-    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
-    raises `InputError` where the quantity is computed.
+    - `mode`: number of the jam mode, 1 to 2 nd + 1; typical: 1, 3, 5, which are stable for light loads
+    - `of`: a platform, or a pair of them for a relative amplitude; typical: 1 to 3; default: platform 1 relative to 2, or the
+      only one
+    - `tier`: "leading" (light loads, by algebra; the default), "exact" (the exact periodic motion), "time" (the full equations,
+      integrated for a while from the jam); typical times for a machine: 0.2 ms, 0.3 ms, 5 to 100 ms
+
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.5 to 10 mm. A number of a mode or platform that the
+    machine does not have raises `InputError` when the quantity is computed.
 
     >>> from optimize import amplitude
     >>> amplitude(mode=3, of=1).unit
@@ -121,12 +126,17 @@ def _amplitude(evaluation: Evaluation, tier: Tier, mode: int, of: Pair) -> Array
 
 @validated
 def phase(*, mode: int, of: tuple[int, int] = (1, 2), tier: Tier = "leading") -> Quantity:
-    """Phase difference of two platforms in a jam mode, rad: 0 in phase, pi in antiphase; of the exact motion that of their
-    first harmonics.
+    """Return the phase difference of two platforms in a jam mode, rad: 0 in phase, pi in antiphase.
 
-    **Arguments**: `mode` number of the jam mode; `of` the two platforms; `tier` "leading" or "exact".
+    For the exact motion it is that of their first harmonics.
 
-    **Returns** `Quantity`, NaN where the mode does not exist. **Raises** `InputError` for what is no pair.
+    **Arguments**
+
+    - `mode`: number of the jam mode; typical: 1, 3, 5
+    - `of`: the two platforms (default: 1 and 2)
+    - `tier`: "leading" (the default) or "exact"
+
+    **Returns** `Quantity`, NaN if the mode does not exist. **Raises** `InputError` for an argument that is no pair.
 
     >>> from optimize import phase
     >>> (phase(mode=3) > "170 deg").words
@@ -153,13 +163,16 @@ def _phase(evaluation: Evaluation, tier: Tier, mode: int, of: tuple[int, int]) -
 
 @validated
 def foundation_force(*, mode: int, harmonic: int | None = None, tier: Tier = "leading") -> Quantity:
-    """Force of all supports on the bed in a jam mode, N zero to peak.
+    """Return the force of all supports on the foundation in a jam mode, N zero to peak.
 
-    **Arguments**: `mode` number of the jam mode; `harmonic` k: that of the force at k times the loads' speed alone (of the
-    exact motion); `tier` as `amplitude`.
+    **Arguments**
 
-    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
-    `InputError` where the quantity is computed, a harmonic of another tier than the exact one here.
+    - `mode`: number of the jam mode; typical: 1, 3, 5
+    - `harmonic` k: the force at k times the loads' speed alone (of the exact motion); typical: 1 to 5; default: the whole force
+    - `tier` as `amplitude`
+
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 1 to 2000 N. A number of a mode that the machine does not
+    have raises `InputError` when the quantity is computed, a harmonic of another tier than the exact one raises it here.
 
     >>> from optimize import foundation_force
     >>> foundation_force(mode=3).unit
@@ -188,12 +201,16 @@ def _force(evaluation: Evaluation, tier: Tier, mode: int, harmonic: int | None) 
 
 @validated
 def force_per_amplitude(*, mode: int, of: Pair = None, tier: Tier = "leading") -> Quantity:
-    """Foundation force per amplitude in a jam mode, N/m; whose amplitude, and the tiers, as `amplitude`.
+    """Return the foundation force per amplitude in a jam mode, N/m.
 
-    **Arguments**: `mode` number of the jam mode; `of` whose amplitude, a platform or a pair of them; `tier`.
+    **Arguments**
 
-    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode or platform that the machine does not have
-    raises `InputError` where the quantity is computed.
+    - `mode`: number of the jam mode; typical: 1, 3, 5
+    - `of`: a platform, or a pair of them, as `amplitude`
+    - `tier` as `amplitude`
+
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.001 to 1 times the stiffness of the supports. A number of
+    a mode or platform that the machine does not have raises `InputError` when the quantity is computed.
 
     >>> from optimize import force_per_amplitude
     >>> force_per_amplitude(mode=3).unit
@@ -221,12 +238,12 @@ def _peaks_per_amplitude(evaluation: Evaluation, sign: float, tier: Tier, mode: 
 
 @validated
 def jam_frequency(*, mode: int, tier: Tier = "leading") -> Quantity:
-    """Speed Omega at which the loads jam in a mode, rad/s.
+    """Return the speed Omega at which the loads jam in a mode, rad/s.
 
-    **Arguments**: `mode` number of the jam mode; `tier` as `amplitude`.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier` as `amplitude`.
 
-    **Returns** `Quantity`, NaN where the mode does not exist. A number of a mode that the machine does not have raises
-    `InputError` where the quantity is computed.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 90 % to 100 % of a resonance, 10 to 300 rad/s. A number of
+    a mode that the machine does not have raises `InputError` when the quantity is computed.
 
     >>> from optimize import jam_frequency
     >>> jam_frequency(mode=3).unit
@@ -243,15 +260,15 @@ def _frequency(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 @validated
 def fold_margin(*, mode: int) -> Quantity:
-    """Change of the rotor speed, up or down, at which a jam mode vanishes at a fold, rad/s, to leading order.
+    """Return the change of the rotor speed, up or down, at which a jam mode vanishes at a fold, rad/s, to leading order.
 
         margin = min(n - n_low, n_high - n),    n_low, n_high rotor speeds of the folds that end the mode
 
-    Where no fold ends the mode, 0 stands for n_low and ten times the rotor's speed for n_high.
+    If no fold ends the mode, 0 stands for n_low and ten times the rotor's speed for n_high.
 
-    **Arguments**: `mode` number of the jam mode.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
 
-    **Returns** `Quantity`, NaN where the mode does not exist.
+    **Returns** `Quantity`, NaN if the mode does not exist; typical demand: above 5 % of the rotor speed.
 
     >>> from optimize import fold_margin
     >>> (fold_margin(mode=3) > "60 rpm").words
@@ -276,9 +293,11 @@ def _margins(evaluation: Evaluation, sign: float, tier: Tier, mode: int) -> Arra
 
 @validated
 def largest_multiplier(*, mode: int) -> Quantity:
-    """The largest modulus of the non-trivial Floquet multipliers of the exact motion: below 1 it is stable.
+    """Return the largest modulus of the non-trivial Floquet multipliers of the exact motion: below 1 it is stable.
 
-    **Arguments**: `mode` number of the jam mode. **Returns** `Quantity`, NaN where the mode does not exist.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5.
+
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 0.7 to 1; typical demand: below 0.99.
 
     >>> from optimize import largest_multiplier
     >>> (largest_multiplier(mode=3) < 0.99).words
@@ -293,11 +312,13 @@ def _multiplier(evaluation: Evaluation, tier: Tier, mode: int) -> Array:
 
 @validated
 def power(*, mode: int, tier: Tier = "leading") -> Quantity:
-    """Mean power that the loads take from the rotor in a jam mode, W: n sum_j b_W R^2 (n - Omega), and what dry friction takes.
+    """Return the mean power that the loads take from the rotor in a jam mode, W.
 
-    **Arguments**: `mode` number of the jam mode; `tier` "leading" or "exact".
+        P = n sum_j b_W R^2 (n - Omega) + power of dry friction
 
-    **Returns** `Quantity`, NaN where the mode does not exist.
+    **Arguments**: `mode`: number of the jam mode; typical: 1, 3, 5; `tier`: "leading" (the default) or "exact".
+
+    **Returns** `Quantity`, NaN if the mode does not exist; typical: 10 to 2000 W.
 
     >>> from optimize import power
     >>> power(mode=3).unit

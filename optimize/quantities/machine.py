@@ -38,9 +38,11 @@ def _platforms(scene: Scene, what: str) -> Platforms:
 
 
 def support_frequency_squared() -> Quantity:
-    """sum_i k_i/M_i over the platforms, loads included in M, (rad/s)^2: the stiffness budget n_1^2 + n_2^2 of the papers.
+    """Return sum_i k_i/M_i over the platforms, loads included in M, (rad/s)^2: the stiffness budget n_1^2 + n_2^2 of the
+    papers.
 
-    **Returns** `Quantity`. A machine without platforms raises `InputError` where the quantity is computed.
+    **Returns** `Quantity`; typical: 100 to 10,000. A machine without platforms raises `InputError` when the quantity is
+    computed.
 
     >>> import jaxvib as jv
     >>> from optimize import support_frequency_squared
@@ -78,8 +80,11 @@ def _leaf(scene: Scene, part: str, name: str) -> Array:
 
 @validated
 def total(field: str) -> Quantity:
-    """The sum of an array of the scene, such as "machine.stiffness", in the unit of its entries; a number that all loads share,
-    such as "loads.mass", counts once for each load.
+    """Return the sum of an array of the scene, such as "machine.stiffness", in the unit of its entries.
+
+    A number that all loads share, such as "loads.mass", counts once for each load.
+
+    **Arguments**: `field`: the name of the array; typical: "machine.mass", "machine.stiffness", "loads.mass".
 
     **Returns** `Quantity`. **Raises** `InputError` for a name that no scene has.
 
@@ -97,8 +102,11 @@ def _total(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
 
 @validated
 def product(field: str) -> Quantity:
-    """The product of an array of the scene, such as "machine.stiffness", see `total`; its unit, that of its entries' product,
-    is left out.
+    """Return the product of an array of the scene, such as "machine.stiffness", see `total`.
+
+    Its unit, that of its entries' product, is left out.
+
+    **Arguments**: `field`: the name of the array; typical: "machine.mass", "machine.stiffness".
 
     **Returns** `Quantity`. **Raises** `InputError` for a name that no scene has.
 
@@ -115,9 +123,10 @@ def _product(evaluation: Evaluation, tier: Tier, part: str, name: str) -> Array:
 
 
 def total_mass() -> Quantity:
-    """Mass of the platforms and the loads, kg.
+    """Return the mass of the platforms and the loads, kg.
 
-    **Returns** `Quantity`. A machine without platforms raises `InputError` where the quantity is computed.
+    **Returns** `Quantity`; typical: 50 to 5000 kg. A machine without platforms raises `InputError` when the quantity is
+    computed.
 
     >>> from optimize import total_mass
     >>> total_mass().unit
@@ -134,12 +143,12 @@ def _mass(evaluation: Evaluation, tier: Tier) -> Array:
 
 @validated
 def static_deflection(of: int | None = None) -> Quantity:
-    """Static deflection of a platform under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
+    """Return the static deflection of a platform under the weight of platforms and loads, m: K y = M g, g = 9.80665 m/s^2.
 
-    **Arguments**: `of` the platform; default: the largest deflection of all platforms.
+    **Arguments**: `of`: the platform; typical: 1 to 3; default: the largest deflection of all platforms.
 
-    **Returns** `Quantity`, NaN for a platform that no support carries, directly or by links. A machine without platforms, or
-    without that one, raises `InputError` where the quantity is computed.
+    **Returns** `Quantity`, NaN for a platform that no support carries, directly or by links; typical: 2 to 50 mm. A machine
+    without platforms, or without that one, raises `InputError` when the quantity is computed.
 
     >>> import jaxvib as jv
     >>> from optimize import static_deflection
@@ -179,14 +188,18 @@ def _carried(machine: Platforms) -> Array:
 
 @validated
 def spring_cost(prices: Sequence[tuple[Number, float]], unit: str = "") -> Quantity:
-    """Cost of the springs of supports and links, from a price list.
+    """Return the cost of the springs of supports and links, from a price list.
 
-    Prices between two entries are interpolated. Beyond an end of the list they go on as between its last two entries there,
-    but never below the price at that end. A spring of stiffness 0 costs nothing.
+    Prices between two entries are interpolated. Beyond an end of the list they go on as between its last two entries there, but
+    never below the price at that end. A spring of stiffness 0 costs nothing.
 
-    **Arguments**: `prices` pairs (stiffness N/m or text, price), stiffness ascending, prices at least 0; `unit` of the prices.
+    **Arguments**
 
-    **Returns** `Quantity`. **Raises** `InputError` for a list that is no such list.
+    - `prices`: pairs (stiffness, price), stiffness in N/m or text, ascending, prices at least 0; typical: 2 to 20 pairs from
+      1e4 to 1e6 N/m
+    - `unit` of the prices
+
+    **Returns** `Quantity`. **Raises** `InputError` for a wrong list.
 
     >>> from optimize import spring_cost
     >>> spring_cost([("10 N/mm", 20.0), ("100 N/mm", 55.0)]).words

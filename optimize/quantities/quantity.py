@@ -46,16 +46,21 @@ Operand: TypeAlias = "Quantity | Number"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number of a scene with a name and a unit; quantities can be added, multiplied, compared.
+    """Number of a scene with a name and a unit; quantities can be added, multiplied, compared.
 
-    **Arguments**: `name`; `unit`, "" for none; `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`),
-    that gives a scalar, differentiable, NaN where the quantity does not exist; `mode` the jam mode it belongs to, if any; `of`
-    whose amplitude it is about, if any.
+    **Arguments**
 
-    What is added or compared must have the same unit, and a text such as "50 N" counts as a quantity: `force < "50 N"`,
+    - `name` of the quantity
+    - `unit`, "" for none
+    - `function` of a `Scene`, or of a `Scene` and its jam modes (`jaxvib.JamModes`), that returns a scalar, differentiable, NaN
+      if the quantity does not exist
+    - `mode`: its jam mode, if any; typical: 1, 3, 5
+    - `of`: the platform or pair of platforms of its amplitude, if any
+
+    Operands of a sum or a comparison must have the same unit. A text such as "50 N" counts as a quantity: `force < "50 N"`,
     `0.3 * a / "1 mm" + force / "10 N"`. `+ - * / **` of quantities and numbers are quantities; `<` and `>` make a `Demand`.
 
-    **Raises** `InputError` for what is no function of one or two arguments, and for units that do not go together.
+    **Raises** `InputError` for an argument that is no function of one or two arguments, and for units that do not match.
 
     >>> import jaxvib as jv
     >>> from optimize import Quantity, foundation_force
@@ -70,7 +75,7 @@ class Quantity:
     mode: int | None = None
     of: Pair = None
     parts: tuple[Quantity, ...] = field(default=(), kw_only=True)
-    """The quantities that it is made of."""
+    """Quantities from which this one is computed."""
 
     def __post_init__(self) -> None:
         if self.mode is not None:
@@ -85,20 +90,22 @@ class Quantity:
         return self.read(Evaluation(scene, modes=modes))
 
     def read(self, evaluation: Evaluation) -> Array:
-        """The quantity's value, a scalar in `unit`, from what is known of a scene."""
+        """Return the quantity's value, a scalar in `unit`, from an `evaluation` of a scene."""
         assert self.function is not None
         if arguments(self.function) == 1:
             return jnp.reshape(self.function(evaluation.scene), ())
         return jnp.reshape(self.function(evaluation.scene, evaluation.modes), ())
 
     def pieces(self, evaluation: Evaluation, sign: float = 1.0) -> Array:
-        """Smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity where `sign` is -1: a
-        search may go along the kinks where two of them are alike."""
+        """Return smooth numbers (p,) in `unit` of which the largest is the quantity, or minus the quantity if `sign` is -1.
+
+        A search may go along the kinks at which two of them, computed from an `evaluation`, are equal.
+        """
         return jnp.reshape(sign * self.read(evaluation), (1,))
 
     @property
     def words(self) -> str:
-        """The quantity in words."""
+        """Name of the quantity for tables and sentences."""
         return self.name.replace("_", " ")
 
     @property
@@ -107,18 +114,23 @@ class Quantity:
         return any(part.forward_only for part in self.parts)
 
     def at_tier(self, tier: Tier) -> Quantity:
-        """The same quantity computed in another way, where it can be. **Raises** `InputError` for a tier that there is not."""
+        """Return the same quantity computed by another `tier`, if it can be.
+
+        **Raises** `InputError` for an unknown tier.
+        """
         require_one_of(tier, TIERS, "tier")
         return replace(self, parts=tuple(part.at_tier(tier) for part in self.parts)) if self.parts else self
 
     @property
     def easy(self) -> Quantity:
-        """Quantity that is searched first in its place, since it takes less time and its best machines are near: to leading
-        order, without tolerances."""
+        """Quantity that is searched first in its place, because it takes less time and its best machines are near.
+
+        It is the leading order, without tolerances.
+        """
         return replace(self, parts=tuple(part.easy for part in self.parts)) if self.parts else self
 
     def named(self, name: str) -> Quantity:
-        """The same quantity under another name."""
+        """Return the same quantity under another `name`."""
         return replace(self, name=name)
 
     def __add__(self, other: Operand) -> Quantity:
@@ -261,9 +273,9 @@ class Combined(Quantity):
 
 @dataclass(frozen=True)
 class Demand:
-    """A quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
+    """Quantity that must be at most, or at least, another one or a value; made by `<` and `>`.
 
-    **Attributes**: `quantity`, `limit` quantities of the same unit; `sense` "at most" or "at least".
+    **Attributes**: `quantity` and `limit`, quantities of the same unit; `sense`: "at most" or "at least".
     """
 
     quantity: Quantity
@@ -273,7 +285,10 @@ class Demand:
 
     @classmethod
     def of(cls, quantity: Quantity, limit: Operand, sense: str) -> Demand:
-        """A demand. **Raises** `InputError` for a limit of another unit."""
+        """Return the demand that a `quantity` is "at most" or "at least" (`sense`) a `limit`.
+
+        **Raises** `InputError` for a limit of another unit.
+        """
         other = (
             limit if isinstance(limit, Quantity) else _constant(number_in(limit, quantity.unit, quantity.words), quantity.unit)
         )
@@ -286,22 +301,25 @@ class Demand:
 
     @property
     def words(self) -> str:
-        """The demand as a sentence's part."""
+        """Demand as part of a sentence."""
         return f"{self.quantity.words} {self.sense} {self.shown}"
 
     @property
     def constant(self) -> float | None:
-        """The limit, where it is a number."""
+        """Limit, if it is a number; otherwise None."""
         limit = self.limit
         return limit.constant if isinstance(limit, Combined) and limit.operation == "constant" else None
 
     def form(self) -> Demand:
-        """The same demand without its words and, where that is a number, its limit: those of one form share programs."""
+        """Same demand without its words and, if that is a number, its limit: demands of one form share programs."""
         limit = self.limit if self.constant is None else Combined("", "", operation="constant")
         return replace(self, limit=limit, shown="")
 
     def excess(self, evaluation: Evaluation, constant: Array) -> Array:
-        """Violation of the demand in its unit, negative if it is met; `constant` is its limit if that is a number."""
+        """Return the violation of the demand in its unit, negative if it is met.
+
+        **Arguments**: an `evaluation` of a scene; `constant`: the limit if that is a number.
+        """
         value = self.quantity.read(evaluation)
         limit = constant if self.constant is not None else self.limit.read(evaluation)
         return value - limit if self.sense == "at most" else limit - value
@@ -382,7 +400,11 @@ def _extreme(operation: str, quantities: tuple[Quantity, ...]) -> Quantity:
 
 @validated
 def largest(*quantities: Quantity) -> Quantity:
-    """The largest of some quantities of the same unit, for example of one quantity at several operating points.
+    """Return the largest of some quantities of the same unit, for example of one quantity at several operating points.
+
+    **Arguments**: `quantities`, at least one; typical: 2 to 5.
+
+    **Returns** `Quantity`. **Raises** `InputError` for quantities of different units.
 
     >>> from optimize import foundation_force, largest, under
     >>> force = foundation_force(mode=3)
@@ -394,7 +416,16 @@ def largest(*quantities: Quantity) -> Quantity:
 
 @validated
 def least(*quantities: Quantity) -> Quantity:
-    """The least of some quantities of the same unit, see `largest`."""
+    """Return the least of some quantities of the same unit, see `largest`.
+
+    **Arguments**: `quantities`, at least one; typical: 2 to 5.
+
+    **Returns** `Quantity`. **Raises** `InputError` for quantities of different units.
+
+    >>> from optimize import amplitude, least
+    >>> (least(amplitude(mode=3, of=1), amplitude(mode=3, of=2)) > "2 mm").words
+    'least of (amplitude of platform 1, mode 3; amplitude of platform 2, mode 3) at least 2 mm'
+    """
     return _extreme("least", quantities)
 
 
