@@ -308,6 +308,7 @@ def test_names_of_statuses():
     assert status_name(RunStatus.no_step) == "no_step" and sentence(Computed.done) == "the answer was computed"
     several = member(RunStatus, [["done", "no_start"], ["done", "done"]])
     assert status_names(several).tolist() == [["done", "no_start"], ["done", "done"]]
+    assert status_names(member(RunStatus, np.zeros((0, 2), dtype=str))).shape == (0, 2)
     assert sentence(several) == f"{RunStatus[RunStatus.done]} (3 of 4); {RunStatus[RunStatus.no_start]} (1 of 4)"
     assert str(failure(RunStatus.no_start, "; look")) == f"no_start: {RunStatus[RunStatus.no_start]}; look"
     with pytest.raises(TypeError, match="has no name yet"):

@@ -68,6 +68,10 @@ def test_a_number_goes_to_a_program_as_it_is_known():
         assert known_number(2e-3, "s", "field").dtype == np.float32
         with pytest.raises(jv.InputError, match="field is inf s; a finite number is needed"):
             known_number(1e39, "s", "field")
+    with pytest.raises(jv.InputError, match="field is -1 s; it must be at least 0"):
+        known_number(-1.0, "s", "field", low=0.0)
+    with pytest.raises(jv.InputError, match="field is 0 s; it must be greater than 0"):
+        known_number(0.0, "s", "field", low=0.0, open_low=True)
 
 
 @pytest.mark.parametrize(("unit", "text"), [(unit, text) for unit, known in _FACTORS.items() for text in known])
@@ -84,6 +88,7 @@ def test_pint_quantities_come_in():
     units = pint.get_application_registry()
     np.testing.assert_allclose(number(units.Quantity(1500.0, "rpm"), "rad/s", "field"), 50 * np.pi, rtol=1e-14)
     np.testing.assert_allclose(number(units.Quantity(25.0, "Hz"), "rad/s", "field"), 50 * np.pi, rtol=1e-14)
+    np.testing.assert_allclose(number(units.Quantity(1500.0, "1/min"), "rad/s", "field"), 50 * np.pi, rtol=1e-14)
     np.testing.assert_allclose(numbers(units.Quantity([1.0, 2.0], "N/mm"), "N/m", "field", 2), [1e3, 2e3])
     np.testing.assert_allclose(numbers([units.Quantity(1.0, "N/mm"), 5.0], "N/m", "field", 2), [1e3, 5.0])
     with pytest.raises(jv.InputError, match=r"^field is '3.0 kilogram', which is not in N/m"):

@@ -11,8 +11,8 @@ A mutant is the package with one change in one line:
 
 Mutants are drawn from every folder of `jaxvib` and `optimize`, or from each `--folder`: `--count` in each, of all kinds alike,
 in an order that follows from the seed and the change itself: a change of one file leaves the mutants of others as they were.
-Each is given to the nearest `--files` test files, first the test file of its name, then those of its folder that name something
-of it, then the smallest; and to the examples in its own file. Of these the tests that reach its line run first; the first test
+Each is given to the nearest `--files` test files, first the test file of its name, then those of its folder, then those that
+name most of it; and to the examples in its own file. Of these the tests that reach its line run first; the first test
 that fails ends it. The lines that each test of a file reaches are measured (`coverage`) when a mutant needs that file, once for
 an `--out`. Take a new `--out` for changed packages.
 
@@ -79,30 +79,26 @@ def all_folders() -> list[str]:
 
 def nearest(file: str, count: int) -> list[str]:
     """The test files nearest to a file of the packages, and the file itself if it has examples."""
-    text, place = (ROOT / file).read_text(), pathlib.Path(file.removeprefix("jaxvib/"))
+    text, place = (ROOT / file).read_text(), _home(pathlib.Path(file.removeprefix("jaxvib/")))
     public = re.search(r"^__all__ = \[(.*?)\]", text, re.DOTALL | re.MULTILINE)
-    words = [place.stem, *re.findall(r"\w+", public[1] if public else "")]
-    names = re.compile(rf"\b({'|'.join(words)})\b")
+    words = re.findall(r"\w+", public[1]) if public else re.findall(r"^(?:def|class) ([a-zA-Z]\w*)", text, re.MULTILINE)
+    names = re.compile(rf"\b({'|'.join([place[-1], *words])})\b")
 
     def distance(path: pathlib.Path) -> tuple:
-        own, test = path.relative_to(ROOT / "tests").parent.parts, path.read_text()
-        common = sum(
-            1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(place.parent.parts, own, strict=False))
-        )
-        name = path.stem.removeprefix("test_")
-        same = name == place.stem
-        return (
-            not (same and common),
-            not (name == place.parent.name and common),
-            not same,
-            -common,
-            not names.search(test),
-            len(test),
-        )
+        own, test = _home(path.relative_to(ROOT / "tests")), path.read_text()
+        common = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(place, own, strict=False)))
+        same, named = own[-1] == place[-1], len(set(names.findall(test)))
+        return not (same and common), common < len(own), common < len(place) - 1, -common - named, not same, len(test)
 
     tests = sorted((ROOT / "tests").rglob("test_*.py"), key=distance)
     first, *others = [str(path.relative_to(ROOT)) for path in tests[:count]]
     return [first, *[file] * (">>>" in text), *others]
+
+
+def _home(path: pathlib.Path) -> tuple[str, ...]:
+    """The folders and the name of a file, the same for `units/reading.py` and its tests `units/test_reading.py`."""
+    name = path.stem.removeprefix("test_")
+    return path.parent.parts if name == "__init__" and path.parent.parts else (*path.parent.parts, name)
 
 
 class Reach:

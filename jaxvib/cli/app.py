@@ -147,7 +147,7 @@ def _first_line(name: str) -> str:
 
 
 def _is_command(decorator: ast.expr, name: str) -> bool:
-    return isinstance(decorator, ast.Call) and any(isinstance(x, ast.Constant) and x.value == name for x in decorator.args)
+    return isinstance(decorator, ast.Call) and name in [x.value for x in decorator.args if isinstance(x, ast.Constant)]
 
 
 @click.group(cls=_Lazy, context_settings={"help_option_names": ["-h", "--help"]}, no_args_is_help=True)

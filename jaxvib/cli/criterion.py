@@ -55,7 +55,7 @@ def criterion(scene: Path, check: bool, unit: SpeedUnit, without: tuple[str, ...
         crowd = np.concatenate([w + np.geomspace(1e-4, 0.2, 60) * w * s for w in document["resonances"] for s in (-1, 1)])
         speeds = np.unique(np.clip(np.concatenate([np.linspace(1e-3, 1.0, 1200) * top, crowd]), 1e-3 * top, top))
         pull = jax.vmap(lambda w: criterion_functional(loaded, w))(jnp.asarray(speeds))
-        figure, (axis,) = panels(1, size=(9.0, 4.0))
+        figure, (axis,) = panels(1)
         pull_chart(axis, speeds, np.asarray(pull), document["balancing"], exact, unit)
         return figure
 

@@ -94,8 +94,8 @@ def _text(best: Synthesis) -> str:
 
     counted = f"{best.starts} starts ({best.drawn} drawn), {best.converged} converged, {best.same} to the best machine"
     rows = best.rows()
-    columns = [k for k in range(len(rows[0])) if k < 3 or any(row[k] for row in rows)]
     heads = ["", "before", "after", "exact", "verified"]
+    columns = [k for k in range(len(heads)) if k < 3 or any(row[k] for row in rows)]
     drawn = table(objective_text(best.objective), [heads[k] for k in columns], [[row[k] for k in columns] for row in rows])
     checked = "verified: measured on the full equations, integrated until they settled"
     if best.verified is None:

@@ -18,9 +18,8 @@ def record_chart(time: np.ndarray, angle: np.ndarray, fitted: np.ndarray, noise:
     """
     degrees = 180.0 / np.pi
     figure, (top, bottom) = panels(2, size=(9.0, 2.6), share_x=True, ax=ax)
-    size = 4.0 if time.size < 800 else 2.0
     top.plot(time, degrees * fitted, color=COLORS[0], lw=0.8, label="fit")
-    top.plot(time, degrees * angle, ".", color=COLORS[1], ms=size, label="record")
+    top.plot(time, degrees * angle, ".", color=COLORS[1], ms=2.5, label="record")
     top.set_ylabel("angle, deg")
     legend_above(top)
     bottom.plot(time, degrees * (fitted - angle), ".", color=COLORS[0], ms=2.5)

@@ -46,16 +46,16 @@ def worth(document: Mapping[str, Plain], units: Units) -> str:
     return _pairs([(name, document[name]) for name in WORTH if name in document and _plain(document[name])], units)
 
 
-def results(document: Mapping[str, Plain], units: Units, depth: int = 0) -> str:
+def results(document: Mapping[str, Plain], units: Units, inner: bool = False) -> str:
     """A document as tables: single values in one, lists of like entries in a table each, all else below headings."""
     single, below = [], []
     for name, value in document.items():
-        if name in _HIDDEN or (depth == 0 and name in WORTH and _plain(value)):
+        if name in _HIDDEN or (not inner and name in WORTH and _plain(value)):
             continue
         if _plain(value):
             single.append((name, value))
         elif isinstance(value, Mapping):
-            below.append((name, results(value, units, depth + 1)))
+            below.append((name, results(value, units, inner=True)))
         elif _entries(value):
             below.append((name, _rows(value, units)))
         elif isinstance(value, list) and value:

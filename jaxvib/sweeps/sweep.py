@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -264,7 +265,7 @@ def _computed(
 
 
 def _cases(new_study: Study, chunk: int) -> int:
-    return int(np.prod([s.stop - s.start for s in new_study.grid.region(chunk)], dtype=np.int64))
+    return math.prod(s.stop - s.start for s in new_study.grid.region(chunk))
 
 
 @validated
@@ -287,7 +288,7 @@ def open_sweep(store: str | Path) -> Sweep:
     opened = Store(Path(store))
     states = opened.states()
     damaged = np.flatnonzero(states == ChunkState.damaged)
-    cases = sum(int(np.prod([s.stop - s.start for s in opened.region(int(chunk))])) for chunk in damaged)
+    cases = sum(math.prod(s.stop - s.start for s in opened.region(int(chunk))) for chunk in damaged)
     return _found(opened, states, 0, 0.0, cases)
 
 
@@ -295,4 +296,4 @@ def _found(store: Store, states: np.ndarray, computed: int, seconds: float, dama
     counts = store.counts(states)
     rows = tuple(CaseCount(name, int(n)) for name, n in zip(CASE_STATUSES, counts, strict=True) if n)
     status = SweepStatus.partly if counts[0] else SweepStatus.done
-    return Sweep(status, str(store.path), int(np.prod(store.shape, dtype=np.int64)), rows, computed, seconds, damaged)
+    return Sweep(status, str(store.path), math.prod(store.shape), rows, computed, seconds, damaged)

@@ -189,7 +189,7 @@ def _magnitude(given: Any, unit: str, field: str, text: str) -> Any:
         registry, wanted = pint.get_application_registry(), _parsed(unit)
         units = registry.Unit(str(given.units))
         (rest, angle, hertz), (wanted_rest, wanted_angle, wanted_hertz) = _roots(units), _roots(wanted)
-        if wanted_angle + wanted_hertz and units == registry.Unit("1/min"):
+        if (wanted_angle or wanted_hertz) and units == registry.Unit("1/min"):
             given, angle = registry.Quantity(given.m, "rpm"), 1.0
         if rest != wanted_rest:
             raise _wrong_unit(text, unit, field)

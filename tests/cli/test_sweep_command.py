@@ -51,6 +51,13 @@ def test_a_study_is_run_resumed_and_shown(typed, tmp_path):
     assert json.loads(out)["cases"] == 10
 
 
+def test_progress_is_lines_where_there_is_no_terminal(typed, monkeypatch):
+    monkeypatch.setattr(command, "_QUIET", 0.0)
+    _, _, err = typed("sweep", "study.toml")
+    lines = err.splitlines()
+    assert lines[0].startswith("4 of 10 cases (40.0 %), ") and lines[-1].startswith("10 of 10 cases (100.0 %), ")
+
+
 def test_a_commented_study_file_is_one(typed, tmp_path):
     code, out, _ = typed("new", "sweep")
     assert code == 0 and "[axes]" in out

@@ -1,15 +1,18 @@
 """Charts against the numbers that they show."""
 
+import itertools
+
 import matplotlib.colors
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from jaxvib.draw.charts import branch_diagram
+from jaxvib.draw.comparison import audit_chart
 from jaxvib.draw.criterion import agreement_maps
 from jaxvib.draw.motion.histories import time_histories
 from jaxvib.draw.motion.spectra import path_chart
-from jaxvib.draw.results import growth_chart, phase_circles
+from jaxvib.draw.results import growth_chart, phase_circles, shapes_chart
 
 
 def branches(**options):
@@ -61,6 +64,26 @@ def test_circles_of_phases_stand_four_in_a_row(count, rows):
     heights = [axis.get_position().y0 for axis in titled]
     assert [sum(np.isclose(heights, height)) for height in sorted(set(np.round(heights, 6)), reverse=True)] == rows
     assert titled[0].get_title() == f"0\nresultant {np.cos(0.5):.3g}"
+    ticks = [np.mean(line.get_xydata(), axis=0) for line in titled[0].lines if len(line.get_xdata()) == 2]
+    turns = np.radians(np.arange(0.0, 360.0, 45.0))
+    np.testing.assert_allclose(ticks, np.stack([np.cos(turns), np.sin(turns)], axis=1), atol=1e-12)
+
+
+def test_bars_of_a_mode_shape_stand_side_by_side():
+    axis = shapes_chart(np.array([10.0, 20.0]), np.ones((2, 4)), names=("y1", "y2", "y3", "y4")).axes[0]
+    bars = sorted((bar.get_x(), bar.get_x() + bar.get_width()) for bar in axis.patches)
+    assert len(bars) == 8 and all(right < left for (_, right), (left, _) in itertools.pairwise(bars))
+    middles = np.reshape(bars, (2, 8)).mean(axis=1)
+    np.testing.assert_allclose(middles, axis.get_xticks(), atol=1e-12)  # around the number of their mode
+
+
+def test_an_audits_picture_grows_by_a_line_for_each_effect():
+    heights = []
+    for count in (5, 15):
+        labels, each = [f"{k}" for k in range(count)], np.full(count, 1e-3)
+        figure = audit_chart(labels, {"amplitude": each}, each, 0.01, each)
+        heights.append(figure.get_size_inches()[1])
+    assert heights[1] - heights[0] == pytest.approx(3.4)  # inches
 
 
 def test_the_smaller_of_two_bands_lies_in_front_of_the_larger():

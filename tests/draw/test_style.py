@@ -138,6 +138,8 @@ def test_before_and_after_shows_what_falls_a_thousandfold():
     axis = figure.axes[0]
     bars = [bar for bar in axis.patches if bar.get_width() and bar.get_height()]
     np.testing.assert_allclose([bar.get_x() + bar.get_width() for bar in bars], [2.1 / 1424.0, 3.0])
+    level = [line.get_color() for line in axis.lines if list(line.get_xdata()) == [1.0, 1.0]]
+    assert level == ["black"]  # what has not changed
     assert axis.get_xscale() == "log" and "1424 → 2.1   (0.00147 x)" in [text.get_text() for text in axis.texts]
 
 

@@ -58,6 +58,8 @@ def test_each_slider_moves_its_number_alone():
         moved.append(place)
     assert len(set(moved)) == len(moved) == 9  # four springs and dampers of supports, two of the link, mass, drag, speed
     assert scene_at(scene, {COUNT: 5}).loads.count == 5
+    counts = [sliders_of(scene_at(scene, {COUNT: n}))[1].steps for n in (2, 5)]
+    assert [(steps[0], steps[-1]) for steps in counts] == [(1, 8), (1, 10)]  # twice as many as there are, 8 at least
     with pytest.raises(jv.InputError, match=r"loads\.ball_radius .* side by side"):
         scene_at(scene, {COUNT: 256})
     with pytest.raises(jv.InputError, match=r"machine\.mass is no slider of this scene; there are: drive\.speed"):
@@ -170,9 +172,9 @@ def _axes(spans, log=False):
     return across, np.polyfit(*zip(*levels, strict=True), 1)
 
 
-def _lines(drawn, color):
-    """The lines of a colour, in dots, with the figures of their dashes."""
-    paths = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == color and p.get("d") and p.get("fill") == "none"]
+def _lines(drawn, color, filled=False):
+    """The lines of a colour, in dots, with the figures of their dashes, or the outlines of what is filled."""
+    paths = [p for p in drawn.iter(f"{SVG}path") if p.get("stroke") == color and (p.get("fill") != "none") == filled]
     return [(np.array(re.findall(r"[ML]([-.0-9]+) ([-.0-9]+)", p.get("d")), float), p.get("stroke-dasharray")) for p in paths]
 
 
@@ -184,6 +186,8 @@ def test_the_charts_lines_are_the_branches(kind):
     found = jax.device_get(jv.branches(scene, most=most))
     drawn = ElementTree.fromstring(pictures.diagram(scene, most))
     spans = _texts(drawn)
+    wide, tall = float(drawn.get("width")), float(drawn.get("height"))
+    assert all(0.0 <= x < wide and 0.0 < y < tall for x, y, _, _ in spans)  # the legend too
     titles = {text: x for x, _, text, _ in spans if text in ("speed of loads, rpm", "foundation force, N, zero to peak")}
     middle = titles["foundation force, N, zero to peak"]
     for right, values, log in ((False, RPM * found.omega, False), (True, found.foundation_force, True)):
@@ -222,6 +226,11 @@ def test_the_campbell_diagram_is_the_rotors_whirl(kind):
     said = " ".join(text for *_, text, _ in _texts(drawn) if text)
     speeds = [(w, way) for w, way in zip(RPM * found.critical.speed, found.critical.forward, strict=True) if np.isfinite(w)]
     assert all(f"{w:.4g} {'forward' if way else 'backward'}" in said for w, way in speeds) and len(speeds) >= 2
+    marks = [outline for outline, _ in _lines(drawn, "#004488", filled=True) + _lines(drawn, "#d55e00", filled=True)]
+    middles = np.array([(np.min(outline, axis=0) + np.max(outline, axis=0)) / 2.0 for outline in marks])
+    places = np.stack([np.polyval(across, middles[:, 0]), np.polyval(up, middles[:, 1])], axis=1)
+    marked = np.array([[w, w] for w, _ in speeds if w <= RPM * 1.05 * most])
+    np.testing.assert_allclose(places[np.argsort(places[:, 0])], np.sort(marked, axis=0), atol=0.6 * abs(up[0]))
 
 
 def test_the_machine_moves_as_its_jam_says(two_platforms):
@@ -271,6 +280,7 @@ def test_the_command_serves_the_page_to_this_computer_alone(one_mass, tmp_path, 
     monkeypatch.setattr(serve, "leave", lambda: None)
     assert run(["explore", str(path), "--port", "27180", "--no-browser"]) == 0
     assert callable(served["page"]) and (served["host"], served["port"]) == ("127.0.0.1", 27180)
+    assert served["log_level"] == "warning"  # no line on the terminal for each picture
     address = re.search(r"the page is at (http://127.0.0.1:27180/[-\w]{43}/);", capsys.readouterr().out)
     assert address and serve.served_path() == path.resolve()
     assert counted.wait(10.0)  # beside the page, the next numbers of loads are compiled

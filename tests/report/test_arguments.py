@@ -63,6 +63,16 @@ def test_needed_arguments_have_no_default():
     assert by_name["side"].default == "both" and by_name["position"].default is None
 
 
+def test_texts_are_chosen_from_the_allowed_ones():
+    allowed = {
+        argument.name: argument.allowed
+        for kind in ("gravity", "stop", "dry_friction")
+        for argument in arguments_of(described("effects", kind))
+        if argument.allowed
+    }
+    assert allowed == {"along": ("up", "axis"), "side": ("above", "below", "both"), "reaction": ("exact", "run_up", "steady")}
+
+
 @pytest.mark.parametrize(("group", "name", "field"), [("machine", "rotor", "group"), ("machines", "rotors", "name")])
 def test_an_unknown_part_is_refused(group, name, field):
     with pytest.raises(jv.InputError, match=rf"^{field} is '.*'; did you mean '(machines|rotor)'"):

@@ -1,8 +1,10 @@
 """Reports: one web page that asks for nothing, whose text cannot be code, with units and what the result is worth."""
 
+import base64
 import html.parser
 import math
 
+import matplotlib
 import pytest
 from matplotlib.figure import Figure
 from scenes import scene
@@ -93,6 +95,19 @@ def test_parameters_of_every_template_have_units(kind, tmp_path):
     checked(text)
     assert "<td class='unit'>kg</td>" in text and "<td class='unit'>rad/s</td>" in text
     assert RESULT.message in text
+
+
+def test_the_machine_is_the_runs_own_or_the_given_one(tmp_path):
+    run, other = small_run(), jv.scene_from_toml(TEMPLATES["network"])
+    own = jv.html_report(run, tmp_path / "own.html", figures=[]).read_text()
+    given = jv.html_report(run, tmp_path / "given.html", scene=other, figures=[]).read_text()
+    assert f"<h3>machine: {run.scene.machine.kind.replace('_', ' ')}</h3>" in own and "<h3>machine: network</h3>" in given
+
+
+def test_pictures_are_png_whatever_matplotlib_saves_by_default():
+    with matplotlib.rc_context({"savefig.format": "svg"}):
+        text = Report("x", {}, figures=[("a", Figure(figsize=(1.0, 1.0)))]).html()
+    assert base64.b64decode(checked(text).links[0].split(",")[1]).startswith(b"\x89PNG")
 
 
 def test_units_are_those_of_the_fields():

@@ -70,6 +70,13 @@ def test_only_results_and_named_tuples_are_made(tmp_path, monkeypatch, name):
     assert [file.name for file in tmp_path.iterdir()] == ["prepared.npz"]
 
 
+def test_no_module_of_others_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "harmful.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(jv.InputError, match=LOST):
+        jv.load(prepared(tmp_path / "x.npz", {"class": "harmful:Run", "fields": {}}))
+
+
 def test_no_constructor_is_called_that_a_file_names(modes, tmp_path, monkeypatch):
     path = modes.save(tmp_path / "modes")
     monkeypatch.setattr(type(modes), "__init__", lambda *_, **__: pytest.fail("called"))

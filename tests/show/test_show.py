@@ -50,6 +50,7 @@ def test_every_machine_has_a_sketch_with_its_numbers(kind):
     assert f"{stiffness / 1e3:.4g} N/mm" in told
     # A circle for each load, and nothing outside of the picture.
     left, right, bottom, top = view_of(scene).limits
+    assert all(left <= text.x <= right and bottom <= text.y <= top for text in view_of(scene).texts(at_rest(scene), 0.0))
     points = np.concatenate([part.points for part in view_of(scene).parts(at_rest(scene), 0.0)])
     points = points[np.all(np.isfinite(points), axis=1)]
     assert left <= points[:, 0].min() and points[:, 0].max() <= right
@@ -115,10 +116,12 @@ def test_an_orbit_is_the_run_that_settled_on_it(orbit):
 def test_a_film_is_a_gif_and_a_page_that_asks_for_nothing(run, orbit, tmp_path):
     short = dict(begin=1.5, end=1.6, seconds=0.4, width=3.0)
     film = jv.animate(run, tmp_path / "a.gif", **short)
+    left, right, bottom, top = view_of(SCENE).limits
+    height = 0.8 * 3.0 * (top - bottom) / (right - left) + 2.9  # inches, with the strips below
     jv.animate(run, tmp_path / "b.gif", **short)
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as picture:
-        assert picture.n_frames == film.count == 8 and picture.size == (300, picture.size[1])
+        assert picture.n_frames == film.count == 8 and picture.size == (300, int(100.0 * height))
         first = np.asarray(picture.convert("RGB"))
         picture.seek(4)
         assert np.any(np.asarray(picture.convert("RGB")) != first) and first[0, 0].tolist() == [255, 255, 255]
@@ -184,6 +187,8 @@ def test_a_spectrum_has_the_height_of_the_vibration(run):
         assert data[name].dims == ("piece",) and data[name].attrs["units"] == unit
     labels = [axes.get_ylabel() for axes in fall.plot(unit="rpm").axes]
     assert labels == ["frequency, rpm", "y1, mm, zero to peak"]
+    axis = Figure().subplots()
+    assert fall.plot(ax=axis) is axis and axis.has_data()
 
 
 def test_mode_shapes_against_the_eigenproblem():
@@ -197,6 +202,14 @@ def test_mode_shapes_against_the_eigenproblem():
     assert found.to_xarray()["shape"].dims == ("shape_mode", "coordinate")
     bars = [bar.get_height() for bar in found.plot().axes[0].patches]
     np.testing.assert_allclose(np.sort(bars), np.sort(np.ravel(found.shape)))
+
+
+def test_forces_on_a_rotors_bed_differ_by_colour_and_stroke():
+    rotor = jv.Scene(jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0), SCENE.loads, SCENE.drive)
+    short = jv.simulate(rotor, 0.4, samples=256, estimate=False)
+    film = jv.animate(short, begin=0.3, end=0.4, seconds=0.4, width=2.0)
+    forces = [line for line in film.figure.axes[2].lines if line.get_label().startswith("force on the bed")]
+    assert len({line.get_color() for line in forces}) == len({line.get_linestyle() for line in forces}) == 2
 
 
 def test_the_path_of_a_rotors_axis(run):

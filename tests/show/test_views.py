@@ -66,6 +66,23 @@ def test_a_tilting_rotors_loads_move_by_their_stations():
         np.testing.assert_allclose(shift[4:], 0.0, atol=1e-12)
 
 
+def test_loads_are_round():
+    for outline in (points for points in drawn("planar_rotor")[1] if len(points) == 31):
+        away = np.hypot(*(outline - np.mean(outline[:-1], axis=0)).T)
+        np.testing.assert_allclose(away, away[0], rtol=1e-9)
+
+
+def test_the_cut_track_lies_in_the_middle_of_its_section():
+    """Dotted, a circle of the balls' middles: the tube of the template is round."""
+    scene = jv.scene_from_toml(TEMPLATES["torus"])
+    parts = view_of(scene).parts(at_rest(scene), REACH)
+    (track,) = [part.points for part in parts if part.look.get("ls") == ":" and len(part.points) == 61 and not part.filled][-1:]
+    wall = max(
+        (part.points for part in parts if part.filled and len(part.points) == 61), key=lambda points: np.mean(points[:, 0])
+    )
+    np.testing.assert_allclose(np.mean(track[:-1], axis=0), np.mean(wall[:-1], axis=0), atol=1e-9)
+
+
 def test_both_views_of_a_rotor_have_its_loads_at_one_height():
     _, points = drawn("rotor")
     side, front = np.split(loads_of(points), 2)
@@ -80,4 +97,4 @@ def test_a_spring_and_its_damper_lie_beside_each_other(kind):
     spring, damper = (each[np.all(np.isfinite(each), axis=1)] for each in ties[:2])
     across = (spring[0] + spring[-1]) / 2.0 - (np.min(damper, axis=0) + np.max(damper, axis=0)) / 2.0
     along = spring[-1] - spring[0]
-    assert np.hypot(*across) > 0.2 and abs(along @ across) < 1e-9 * np.hypot(*along)
+    assert np.hypot(*across) == pytest.approx(0.34) and abs(along @ across) < 1e-9 * np.hypot(*along)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
@@ -15,6 +17,8 @@ from jaxvib.machine.numbers import read_numbers, unit
 from jaxvib.units import Number
 
 __all__ = ["CubicSupport", "Stop"]
+
+Side = Literal["above", "below", "both"]
 
 
 class _Support(Effect):
@@ -122,7 +126,7 @@ class Stop(_Support):
     stiffness: Array = eqx.field(metadata=unit("N/m", low=0.0, words="stiffness of the stop"))
     gap: Array = eqx.field(metadata=unit("m", low=0.0, words="gap of the stop"))
     damping: Array = eqx.field(metadata=unit("N s/m", low=0.0, words="damping of the stop"))
-    side: str = eqx.field(static=True)
+    side: Side = eqx.field(static=True)
     platform: int | None = eqx.field(static=True)
     position: Array | None = eqx.field(metadata=unit("m", words="position of the stop", typical=0.1))
     kind: str = eqx.field(static=True)
@@ -132,14 +136,14 @@ class Stop(_Support):
         stiffness: Number,
         gap: Number,
         damping: Number = 0.0,
-        side: str = "both",
+        side: Side = "both",
         platform: int | None = None,
         position: Number | None = None,
     ):
         self.kind = "stop"
         given = read_numbers(Stop, "effects.stop", stiffness=stiffness, gap=gap, damping=damping)
         self.stiffness, self.gap, self.damping = given.values()
-        require_one_of(side, ("above", "below", "both"), "effects.stop.side")
+        require_one_of(side, get_args(Side), "effects.stop.side")
         self.side = side
         self.platform, self.position = _read_place(Stop, self.kind, platform, position)
 

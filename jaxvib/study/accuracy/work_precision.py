@@ -171,7 +171,7 @@ def _steady(ask: _Ask, quantity: str, jam: ExactJam, end: float | None) -> Cost:
         left_out.append(f"leading order: {light.message}; runs start on the exact motion in its place")
     for few in _ORBIT_POINTS:
         points = collocation_points(scene, few)
-        call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points, throw=False)), scene)
+        call = _compiled(lambda s, points=points: read(jam_orbit(s, mode=mode, points=points)), scene)
         rows.append(row_of("exact orbit", "", f"{points} points", call, error, ask.repeats))
     if not bool(jam.fine.stable):
         left_out.append(unstable("envelope, full", jam))

@@ -11,6 +11,7 @@ from scenes import published
 import jaxvib as jv
 from jaxvib.cli.app import run
 from jaxvib.study.accuracy.cost import Cost, CostRow, cost_figure
+from jaxvib.study.accuracy.exact_reference import slow_period
 
 
 def test_ways_agree_where_they_should(tmp_path, capsys):
@@ -92,6 +93,25 @@ def test_final_states_are_compared_up_to_whole_turns():
     error = {row.dtype: row.error for row in cost.rows}
     assert error.keys() == {"float64", "float32"} and 0.0 < error["float64"] < 1e-3 and error["float32"] < 0.1
     assert cost.reference_error < 1e-8 and len(cost.reference) == 4
+
+
+def test_a_final_state_is_in_units_of_its_own_motion():
+    scene = light()
+    cost = jv.work_precision(scene, "final_state", until=2.0, tolerances=(1e-5,), solvers=["default"], repeats=1)
+    run = jv.simulate(scene, 2.0, save="window", stepsize_controller=jv.Tolerance(1e-11), estimate=False)
+    last = jax.tree.map(lambda leaf: float(np.ravel(leaf[-1])[0]), run.window.state)
+    np.testing.assert_allclose(cost.reference[2:], [last.angle[0], last.rate[0] / 60.0], rtol=1e-7)  # rad, in the rotor's speed
+    np.testing.assert_array_equal(np.sign(cost.reference[:2]), np.sign([last.displacement, last.velocity]))
+
+
+def test_the_slow_period_is_that_of_the_lowest_mode():
+    """Closed form: equal masses m between two springs k and one of k in the middle; a free machine has what oscillates."""
+    k, m = 4e4, 50.0
+    spread = jv.two_mass(mass=m, stiffness=k, damping=1.0, link_stiffness=k, link_damping=1.0)
+    free = jv.two_mass(mass=m, stiffness=0.0, damping=1.0, link_stiffness=k, link_damping=1.0)
+    for machine, stiffness in ((spread, k), (free, 2.0 * k)):
+        scene = jv.Scene(machine, jv.balls(count=1, mass=1e-9, radius=0.1, drag=1.0), jv.ConstantSpeed(60.0))
+        assert slow_period(scene) == pytest.approx(2.0 * np.pi * np.sqrt(m / stiffness), rel=1e-6)
 
 
 def row(error, seconds):

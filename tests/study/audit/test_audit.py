@@ -18,6 +18,7 @@ from jaxvib.machine.effects.base import has_term
 from jaxvib.machine.effects.terms import RotorImbalance
 from jaxvib.machine.files import DRIVES, EFFECTS, TEMPLATES
 from jaxvib.results.status import member
+from jaxvib.study.audit import compared
 from jaxvib.study.audit.audit import _as_computed
 from jaxvib.study.audit.compared import EffectRow, RepeatedQuestion, effect_row
 from jaxvib.study.audit.numbers import NumberRow, dimensionless_numbers, gravity_share
@@ -53,6 +54,23 @@ ROTOR = jv.Scene(
 @pytest.fixture(scope="module")
 def found():
     return jv.audit(SCENE, accuracy=2e-3, mode=1, possible=(SEAL,), repeats=0)
+
+
+class Recorded(eqx.Module):
+    omega: jax.Array
+
+
+def test_the_time_of_a_scene_is_that_of_a_hundred_turns(monkeypatch):
+    ends = []
+
+    def recording(scene, end, *_):
+        jax.debug.callback(lambda x: ends.append(float(x)), end)
+        return Recorded(end)
+
+    monkeypatch.setattr(compared, "integrate", recording)
+    compared._times(SCENE, jv.initial_state(SCENE), 1)
+    jax.effects_barrier()
+    np.testing.assert_allclose(ends, 100.0 * 2.0 * np.pi / 60.0, rtol=1e-12)
 
 
 def test_change_by_an_effect_is_that_of_both_scenes(found):

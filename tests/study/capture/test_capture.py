@@ -44,6 +44,14 @@ def test_fractions_are_of_perturbed_starts_and_say_their_error():
     np.testing.assert_array_equal(again.captured, found.captured)
 
 
+def test_thrown_balls_lie_side_by_side_from_their_shift_on():
+    scene = published_torus(3.5)
+    beside = 2.0 * np.arctan(float(scene.loads.ball_radius) / float(scene.loads.radius))
+    state = thrown_state(scene, -0.4, shift=0.3)
+    np.testing.assert_allclose(state.angle[0], 0.3 + beside * np.arange(scene.loads.count), rtol=1e-12)
+    np.testing.assert_allclose(state.rate[0], 0.6 * float(scene.drive.speed), rtol=1e-12)
+
+
 def test_a_threshold_curve_is_captures_beside_each_other():
     speeds = np.linspace(-1.0, -0.1, 4)
     curve = jv.threshold_curve(published_torus, [2.5, 3.5], speeds, turns=150)
