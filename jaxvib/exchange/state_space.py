@@ -101,6 +101,8 @@ class StateSpace(NamedTuple):
         It holds A, B, C, D, x0, u0, y0, the text `about`, and names and units as cell arrays: state_names, state_units,
         input_names, input_units, output_names, output_units.
 
+        **Arguments**: `path` of the file.
+
         **Returns** the path. **Raises** `InputError` for a path that cannot be written to.
         """
         path = Path(path)
@@ -131,19 +133,25 @@ def _module(name: str, extra: str) -> Any:
 def state_space(
     scene: Scene, at: Literal["rest"] | Jam | PhaseJam = "rest", *, rotor_speed: Number | None = None
 ) -> StateSpace:
-    """State-space model of a scene's machine, at rest or in a jam.
+    """Return the state-space model of a scene's machine, at rest or in a jam.
 
     At rest, with the masses of the loads in M and the linear part of nonlinear supports in K and C:
 
         M q'' + (C + n G) q' + K q = f + P^T f_e,      x = (q, q'),      y = (q, q', q'', T_K q + T_C q')
 
-    In a jam it is the linearization of the averaged equations (`envelope`) about it: states are the complex amplitudes of the
-    carrier (real and imaginary parts), the speeds of the loads and their phases relative to the first one; the input is the
-    rotor speed; outputs are the mean speed of the loads, the amplitudes of the coordinates and of the foundation force. Its
-    poles are those whose largest real part is the `growth` of `phase_jams`.
+    In a jam it is the linearization of the averaged equations (`envelope`) about it:
 
-    **Arguments**: `at` "rest", or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`; `rotor_speed` n, rad/s,
-    of a machine at rest with a gyroscopic matrix (default: the drive's speed).
+    - states are the complex amplitudes of the carrier (real and imaginary parts), the speeds of the loads and their phases
+      relative to the first one
+    - the input is the rotor speed
+    - outputs are the mean speed of the loads, the amplitudes of the coordinates and of the foundation force
+    - the largest real part of its poles is the `growth` of `phase_jams`
+
+    **Arguments**
+
+    - `scene`; at rest only its machine, loads and nonlinear supports count
+    - `at`: "rest" (the default), or a jam from `jam_modes(scene).select(mode)` or `phase_jams(scene)`
+    - `rotor_speed` n, rad/s, of a machine at rest with a gyroscopic matrix (default: the drive's speed); typical: 0 to 500
 
     **Returns** `StateSpace`.
 

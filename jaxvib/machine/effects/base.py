@@ -166,7 +166,7 @@ class Gravity(Effect):
             raise InputError("effects.gravity.along", f"is {quoted(self.along)}; it {problem}")
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:
-        """Return m g p_up(u), or m g p_axis(u), (count,) J."""
+        """Return m g p_up(u), or m g p_axis(u), (count,) J, of `loads` at the coordinates `u`."""
         return loads.mass * self.g * loads.position(*u)[_AXES[self.along]]
 
 

@@ -129,14 +129,17 @@ class LoadContact(Effect):
         )
 
     def energy(self, loads: Loads, u: Coordinates) -> Array:
-        """Return k (2 r - s)^2 / 2 of the pairs that overlap, (count,) J."""
+        """Return k (2 r - s)^2 / 2 of the pairs that overlap, (count,) J, for `loads` at the coordinates `u`."""
         parts = [0.5 * self.stiffness * jnp.maximum(-gap, 0.0) ** 2 for gap in _clearances(loads, u)]
         if parts[-1].shape != (loads.count,):  # opposite loads make half as many pairs
             parts[-1] = jnp.concatenate([parts[-1], jnp.zeros_like(parts[-1])])
         return sum(parts[1:], parts[0])
 
     def resistance(self, loads: Loads, u: Coordinates, rate: Coordinates) -> Coordinates:
-        """Return the forces -c s' of the pairs that overlap; a contact never pulls."""
+        """Return the forces -c s' of the pairs that overlap, for `loads` at the coordinates `u` with rates `rate`.
+
+        A contact never pulls.
+        """
         damping = self._damping(loads)
 
         def gaps(*v: Array) -> tuple[Array, ...]:

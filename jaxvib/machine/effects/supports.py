@@ -33,7 +33,7 @@ class _Support(Effect):
         self.rows(machine)
 
     def rows(self, machine: Machine) -> Array:
-        """Return the row of the platform's coordinate, or the rows of the two directions of the axis."""
+        """Return the row of the platform's coordinate on a `machine`, or the rows of the two directions of the axis."""
         if self.position is None:
             return machine.rows_at(self.platform, f"effects.{self.kind}.platform")
         return machine.rows_at(self.position, f"effects.{self.kind}.position")
@@ -162,7 +162,7 @@ class Stop(_Support):
         return (SupportForce(self.rows, self.energy, self.resistance),)
 
     def rows(self, machine: Machine) -> Array:
-        """Return the rows of the place. **Raises** `InputError` for a side of a ring."""
+        """Return the rows of the place on a `machine`, (1, nd) or (2, nd). **Raises** `InputError` for a side of a ring."""
         rows = super().rows(machine)
         if rows.shape[0] > 1 and self.side != "both":
             raise InputError("effects.stop.side", f"is {quoted(self.side)}; around a rotor's axis it must be 'both'")
