@@ -106,6 +106,7 @@ from jaxvib.results.files import load
 from jaxvib.results.result import Result
 
 # Exchange with other tools
+from jaxvib.exchange.fmu import Fmu, export_fmu
 from jaxvib.exchange.state_space import StateSpace, state_space
 
 __version__: str
@@ -268,6 +269,8 @@ __all__ = [
     "write_csv",
     "html_report",
     # Exchange with other tools
+    "export_fmu",
+    "Fmu",
     "state_space",
     "StateSpace",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -142,15 +142,15 @@ def vector_field(scene: Scene) -> Dynamics:
     return dynamics_of(assemble(scene))
 
 
-def dynamics_of(model: Model) -> Dynamics:
-    """Return `vector_field` of a scene that is assembled already."""
+def dynamics_of(model: Model, solve: Callable[[Array, Array], Array] = small_solve) -> Dynamics:
+    """Return `vector_field` of a scene that is assembled already; `solve` gives x of a x = b, a the mass matrix."""
     scene, carrier, mount, effects = model.scene, model.carrier, model.mount, model.scene.effects
     moving = mount.rows if has_term(effects, RotorImbalance) else mount.rows[: len(mount.levers)]
     rows = moving[0] if len(moving) == 1 else jnp.concatenate(moving)
     parts = [carrier.stiffness, carrier.damping, rows.T, *(place.T for place in model.supports)]
     if mount.gyroscopic is not None:
         parts.append(mount.gyroscopic)
-    solved = small_solve(carrier.mass, jnp.concatenate(parts, axis=1))
+    solved = solve(carrier.mass, jnp.concatenate(parts, axis=1))
     stiffness, damping, input_matrix, *rest = jnp.split(solved, np.cumsum([part.shape[1] for part in parts])[:-1], axis=1)
     exciter = Exciter(
         levers=mount.levers,

@@ -280,13 +280,14 @@ def _eigenvalues_in_turn(size: int, is_mapped: list[bool], matrix: Array) -> tup
 
 
 def solve_definite(a: Array, b: Array) -> Array:
-    """x of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no branches."""
-    rows = jnp.concatenate([a, b[:, None]], axis=1)
+    """x (n,) or (n, m) of a x = b, a symmetric and positive definite: nothing needs to be exchanged, and single numbers have no
+    branches."""
+    rows = jnp.concatenate([a, b if b.ndim > 1 else b[:, None]], axis=1)
     for k in range(b.shape[0]):
         line = rows[k, 1:] / rows[k, 0]
         above, below = (part[:, 1:] - part[:, :1] * line[None] for part in (rows[:k], rows[k + 1 :]))
         rows = jnp.concatenate([above, line[None], below])
-    return rows[:, 0]
+    return rows if b.ndim > 1 else rows[:, 0]
 
 
 @_compiled

@@ -49,6 +49,7 @@ __all__ = [
     "MAX_SCALARS",
     "NotScalarizable",
     "arrays_program",
+    "scalar_program",
     "scalarize",
     "scalarized_program",
     "scalarized_vmap",
@@ -102,14 +103,11 @@ def scalarize(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array])
     return run
 
 
-def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
+def scalar_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr:
     """`scalarize`, traced: a program that takes the numbers of all arguments and gives those of the result, in order.
 
-    **Returns** None where an operation has no rule on scalars, where there are too many of them, or where this version of JAX
-    lets nobody read its programs.
+    **Raises** `NotScalarizable` if an operation has no rule on scalars.
     """
-    if not HAS_JAXPRS:
-        return None
     leaves, structure = jax.tree.flatten(arguments)
 
     def run(*numbers: Array) -> list[Array]:
@@ -126,12 +124,22 @@ def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTre
         return [jnp.asarray(x, leaves[0].dtype) for array in arrays for x in array.ravel()]
 
     shapes = [jax.ShapeDtypeStruct((), leaf.dtype) for leaf in leaves for _ in range(leaf.size)]
+    on_scalars = scalarize(function, *arguments)
+    return without_repeats(jax.make_jaxpr(run)(*shapes))
+
+
+def scalarized_program(function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]) -> ClosedJaxpr | None:
+    """Return `scalar_program`, or None for a program that has no such form.
+
+    This is so if an operation has no rule on scalars, if there are too many operations, and if this version of JAX does not
+    give access to its programs.
+    """
+    if not HAS_JAXPRS:
+        return None
     try:
-        on_scalars = scalarize(function, *arguments)
-        program = jax.make_jaxpr(run)(*shapes)
+        program = scalar_program(function, *arguments)
     except NotScalarizable:
         return None
-    program = without_repeats(program)
     return program if len(program.jaxpr.eqns) <= _MAX_OPERATIONS else None
 
 

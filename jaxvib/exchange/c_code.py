@@ -1,0 +1,226 @@
+"""Programs on single numbers, written as C.
+
+Everything that depends on parameters alone goes into a function of its own, which is called when a parameter changes; the
+equations then read its results as constants. Each operation is one statement; an operation without a rule is an error.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxvib.errors import InputError
+from jaxvib.runtime.compat import ClosedJaxpr, JaxprEqn, Literal, Var
+
+__all__ = ["Written", "number_text", "write_program"]
+
+_CALLS = ("exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
+_CALLS += ("asinh", "acosh", "atanh", "erf", "erfc", "floor", "ceil")
+
+_RULES: Mapping[str, str] = {
+    "add": "{0} + {1}",
+    "add_any": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "square": "{0} * {0}",
+    "abs": "fabs({0})",
+    "sign": "{0} > 0.0 ? 1.0 : {0} < 0.0 ? -1.0 : {0}",
+    "rsqrt": "1.0 / sqrt({0})",
+    "logistic": "1.0 / (1.0 + exp(-{0}))",
+    "pow": "pow({0}, {1})",
+    "atan2": "atan2({0}, {1})",
+    "rem": "fmod({0}, {1})",
+    "is_finite": "isfinite({0})",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "and": "{0} & {1}",
+    "or": "{0} | {1}",
+    "copy": "{0}",
+    "copy_p": "{0}",
+    **{name: f"{name}({{0}})" for name in _CALLS},
+}
+"""Expressions of operations, by the names of JAX."""
+
+_BRANCHES = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+"""Comparisons that choose a branch of the equations."""
+
+
+class Written(NamedTuple):
+    """A program as C.
+
+    **Attributes**: `prepare`, `body`: statements of the part that depends on parameters alone, and of the rest; the number of
+    `constants` of the first part that the second one reads; `branches`, the number of comparisons of the second part that are
+    event indicators.
+    """
+
+    prepare: list[str]
+    body: list[str]
+    constants: int
+    branches: int
+
+
+def number_text(value: Any) -> str:
+    """Return a number as C reads it back bit for bit.
+
+    >>> number_text(0.1), number_text(-3.0), number_text(True)
+    ('0.1', '-3.0', '1')
+    """
+    if isinstance(value, (bool, np.bool_, int, np.integer)):
+        return str(int(value))
+    value = float(value)
+    if math.isnan(value):
+        return "NAN"
+    return repr(value) if math.isfinite(value) else "INFINITY" if value > 0.0 else "-INFINITY"
+
+
+def write_program(
+    program: ClosedJaxpr, inputs: Sequence[str], parameters: int, outputs: Sequence[str], *, has_events: bool = False
+) -> Written:
+    """Write a program on scalars as C.
+
+    **Arguments**: `inputs`, the C expression of each argument; the first `parameters` of them change between events only;
+    `outputs`, the C expression that each result is assigned to; `has_events`: assign the difference of the sides of each
+    comparison to an event indicator.
+
+    **Raises** `InputError` with the name of an operation that has no rule.
+    """
+    return _Writer(program, inputs, parameters, has_events).written(outputs)
+
+
+class _Writer:
+    def __init__(self, program: ClosedJaxpr, inputs: Sequence[str], parameters: int, has_events: bool):
+        jaxpr = program.jaxpr
+        self.program = program
+        self.has_events = has_events
+        self.names = dict(zip(jaxpr.constvars, map(number_text, map(np.asarray, program.consts)), strict=True))
+        self.names |= dict(zip(jaxpr.invars, inputs, strict=True))
+        self.early: set[Var] = {*jaxpr.constvars, *jaxpr.invars[:parameters]}
+        self.magnitudes: set[Var] = set()
+        self.constants: dict[Var, str] = {}
+        self.prepare: list[str] = []
+        self.body: list[str] = []
+        self.branches = 0
+
+    def written(self, outputs: Sequence[str]) -> Written:
+        jaxpr = self.program.jaxpr
+        for equation in jaxpr.eqns:
+            early = all(isinstance(atom, Literal) or atom in self.early for atom in equation.invars)
+            for variable, text in zip(equation.outvars, self._expressions(equation, early), strict=True):
+                name = f"x{len(self.names)}"
+                kind = "double" if np.issubdtype(_dtype(variable), np.floating) else "int"
+                (self.prepare if early else self.body).append(f"const {kind} {name} = {text};")
+                self.names[variable] = name
+                if early:
+                    self.early.add(variable)
+            if equation.primitive.name == "abs":
+                self.magnitudes.update(equation.outvars)
+        for atom, target in zip(jaxpr.outvars, outputs, strict=True):
+            self.body.append(f"{target} = {self._read(atom, early=False)};")
+        self.prepare += [f"{place} = {self.names[variable]};" for variable, place in self.constants.items()]
+        return Written(self.prepare, self.body, len(self.constants), self.branches)
+
+    def _read(self, atom: Var | Literal, *, early: bool) -> str:
+        """Return the C expression of a value in one of the two parts."""
+        if isinstance(atom, Literal):
+            text = number_text(np.asarray(atom.val, _dtype(atom)).item())
+            return f"({text})" if text.startswith("-") else text
+        name = self.names[atom]
+        is_computed_early = atom in self.early and name.startswith("x")
+        if early or not is_computed_early:
+            return name
+        return self.constants.setdefault(atom, f"constants[{len(self.constants)}]")
+
+    def _expressions(self, equation: JaxprEqn, early: bool) -> list[str]:
+        """Return the C expression of each result of an operation."""
+        name, params = equation.primitive.name, equation.params
+        values = [self._read(atom, early=early) for atom in equation.invars]
+        if name == "custom_jvp_call":  # the only one in programs on scalars is `sine_and_cosine`
+            return [f"sin({values[0]})", f"cos({values[0]})"]
+        # A comparison of two magnitudes chooses a pivot, which is no event of the machine.
+        if name in _BRANCHES and not early and _is_real(equation) and not self.magnitudes.issuperset(_variables(equation)):
+            return [self._branch(f"{values[0]} {_BRANCHES[name]} {values[1]}", *values)]
+        if name in ("max", "min", "clamp"):
+            real = not early and _is_real(equation)
+            if name != "clamp":
+                return [self._larger(values[0], values[1], ">" if name == "max" else "<", real)]
+            low, x, high = values
+            above = f"x{len(self.names)}a"
+            (self.prepare if early else self.body).append(f"const double {above} = {self._larger(x, low, '>', real)};")
+            return [self._larger(above, high, "<", real)]
+        if (rule := _SPECIAL.get(name)) is not None:
+            return [rule(values, params, equation)]
+        if name not in _RULES or (name == "div" and not _is_real(equation)):
+            problem = f"needs the operation {name!r} of JAX, which has no rule in C; leave out the part that needs it"
+            raise InputError("scene", problem)
+        return [_RULES[name].format(*values)]
+
+    def _larger(self, x: str, y: str, than: str, real: bool) -> str:
+        """Return the larger or smaller of two numbers; NaN if x is."""
+        test = f"{x} {than} {y} || {x} != {x}"
+        return f"{self._branch(test, x, y) if real else f'({test})'} ? {x} : {y}"
+
+    def _branch(self, test: str, x: str, y: str) -> str:
+        """Return a test; the difference of its sides is an event indicator."""
+        if self.has_events:
+            self.body.append(f"indicators[{self.branches}] = {x} - {y};")
+            self.branches += 1
+        return f"({test})"
+
+
+def _dtype(atom: Any) -> np.dtype:
+    return atom.aval.dtype
+
+
+def _is_real(equation: JaxprEqn) -> bool:
+    return np.issubdtype(_dtype(equation.invars[0]), np.floating)
+
+
+def _variables(equation: JaxprEqn) -> list[Any]:
+    return [atom if isinstance(atom, Var) else None for atom in equation.invars]
+
+
+def _power(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
+    n = int(params["y"])
+    product = " * ".join([values[0]] * abs(n)) if 0 < abs(n) <= 4 else f"pow({values[0]}, {abs(n)})"
+    return product if n > 0 else f"1.0 / ({product})"
+
+
+def _select(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
+    which, *cases = values
+    if len(cases) == 2:
+        return f"{which} ? {cases[1]} : {cases[0]}"
+    return " : ".join([*(f"{which} == {k} ? {case}" for k, case in enumerate(cases[:-1])), cases[-1]])
+
+
+def _convert(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
+    new = np.dtype(params["new_dtype"])
+    if new.kind == "b":
+        return f"{values[0]} != 0"
+    return f"({'int' if np.issubdtype(new, np.integer) else 'double'}){values[0]}"
+
+
+def _not(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
+    return f"!{values[0]}" if _dtype(equation.invars[0]).kind == "b" else f"~{values[0]}"
+
+
+def _round(values: list[str], params: Mapping[str, Any], equation: JaxprEqn) -> str:
+    return f"{'rint' if 'EVEN' in str(params['rounding_method']) else 'round'}({values[0]})"
+
+
+_SPECIAL: Mapping[str, Callable[[list[str], Mapping[str, Any], JaxprEqn], str]] = {
+    "integer_pow": _power,
+    "select_n": _select,
+    "convert_element_type": _convert,
+    "not": _not,
+    "round": _round,
+}
+"""Operations whose expression depends on their parameters."""

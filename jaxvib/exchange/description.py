@@ -1,0 +1,165 @@
+"""Descriptions of functional mock-up units, the file modelDescription.xml of FMI 2.0 and 3.0."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+from jaxvib.errors import CONTROL
+
+__all__ = ["Fmi", "Variable", "base_units", "describe_model"]
+
+Fmi = Literal["2.0", "3.0"]
+"""Versions of the functional mock-up interface."""
+
+_BASE: Mapping[str, Mapping[str, int]] = {
+    "m": {"m": 1},
+    "kg": {"kg": 1},
+    "s": {"s": 1},
+    "rad": {"rad": 1},
+    "N": {"kg": 1, "m": 1, "s": -2},
+}
+"""Units in base units of SI."""
+
+_STRUCTURED = re.compile(r"(der\()?[A-Za-z_]\w*(\[\d+\])?(\.[A-Za-z_]\w*(\[\d+\])?)*\)?", re.ASCII)
+
+
+class Variable(NamedTuple):
+    """Variable of a unit; its value reference is its place in the list of all variables.
+
+    **Attributes**: `name`; `unit`, "" for none; `kind` (causality) of FMI; `start` None if it is computed; `about`, a
+    description; `low`, `high` bounds or None; `state`, the place of the state whose rate it is, or None; `nominal` or None;
+    `listed`: False for a variable that the description of FMI 2.0 leaves out.
+    """
+
+    name: str
+    unit: str
+    kind: Literal["independent", "output", "local", "input", "parameter"]
+    start: str | None = None
+    about: str = ""
+    low: str | None = None
+    high: str | None = None
+    state: int | None = None
+    nominal: str | None = None
+    listed: bool = True
+
+    @property
+    def variability(self) -> str:
+        """The variability of FMI."""
+        return "tunable" if self.kind == "parameter" else "continuous"
+
+    @property
+    def is_calculated(self) -> bool:
+        """True if the value follows from others from the start."""
+        return self.kind in ("output", "local") and self.start is None
+
+
+def base_units(unit: str) -> dict[str, int]:
+    """Return the exponents of a unit in base units.
+
+    >>> base_units("N s/m"), base_units("kg m^2")
+    ({'kg': 1, 's': -1}, {'kg': 1, 'm': 2})
+    """
+    powers: dict[str, int] = {}
+    for place, part in enumerate(unit.split("/")):
+        for word in part.split():
+            name, _, power = word.partition("^")
+            if word == "1":
+                continue
+            for base, exponent in _BASE[name].items():
+                powers[base] = powers.get(base, 0) + exponent * int(power or 1) * (-1 if place else 1)
+    return {base: exponent for base, exponent in powers.items() if exponent}
+
+
+def describe_model(
+    fmi: Fmi, name: str, identifier: str, token: str, tool: str, about: str, variables: Sequence[Variable], step: str, stop: str
+) -> str:
+    """Return the text of modelDescription.xml.
+
+    **Arguments**: the `name` and `identifier` of the model; `token` that its binary must have; `variables` in the order of
+    their value references; `step` of co-simulation and `stop` time of a default experiment, s.
+    """
+    two = fmi == "2.0"
+    listed = [(reference, each) for reference, each in enumerate(variables) if each.listed or not two]
+    places = {reference: place for place, (reference, _) in enumerate(listed, 1)}
+    indicators = [reference for reference, each in enumerate(variables) if not each.listed]
+    structured = all(_STRUCTURED.fullmatch(each.name) for each in variables)
+    head = {
+        "fmiVersion": fmi,
+        "modelName": name,
+        "guid" if two else "instantiationToken": token,
+        "description": about,
+        "generationTool": tool,
+        "variableNamingConvention": "structured" if structured else "flat",
+        **({"numberOfEventIndicators": str(len(indicators))} if two else {}),
+    }
+    states = "canGetAndSetFMUstate", "canSerializeFMUstate"
+    can = states if two else tuple(each.replace("state", "State") for each in states)
+    common = {
+        "modelIdentifier": identifier,
+        **dict.fromkeys(can, "true"),
+        "providesDirectionalDerivative" + "s" * (not two): "true",
+    }
+    stepping = {"canHandleVariableCommunicationStepSize": "true"}
+    files = [f'<SourceFiles><File name="fmi{fmi[0]}.c"/></SourceFiles>'] if two else []
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        _tag("fmiModelDescription", head, closed=False),
+        *_element("ModelExchange", common, files),
+        *_element("CoSimulation", {**common, **stepping}, files),
+        "<UnitDefinitions>",
+        *(
+            f"<Unit name={_attribute(unit)}>{_tag('BaseUnit', {k: str(v) for k, v in base_units(unit).items()})}</Unit>"
+            for unit in sorted({each.unit for _, each in listed if each.unit})
+        ),
+        "</UnitDefinitions>",
+        '<LogCategories><Category name="logStatusError"/></LogCategories>',
+        _tag("DefaultExperiment", {"startTime": "0.0", "stopTime": stop, "stepSize": step}),
+        "<ModelVariables>",
+        *(_variable(two, reference, each, places) for reference, each in listed),
+        "</ModelVariables>",
+        "<ModelStructure>",
+    ]
+    outputs = [reference for reference, each in listed if each.kind == "output"]
+    rates = [reference for reference, each in listed if each.state is not None]
+    initial = [reference for reference, each in listed if each.is_calculated and each.listed]
+    groups = {"Outputs": outputs, "Derivatives": rates, "InitialUnknowns": initial}
+    if two:
+        for group, members in groups.items():
+            lines += [f"<{group}>", *(_tag("Unknown", {"index": str(places[each])}) for each in members), f"</{group}>"]
+    else:
+        names = "Output", "ContinuousStateDerivative", "InitialUnknown", "EventIndicator"
+        for group, members in zip(names, (*groups.values(), indicators), strict=True):
+            lines += [_tag(group, {"valueReference": str(each)}) for each in members]
+    return "\n".join([*lines, "</ModelStructure>", "</fmiModelDescription>", ""])
+
+
+def _variable(two: bool, reference: int, each: Variable, places: Mapping[int, int]) -> str:
+    head = {"name": each.name, "valueReference": str(reference)}
+    if each.about:
+        head["description"] = each.about
+    head |= {"causality": each.kind, "variability": each.variability}
+    if each.kind in ("output", "local"):
+        head["initial"] = "calculated" if each.is_calculated else "exact"
+    derivative = None if each.state is None else str(places[each.state] if two else each.state)
+    own = {"unit": each.unit or None, "min": each.low, "max": each.high, "nominal": each.nominal, "derivative": derivative}
+    own = {key: value for key, value in {**own, "start": each.start}.items() if value is not None}
+    if two:
+        return f"{_tag('ScalarVariable', head, closed=False)}{_tag('Real', own)}</ScalarVariable>"
+    return _tag("Float64", {**head, **own})
+
+
+def _element(name: str, attributes: Mapping[str, str], content: Sequence[str]) -> list[str]:
+    return [_tag(name, attributes, closed=False), *content, f"</{name}>"] if content else [_tag(name, attributes)]
+
+
+def _tag(name: str, attributes: Mapping[str, str], *, closed: bool = True) -> str:
+    inner = "".join(f" {key}={_attribute(value)}" for key, value in attributes.items())
+    return f"<{name}{inner}{'/' if closed else ''}>"
+
+
+def _attribute(text: str) -> str:
+    """Return a quoted text without the characters that XML does not allow."""
+    return quoteattr(re.sub(f"{CONTROL.pattern}|[\ud800-\udfff\ufffe\uffff]", "?", text))

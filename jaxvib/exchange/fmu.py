@@ -1,0 +1,358 @@
+"""Functional mock-up units: a scene as C source and a binary, for tools that know nothing of Python."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import platform
+import re
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jaxvib.boundary import validated
+from jaxvib.equations.state import State
+from jaxvib.errors import InputError, quoted, require_one_of, written
+from jaxvib.exchange.c_code import Written, number_text, write_program
+from jaxvib.exchange.description import Fmi, Variable, describe_model
+from jaxvib.exchange.model import DriveBy, Equations, equations_of, has_events, named_entries
+from jaxvib.machine.scene import Scene
+from jaxvib.machine.validation import validate_scene
+from jaxvib.motion.analysis.scaled_error import error_scale, natural_units
+from jaxvib.motion.integrate import frequency_bounds
+from jaxvib.motion.start import Start, initial_state, validate_state
+from jaxvib.motion.stiffness import fastest_decay, steps_of
+from jaxvib.ode.scalarize import NotScalarizable, scalar_program
+from jaxvib.runtime.compat import HAS_JAXPRS
+
+__all__ = ["Fmu", "export_fmu"]
+
+_STEPS_PER_RADIAN = 16.0
+"""Steps of co-simulation in a radian of the fastest motion: a phase error of 1e-7 per radian."""
+
+_COMPILERS = ("cc", "gcc", "clang")
+_COMPILER_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden", "-s")
+_COMPILE_SECONDS = 120
+
+_PLATFORMS = {
+    ("Linux", "x86_64"): ("linux64", "x86_64-linux", ".so"),
+    ("Linux", "aarch64"): ("aarch64-linux", "aarch64-linux", ".so"),
+    ("Darwin", "x86_64"): ("darwin64", "x86_64-darwin", ".dylib"),
+    ("Darwin", "arm64"): ("aarch64-darwin", "aarch64-darwin", ".dylib"),
+    ("Windows", "AMD64"): ("win64", "x86_64-windows", ".dll"),
+}
+"""Folders of binaries by FMI 2.0 and 3.0, and the end of their names."""
+
+
+class Fmu(NamedTuple):
+    """A functional mock-up unit that was written.
+
+    **Attributes**: `path` of the file; `has_binary`: True if it holds a binary of this platform beside the source; `message`, a
+    sentence about that; `statements` of the equations in C.
+    """
+
+    path: Path
+    has_binary: bool
+    message: str
+    statements: int
+
+
+@validated
+def export_fmu(
+    scene: Scene,
+    path: str | Path,
+    *,
+    fmi: Fmi = "2.0",
+    start: Start | State = "rest",
+    mode: int | None = None,
+    drive: DriveBy = "scene",
+    binary: bool = True,
+) -> Fmu:
+    """Write a scene as a functional mock-up unit (FMU), for model exchange and co-simulation.
+
+    The file holds the equations as C source and, if a C compiler is found (`CC`, cc, gcc, clang), a binary of this platform.
+    It needs neither Python nor jaxvib. The same scene gives the same bytes.
+
+    - Parameters are all numbers of the scene under their names (`machine.stiffness[0]`), with units and bounds; they may change
+      during a simulation. `co_simulation.step`, s, is the longest step of co-simulation, which is the classical Runge-Kutta
+      method of order 4
+    - States are outputs: `displacement.y1`, `velocity.y1`, `angle.load1`, `rate.load1`; so are `acceleration.y1`,
+      `foundation_force.up`, `rotor.angle` and `rotor.speed`
+    - Inputs are `force.y1` on each coordinate (N, of angles N m) and, with a motor, `rotor.torque` (N m), which is added to
+      its torque
+    - Event indicators are comparisons in forces that are not smooth (stops, contacts, dry friction) and in a drive whose
+      acceleration jumps: a solver ends its steps where one of them changes its sign
+    - Directional derivatives of rates and outputs by states and inputs are exact
+
+    **Arguments**: `fmi` "2.0" or "3.0"; `start` as in `simulate` except "spin_up", or a `State`; `mode` of the jam to start in;
+    `drive` "scene", or "input" for inputs in place of the drive: `rotor.speed` and its derivative `rotor.acceleration` for an
+    ideal drive, `rotor.torque` alone for a motor; `binary`: compile.
+
+    **Returns** `Fmu`. **Raises** `InputError` for a part of the scene whose equations have no form in C, naming the operation,
+    and for a path that cannot be written to.
+
+    >>> import pathlib, tempfile, jaxvib as jv
+    >>> scene = jv.Scene(jv.one_mass(mass=50.0, stiffness=4e4, damping=30.0),
+    ...                  jv.balls(count=2, mass=0.5, radius=0.1, drag=1.0), jv.ConstantSpeed(100.0))
+    >>> unit = jv.export_fmu(scene, pathlib.Path(tempfile.mkdtemp()) / "machine.fmu", binary=False)
+    >>> unit.message
+    'source only: no binary was asked for'
+    """
+    require_one_of(fmi, ("2.0", "3.0"), "fmi")
+    require_one_of(drive, ("scene", "input"), "drive")
+    if isinstance(start, str) and start == "spin_up":
+        raise InputError(
+            "start", "is 'spin_up', which is a drive of its own; give the scene a drive SpinUp and start at 'rest'"
+        )
+    scene = validate_scene(scene)
+    state = validate_state(scene, start, mode) if isinstance(start, State) else initial_state(scene, start, mode=mode)
+    path = Path(path)
+    path = path if path.suffix == ".fmu" else path.with_name(path.name + ".fmu")
+    _require_writable(path)
+    files, statements, identifier = _sources(scene, state, path.stem, fmi, drive)
+    message = "source only: no binary was asked for"
+    library = None
+    if binary:
+        library, message = _compiled(files, fmi, identifier)
+    if library is not None:
+        files |= library
+    with written(path) as part, part.open("wb") as file:
+        file.write(_archive(files))
+    return Fmu(path, library is not None, message, statements)
+
+
+def _require_writable(path: Path) -> None:
+    """**Raises** `InputError` for a missing folder and for a file that is read-only, before anything is computed."""
+    if not path.parent.is_dir():
+        raise InputError("path", f"is {quoted(str(path))}, and its folder does not exist; create it or name another one")
+    if path.is_dir() or (path.exists() and not path.stat().st_mode & 0o222):
+        kind = "a folder" if path.is_dir() else "read-only"
+        raise InputError("path", f"is {quoted(str(path))}, which is {kind}; name another file")
+
+
+def _sources(scene: Scene, state: State, name: str, fmi: Fmi, drive: DriveBy) -> tuple[dict[str, bytes], int, str]:
+    """Return the files of the unit without a binary, the number of its statements, and the identifier of the model."""
+    equations, names = equations_of(scene, state, drive), named_entries(scene)
+    events = has_events(scene)
+    rates, tangent = _programs(scene, equations, events, len(names))
+    step = _step(scene)
+    variables = _variables(scene, equations, rates.branches, step)
+    identifier = re.sub(r"\W", "_", name, flags=re.ASCII)[:60]
+    identifier = identifier if re.match("[A-Za-z]", identifier) else f"machine_{identifier}"
+    body = _model(scene, equations, rates, tangent, variables)
+    own = Path(__file__).parent / "c"
+    files = {f"sources/{each}": (own / each).read_bytes() for each in ("machine.h", f"fmi{fmi[0]}.c")}
+
+    def described(token: str) -> str:
+        tool, about = f"jaxvib {version('jaxvib')}", f"{scene.machine.kind} with {scene.loads.count} {scene.loads.kind}"
+        return describe_model(fmi, name, identifier, token, tool, about, variables, _text(step), "10.0")
+
+    content = "".join([described(""), body, *(text.decode() for text in files.values())])
+    token = "{" + hashlib.sha256(content.encode()).hexdigest()[:32] + "}"
+    files["sources/model.h"] = f'#define TOKEN "{token}"\n{body}'.encode()
+    files["modelDescription.xml"] = described(token).encode()
+    if fmi == "3.0":
+        files["sources/buildDescription.xml"] = (
+            '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
+            f'<BuildConfiguration modelIdentifier="{identifier}"><SourceFileSet><SourceFile name="fmi3.c"/></SourceFileSet>'
+            "</BuildConfiguration>\n</fmiBuildDescription>\n"
+        ).encode()
+    return files, len(rates.body), identifier
+
+
+def _step(scene: Scene) -> float:
+    """Return the longest step of co-simulation, s."""
+    fastest, decay = float(frequency_bounds(scene)[0]), float(fastest_decay(scene))
+    explicit, _ = steps_of(fastest, min(decay, fastest), _STEPS_PER_RADIAN)
+    return float(f"{min(explicit, 1.0 / max(decay, 1e-300)):.3g}")
+
+
+def _programs(scene: Scene, equations: Equations, events: bool, parameters: int) -> tuple[Written, Written]:
+    """Return the rates, and their derivatives in a direction of states and inputs, in C."""
+    if not HAS_JAXPRS:
+        raise InputError("scene", "cannot be written as C, since this version of JAX does not give access to its programs")
+    time = jnp.zeros((), scene.drive.speed.dtype)
+    given = (scene, time, equations.states, equations.inputs)
+
+    def tangent(scene: Scene, t: Array, states: object, inputs: object, *direction: object) -> object:
+        return jax.jvp(lambda *moving: equations.rates(scene, t, *moving), (states, inputs), direction)[1]
+
+    try:
+        programs = scalar_program(equations.rates, *given), scalar_program(tangent, *given, *given[2:])
+    except NotScalarizable as error:
+        problem = f"needs the operation {str(error)!r} of JAX, which has no rule on single numbers"
+        raise InputError("scene", f"{problem}; leave out the part that needs it") from error
+    numbers = [f"p[{k}]" for k in range(parameters)]
+    count = {"x": len(equations.state_signals), "u": len(equations.input_signals), "y": len(equations.output_signals)}
+    moving = [f"{name}[{k}]" for name in "xu" for k in range(count[name])]
+    seeds = [f"{name}_seed[{k}]" for name in "xu" for k in range(count[name])]
+    results = [f"{name}[{k}]" for name, size in (("rate", "x"), ("y", "y")) for k in range(count[size])]
+    return (
+        write_program(programs[0], [*numbers, "t", *moving], parameters, results, has_events=events),
+        write_program(programs[1], [*numbers, "t", *moving, *seeds], parameters, results),
+    )
+
+
+def _text(value: object) -> str:
+    return number_text(np.asarray(value, float).item())
+
+
+def _flat(tree: object) -> list[str]:
+    """Return the numbers of a tree as C and XML read them."""
+    return [_text(value) for leaf in jax.tree.leaves(tree) for value in np.asarray(leaf).ravel()]
+
+
+def _variables(scene: Scene, equations: Equations, branches: int, step: float) -> list[Variable]:
+    """Return all variables in the order of their value references."""
+    signals, state = equations.state_signals, equations.states.machine
+    scales = jax.tree.map(lambda size, leaf: np.full(np.shape(leaf), size), error_scale(state, natural_units(scene)), state)
+    nominals = [*_flat(scales), *["1.0"] * (equations.states.rotor_angle is not None)]
+    states = [
+        Variable(each.name, each.unit, "output", start, nominal=nominal)
+        for each, start, nominal in zip(signals, _flat(equations.states), nominals, strict=True)
+    ]
+    rates = [
+        Variable(f"der({each.name})", f"{each.unit}/s" if "/" not in each.unit else f"{each.unit}^2", "local", state=k)
+        if own is None
+        else Variable(own.name, own.unit, "output", state=k)
+        for k, (each, own) in enumerate(zip(signals, equations.rate_signals, strict=True), 1)
+    ]
+    starts = zip(equations.input_signals, _flat(equations.inputs), strict=True)
+    parameters = []
+    for each, value in zip(named_entries(scene), _flat(scene), strict=True):
+        low, high = (_text(x) if np.isfinite(x) else None for x in (each.spec.bounds.low, each.spec.bounds.high))
+        (about,) = each.words(scene)
+        parameters.append(Variable(each.name, each.unit, "parameter", value, about, low, high))
+    return [
+        Variable("time", "s", "independent"),
+        *states,
+        *rates,
+        *(Variable(each.name, each.unit, "input", start) for each, start in starts),
+        *(Variable(each.name, each.unit, "output") for each in equations.output_signals),
+        *parameters,
+        Variable("co_simulation.step", "s", "parameter", _text(step), "longest step of co-simulation", "0.0"),
+        *(Variable(f"event_indicator[{k}]", "", "local", listed=False) for k in range(branches)),
+    ]
+
+
+_MODEL = """/* Equations of one scene, written by jaxvib.
+
+   p parameters, t time, x states, u inputs, y outputs; constants are what `prepare` computes of the parameters. */
+
+#define STATES {states}
+#define INPUTS {inputs}
+#define OUTPUTS {outputs}
+#define PARAMETERS {parameters}
+#define INDICATORS {indicators}
+#define CONSTANTS {constants}
+#define TANGENT_CONSTANTS {tangent_constants}
+
+static const char *const NAMES[] = {{{names}}};
+static const double START_STATES[] = {{{start_states}}};
+static const double START_INPUTS[] = {{{start_inputs}}};
+static const double START_PARAMETERS[] = {{{start_parameters}}};
+static const double NOMINALS[] = {{{nominals}}};
+static const double LOW[] = {{{low}}};
+static const double HIGH[] = {{{high}}};
+static const char OPEN[] = {{{open}}};  /* 1: the lower bound itself is not allowed, 2: the upper one */
+
+static void prepare(const double *p, double *constants) {{
+{prepare}
+}}
+
+static void evaluate(const double *p, const double *constants, double t, const double *x, const double *u, double *rate,
+                     double *y, double *indicators) {{
+{body}
+}}
+
+/* Derivatives of rates and outputs in the direction (x_seed, u_seed). */
+static void prepare_tangent(const double *p, double *constants) {{
+{prepare_tangent}
+}}
+
+static void tangent(const double *p, const double *constants, double t, const double *x, const double *u, const double *x_seed,
+                    const double *u_seed, double *rate, double *y) {{
+{tangent}
+}}
+"""
+
+
+def _model(scene: Scene, equations: Equations, rates: Written, tangent: Written, variables: list[Variable]) -> str:
+    """Return the C source of the equations."""
+    parameters = [each for each in variables if each.kind == "parameter"]
+    bounds = [each.spec.bounds for each in named_entries(scene)]
+    opened = [*(int(each.open_low) + 2 * int(each.open_high) for each in bounds), 1]
+    states = [each for each in variables if each.nominal is not None]
+    inputs = [each for each in variables if each.kind == "input"]
+    lists = {
+        "names": [f'"{_c_text(each.name)}"' for each in variables],
+        "start_states": [str(each.start) for each in states],
+        "start_inputs": [str(each.start) for each in inputs],
+        "start_parameters": [str(each.start) for each in parameters],
+        "nominals": [str(each.nominal) for each in states],
+        "low": [each.low or "-INFINITY" for each in parameters],
+        "high": [each.high or "INFINITY" for each in parameters],
+        "open": [str(each) for each in opened],
+    }
+    blocks = {"prepare": rates.prepare, "body": rates.body, "prepare_tangent": tangent.prepare, "tangent": tangent.body}
+    return _MODEL.format(
+        states=len(states),
+        inputs=len(inputs),
+        outputs=len(equations.output_signals),
+        parameters=len(parameters),
+        indicators=rates.branches,
+        constants=rates.constants,
+        tangent_constants=tangent.constants,
+        **{name: ", ".join(texts) for name, texts in lists.items()},
+        **{name: "\n".join(f"    {line}" for line in lines) for name, lines in blocks.items()},
+    )
+
+
+def _c_text(text: str) -> str:
+    return re.sub(r"[^ -~]|[\"\\%?]", "_", text)
+
+
+def _compiled(files: dict[str, bytes], fmi: Fmi, identifier: str) -> tuple[dict[str, bytes] | None, str]:
+    """Return the binary of this platform, or None, and a sentence about it."""
+    found = _PLATFORMS.get((platform.system(), platform.machine()))
+    compiler = next(filter(None, map(shutil.which, filter(None, (os.environ.get("CC"), *_COMPILERS)))), None)
+    if found is None or compiler is None:
+        missing = "a C compiler (CC, cc, gcc or clang)" if compiler is None else "a name of this platform in FMI"
+        return None, f"source only: {missing} was not found; the tool that reads the file has to compile it"
+    folder = found[0] if fmi == "2.0" else found[1]
+    with tempfile.TemporaryDirectory() as home:
+        for name, content in files.items():
+            if name.startswith("sources/"):
+                (Path(home) / Path(name).name).write_bytes(content)
+        words = [compiler, *_COMPILER_FLAGS, "-o", "machine", f"fmi{fmi[0]}.c", "-lm"]
+        try:
+            subprocess.run(words, cwd=home, capture_output=True, text=True, timeout=_COMPILE_SECONDS, check=True)
+        except (OSError, subprocess.SubprocessError) as error:
+            said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+            why = f"{Path(compiler).name} failed ({said[0] if said else 'no message'})"
+            return None, f"source only: {why}; the tool that reads the file has to compile it"
+        return {
+            f"binaries/{folder}/{identifier}{found[2]}": (Path(home) / "machine").read_bytes()
+        }, f"with a binary for {folder}"
+
+
+def _archive(files: dict[str, bytes]) -> bytes:
+    """Return a ZIP archive that is the same for the same files."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, files[name])
+    return buffer.getvalue()

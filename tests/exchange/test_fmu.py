@@ -1,0 +1,417 @@
+"""Functional mock-up units against the equations in JAX, CVode against `simulate`, and a host without Python."""
+
+import functools
+import itertools
+import os
+import pathlib
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from types import SimpleNamespace
+
+import fmpy
+import fmpy.fmi2
+import fmpy.fmi3
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu
+from programs.golden import scenes, state_of
+
+import jaxvib as jv
+from jaxvib.exchange import fmu as module
+from jaxvib.exchange.c_code import write_program
+from jaxvib.exchange.description import base_units
+from jaxvib.exchange.model import state_signals
+from jaxvib.machine.files import TEMPLATES
+from jaxvib.ode.scalarize import scalar_program
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+SCENES = scenes()
+CHECKED = ["two masses", "stop", "imbalance and a motor", "rotor with stations", "torus, balls spin and slide"]
+"""Scenes that are checked by default; `make test-slow` checks all."""
+
+
+def each_scene(*checked):
+    return pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=[] if name in checked else [pytest.mark.slow]) for name in SCENES]
+    )
+
+
+@functools.cache
+def home():
+    return pathlib.Path(tempfile.mkdtemp())
+
+
+@functools.cache
+def exported(name, fmi="2.0", drive="scene"):
+    """A unit, compiled once, and what fmpy reads of it."""
+    scene = SCENES[name]
+    unit = jv.export_fmu(scene, home() / f"{name} {fmi} {drive}.fmu", fmi=fmi, drive=drive)
+    description = fmpy.read_model_description(str(unit.path))
+    references = {each.name: each.valueReference for each in description.modelVariables}
+    folder = fmpy.extract(str(unit.path), str(home() / f"{name} {fmi} {drive}"))
+    return SimpleNamespace(scene=scene, unit=unit, path=str(unit.path), folder=folder, of=description, references=references)
+
+
+def opened(found, kind="ModelExchange"):
+    """An instance in its initialization mode, with functions to get and set values by name."""
+    two = found.of.fmiVersion == "2.0"
+    of = found.of.modelExchange if kind == "ModelExchange" else found.of.coSimulation
+    classes = {("ModelExchange", True): fmpy.fmi2.FMU2Model, ("CoSimulation", True): fmpy.fmi2.FMU2Slave}
+    classes |= {("ModelExchange", False): fmpy.fmi3.FMU3Model, ("CoSimulation", False): fmpy.fmi3.FMU3Slave}
+    machine = classes[kind, two](
+        guid=found.of.guid, unzipDirectory=found.folder, modelIdentifier=of.modelIdentifier, instanceName="machine"
+    )
+    machine.instantiate()
+    if two:
+        machine.setupExperiment(startTime=0.0)
+    machine.enterInitializationMode()
+    get, put = (machine.getReal, machine.setReal) if two else (machine.getFloat64, machine.setFloat64)
+    machine.value = lambda *names: np.array(get([found.references[name] for name in names]))
+    machine.put = lambda **values: put([found.references[name.replace("__", ".")] for name in values], list(values.values()))
+    return machine
+
+
+def of_state(scene, state):
+    """The numbers of a state by name."""
+    values = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(state)])
+    return dict(zip([each.name for each in state_signals(scene, state)], values.tolist(), strict=True))
+
+
+def put_all(machine, found, values):
+    references = [found.references[name] for name in values]
+    (machine.setReal if found.of.fmiVersion == "2.0" else machine.setFloat64)(references, list(values.values()))
+
+
+def rates_of(found):
+    """The names of the rates in the order of the states."""
+    return [each.variable.name for each in found.of.derivatives]
+
+
+@needs_compiler
+@pytest.mark.parametrize("fmi", ["2.0", "3.0"])
+@each_scene(*CHECKED)
+def test_unit_is_valid_and_has_the_rates_of_the_field(name, fmi):
+    found = exported(name, fmi)
+    assert validate_fmu(found.path) == [] and found.unit.has_binary
+    state = state_of(found.scene)
+    machine = opened(found)
+    put_all(machine, found, of_state(found.scene, state))
+    field = jv.vector_field(found.scene)
+    expected = of_state(found.scene, field(jnp.asarray(0.0), state))
+    given = machine.value(*rates_of(found))
+    np.testing.assert_allclose(given, list(expected.values()), rtol=1e-10, atol=1e-10 * np.max(np.abs(given)))
+    force = jv.foundation_force(found.scene, state)
+    names = [f"foundation_force.{each}" for each in found.scene.machine.structure().bed_directions]
+    np.testing.assert_allclose(machine.value(*names), force, rtol=1e-12)
+    machine.freeInstance()
+
+
+@needs_compiler
+@each_scene("stop", "imbalance and a motor")
+def test_cvode_agrees_with_simulate_over_two_seconds(name):
+    found = exported(name)
+    # Balls that spin and slide are chaotic: as long as they agree.
+    end = 0.5 if "slide" in name else 2.0
+    outputs = [f"displacement.{each}" for each in found.scene.machine.structure().coordinates]
+    outputs += [each for each in found.references if each.startswith("foundation_force")]
+    got = fmpy.simulate_fmu(
+        found.folder, stop_time=end, fmi_type="ModelExchange", output=outputs, output_interval=end / 3200,
+        relative_tolerance=1e-12, model_description=found.of,
+    )  # fmt: skip
+    run = jv.simulate(found.scene, end, stepsize_controller=jv.Tolerance(1e-12), samples=401, estimate=False).trajectory
+    expected = np.concatenate([run.state.displacement, run.foundation_force], axis=1).T
+    rows = [np.argmin(np.abs(got["time"] - t)) for t in np.asarray(run.time)]
+    assert np.max(np.abs(got["time"][rows] - run.time)) < 1e-12
+    for name, values in zip(outputs, expected, strict=True):
+        assert np.max(np.abs(got[name][rows] - values)) < 1e-6 * np.max(np.abs(values)), name
+
+
+@needs_compiler
+@pytest.mark.parametrize("fmi", ["2.0", "3.0"])
+def test_model_exchange_agrees_in_both_versions(fmi):
+    found = exported("stop", fmi)
+    got = fmpy.simulate_fmu(
+        found.folder, stop_time=1.0, fmi_type="ModelExchange", output=["displacement.y2"], relative_tolerance=1e-10,
+        model_description=found.of, output_interval=0.01,
+    )  # fmt: skip
+    run = jv.simulate(found.scene, 1.0, stepsize_controller=jv.Tolerance(1e-11), samples=101, estimate=False).trajectory
+    assert np.max(np.abs(run.state.displacement[:, 1])) > 0.01 and found.of.eventIndicators is not None
+    assert got["displacement.y2"][-1] == pytest.approx(float(run.state.displacement[-1, 1]), abs=1e-7)
+
+
+@needs_compiler
+@pytest.mark.parametrize("fmi", ["2.0", "3.0"])
+def test_co_simulation_converges_with_order_four(fmi):
+    found = exported("two masses", fmi)
+    exact = np.asarray(
+        jv.simulate(found.scene, 1.0, stepsize_controller=jv.Tolerance(1e-12), samples=2).trajectory.state.displacement
+    )
+
+    def error(step):
+        got = fmpy.simulate_fmu(
+            found.folder, stop_time=1.0, fmi_type="CoSimulation", output=["displacement.y1", "displacement.y2"],
+            output_interval=0.1, start_values={"co_simulation.step": step}, model_description=found.of,
+        )  # fmt: skip
+        return np.max(np.abs(np.array(list(got[-1])[1:]) - exact[-1]))
+
+    errors = [error(0.1 / n) for n in (40, 80, 160)]
+    assert all(14.0 < coarse / fine < 18.0 for coarse, fine in itertools.pairwise(errors)), errors
+
+
+@needs_compiler
+def test_default_step_of_co_simulation_is_accurate():
+    found = exported("two masses")
+    got = fmpy.simulate_fmu(
+        found.folder, stop_time=2.0, fmi_type="CoSimulation", output=["displacement.y2"], output_interval=0.05,
+        model_description=found.of,
+    )  # fmt: skip
+    run = jv.simulate(found.scene, 2.0, stepsize_controller=jv.Tolerance(1e-11), samples=2).trajectory
+    assert float(got["displacement.y2"][-1]) == pytest.approx(float(run.state.displacement[-1, 1]), rel=1e-4)
+
+
+@needs_compiler
+def test_changed_parameters_equal_the_changed_scene_file():
+    found = exported("stop")
+    changed = {"machine.stiffness[0]": 6.1e4, "loads.mass": 0.7, "effects.stop[0].gap": 0.004, "drive.speed": 110.0}
+    text = jv.scene_to_toml(found.scene)
+    pairs = (
+        ("50000.0,\n", "61000.0,\n"),
+        ("mass = 0.8", "mass = 0.7"),
+        ("gap = 0.01", "gap = 0.004"),
+        ("speed = 120.0", "speed = 110.0"),
+    )
+    for old, new in pairs:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    state = state_of(found.scene)
+    expected = of_state(found.scene, jv.vector_field(jv.scene_from_toml(text))(jnp.asarray(0.0), state))
+    machine = opened(found)
+    machine.exitInitializationMode()
+    before = machine.value(*rates_of(found))
+    put_all(machine, found, {**of_state(found.scene, state), **changed})
+    given = machine.value(*rates_of(found))
+    np.testing.assert_allclose(given, list(expected.values()), rtol=1e-10, atol=1e-9)
+    assert not np.allclose(before, given)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["two masses", "imbalance and a motor", "stop", "rotor with stations"])
+def test_directional_derivatives_equal_jvp(name):
+    found = exported(name)
+    state, machine = state_of(found.scene), opened(found)
+    put_all(machine, found, of_state(found.scene, state))
+    rng = np.random.default_rng(1)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), state)
+    field = jv.vector_field(found.scene)
+    expected = jax.jvp(lambda x: field(jnp.asarray(0.0), x), (state,), (direction,))[1]
+    known = of_state(found.scene, direction)
+    given = machine.getDirectionalDerivative(
+        [found.references[each] for each in rates_of(found)], [found.references[each] for each in known], list(known.values())
+    )
+    expected = list(of_state(found.scene, expected).values())
+    np.testing.assert_allclose(given, expected, rtol=1e-9, atol=1e-10 * np.max(np.abs(expected)))
+
+
+@needs_compiler
+def test_derivatives_by_inputs_equal_differences():
+    found = exported("imbalance and a motor")
+    machine = opened(found)
+    put_all(machine, found, of_state(found.scene, state_of(found.scene)))
+    names, before = rates_of(found), None
+    for known in ("force.y1", "force.y2", "rotor.torque"):
+        before = machine.value(*names)
+        slope = machine.getDirectionalDerivative([found.references[n] for n in names], [found.references[known]], [1.0])
+        put_all(machine, found, {known: 1.0})
+        np.testing.assert_allclose(machine.value(*names) - before, slope, atol=1e-9)
+        assert np.max(np.abs(slope)) > 1e-4
+        put_all(machine, found, {known: 0.0})
+
+
+@needs_compiler
+def test_force_on_a_platform_enters_its_equation():
+    found = exported("two masses")
+    machine = opened(found)
+    before = machine.value("acceleration.y1", "acceleration.y2")
+    put_all(machine, found, {"force.y1": 240.0})
+    change = machine.value("acceleration.y1", "acceleration.y2") - before
+    np.testing.assert_allclose(change, [240.0 / float(found.scene.machine.mass[0]), 0.0], rtol=1e-12)
+
+
+@needs_compiler
+def test_rotor_of_a_motor_follows_the_torque_input_alone():
+    found = exported("imbalance and a motor", drive="input")
+    assert validate_fmu(found.path) == []
+    scene, state = found.scene, state_of(found.scene)
+    motor = scene.drive
+    machine = opened(found)
+    torque = float(motor.torque(state.rotor[1]))
+    put_all(machine, found, {**of_state(scene, state), "rotor.torque": torque})
+    expected = of_state(scene, jv.vector_field(scene)(jnp.asarray(0.0), state))
+    np.testing.assert_allclose(machine.value(*rates_of(found)), list(expected.values()), rtol=1e-10, atol=1e-10)
+
+
+@needs_compiler
+def test_speed_input_replaces_an_ideal_drive():
+    found = exported("imbalance", drive="input")
+    assert validate_fmu(found.path) == []
+    scene = jv.Scene(found.scene.machine, found.scene.loads, jv.SpinUp(120.0, 5.0), found.scene.effects)
+    state, t = state_of(scene), jnp.asarray(1.7)
+    drive = scene.drive
+    machine = opened(found)
+    values = {
+        "rotor.angle": drive.angle_at(t),
+        "rotor.speed": drive.speed_at(t),
+        "rotor.acceleration": drive.acceleration_at(t),
+    }
+    put_all(machine, found, {**of_state(scene, state), **{name: float(value) for name, value in values.items()}})
+    expected = [*of_state(scene, jv.vector_field(scene)(t, state)).values(), float(drive.speed_at(t))]
+    np.testing.assert_allclose(machine.value(*rates_of(found)), expected, rtol=1e-10, atol=1e-10)
+
+
+@needs_compiler
+@pytest.mark.parametrize("fmi", ["2.0", "3.0"])
+def test_states_of_instances_are_kept_and_restored(fmi):
+    found = exported("two masses", fmi)
+    machine = opened(found, "CoSimulation")
+    machine.exitInitializationMode()
+    kept = machine.getFMUState() if fmi == "3.0" else machine.getFMUstate()
+    machine.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.1)
+    after = machine.value("displacement.y2", "rate.load1")
+    (machine.setFMUState if fmi == "3.0" else machine.setFMUstate)(kept)
+    machine.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.1)
+    assert np.array_equal(machine.value("displacement.y2", "rate.load1"), after) and after[0] != 0.0
+    machine.reset()
+    machine.freeInstance()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"machine.mass[0]": -3.0}, "machine.mass[0] is -3; it must be greater than 0"),
+        ({"loads.drag": -1.0}, "loads.drag is -1; it must be at least 0"),
+        ({"displacement.y1": float("nan")}, "displacement.y1 is not finite; give a number"),
+        ({"acceleration.y1": 1.0}, "the value of acceleration.y1 cannot be set"),
+    ],
+)
+def test_wrong_values_are_refused_in_one_sentence(values, says, capfd):
+    found = exported("two masses")
+    machine = opened(found)
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        put_all(machine, found, values)
+    assert says in capfd.readouterr().out
+    assert np.all(np.isfinite(machine.value("machine.mass[0]", "displacement.y1")))
+
+
+@needs_compiler
+def test_state_that_is_not_finite_is_refused(capfd):
+    found = exported("two masses")
+    machine = opened(found)
+    put_all(machine, found, {"rate.load1": 1e200})
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        machine.value("acceleration.y1")
+    assert "is not finite at 0 s" in capfd.readouterr().out
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name == "nt", reason="the host opens libraries by dlopen")
+def test_host_without_python_steps_the_machine(tmp_path):
+    found = exported("two masses")
+    program = tmp_path / "host"
+    source = pathlib.Path(__file__).with_name("host.c")
+    assert len(source.read_text().splitlines()) <= 45
+    subprocess.run(["cc", "-std=gnu99", "-o", program, source, "-ldl"], check=True)
+    library = next(pathlib.Path(found.folder, "binaries").rglob("*.so"))
+    names = ["displacement.y1", "displacement.y2", "foundation_force.up"]
+    words = [program, library, found.of.guid, "1.0", "1000", *(str(found.references[name]) for name in names)]
+    done = subprocess.run(words, capture_output=True, text=True, env={})
+    run = jv.simulate(found.scene, 1.0, stepsize_controller=jv.Tolerance(1e-11), samples=2).trajectory
+    expected = [*run.state.displacement[-1], run.foundation_force[-1, 0]]
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_allclose([float(x) for x in done.stdout.split()], expected, rtol=1e-5)
+    wrong = subprocess.run([program, library, "{0}", "1.0", "10"], capture_output=True, text=True, env={})
+    assert wrong.returncode == 2 and "%s" in wrong.stderr
+
+
+@needs_compiler
+def test_same_scene_gives_the_same_bytes(tmp_path):
+    scene = SCENES["one mass"]
+    paths = [jv.export_fmu(scene, tmp_path / folder / "m.fmu").path for folder in ("a", "b") if not (tmp_path / folder).mkdir()]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+@pytest.mark.parametrize("kind", TEMPLATES)
+def test_templates_are_valid_units(kind, tmp_path):
+    unit = jv.export_fmu(jv.scene_from_toml(TEMPLATES[kind]), tmp_path / kind, fmi="3.0", binary=False)
+    assert validate_fmu(str(unit.path)) == [] and unit.path.name == f"{kind}.fmu"
+
+
+def test_without_a_compiler_the_source_alone_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(module.shutil, "which", lambda name: None)
+    unit = jv.export_fmu(SCENES["one mass"], tmp_path / "m.fmu")
+    assert not unit.has_binary and unit.message.startswith("source only: a C compiler (CC, cc, gcc or clang) was not found")
+    assert validate_fmu(str(unit.path)) == []
+    assert zipfile.ZipFile(unit.path).namelist() == [
+        "modelDescription.xml", "sources/fmi2.c", "sources/machine.h", "sources/model.h"
+    ]  # fmt: skip
+
+
+@needs_compiler
+def test_failing_compiler_leaves_the_source_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_COMPILER_FLAGS", ("--no-such-option",))
+    unit = jv.export_fmu(SCENES["one mass"], tmp_path / "m.fmu")
+    assert not unit.has_binary and "failed (" in unit.message and "no-such-option" in unit.message
+
+
+def test_operation_without_a_rule_is_named():
+    program = scalar_program(lambda x: jnp.floor(x) + jax.lax.erf(x), jnp.ones(()))
+    assert write_program(program, ["x"], 0, ["y"]).body[1].endswith("= erf(x);")
+    with pytest.raises(jv.InputError, match="needs the operation 'xor' of JAX, which has no rule in C"):
+        write_program(jax.make_jaxpr(lambda a: a ^ 1)(1), ["a"], 0, ["y"])
+
+
+@pytest.mark.parametrize(
+    ("name", "identifier"), [('1 ü&<">', "machine_1______"), ("häger", "h_ger"), ("x" * 200, "x" * 60), ("a.b\x01", "a_b_")]
+)
+def test_hostile_names_give_valid_units(name, identifier, tmp_path):
+    unit = jv.export_fmu(SCENES["one mass"], tmp_path / f"{name}.fmu", binary=False)
+    assert validate_fmu(str(unit.path)) == []
+    assert fmpy.read_model_description(str(unit.path)).modelExchange.modelIdentifier == identifier
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (dict(path="/none/m.fmu"), "path is '/none/m.fmu', and its folder does not exist; create it or name another one"),
+        (dict(path="/proc/m.fmu"), "path is '/proc/m.fmu', which cannot be written"),
+        (dict(path="a\0b"), "path is "),
+        (dict(path=3), "path is 3; "),
+        (dict(fmi="1.0"), "fmi is '1.0'; "),
+        (dict(drive="wheel"), "drive is 'wheel'; "),
+        (dict(start="spin_up"), "start is 'spin_up', which is a drive of its own"),
+        (dict(mode=3), "mode is 3, "),
+    ],
+)
+def test_wrong_arguments_of_units_end_in_one_sentence(change, says, tmp_path):
+    arguments = {"path": tmp_path / "m.fmu", **change}
+    with pytest.raises(jv.InputError) as error:
+        jv.export_fmu(SCENES["one mass"], **arguments)
+    assert str(error.value).startswith(says) and list(tmp_path.iterdir()) == []
+
+
+def test_read_only_file_stays_as_it_is(tmp_path):
+    path = tmp_path / "m.fmu"
+    path.write_text("kept")
+    path.chmod(0o444)
+    with pytest.raises(jv.InputError, match="which is read-only; name another file"):
+        jv.export_fmu(SCENES["one mass"], path)
+    assert path.read_text() == "kept"
+
+
+def test_every_unit_of_a_scene_has_base_units():
+    assert base_units("N m s/rad") == {"kg": 1, "m": 2, "s": -1, "rad": -1} and base_units("m/s^2") == {"m": 1, "s": -2}
+    assert base_units("1/s") == {"s": -1} and base_units("N/m^3") == {"kg": 1, "s": -2, "m": -2}
