@@ -107,7 +107,7 @@ def test_a_speed_must_say_what_it_counts(text):
     with pytest.raises(jv.InputError, match=r"write (for example )?'1500 rpm', '157.1 rad/s' or '25 Hz'"):
         to_float(text, "rad/s", "drive.speed")
     with pytest.raises(jv.InputError, match="which is not in rad; write for example"):
-        to_float("5 percent", "rad", "apart")
+        to_float("5 percent", "rad", "separation")
 
 
 def test_a_decimal_comma_has_its_own_message():
@@ -166,9 +166,9 @@ def test_a_count_ends_where_indices_and_memory_end():
 
 
 def test_an_angle_keeps_digits_within_a_turn():
-    assert number(1e15, "rad", "apart") == 1e15 and number(1e16, "m", "radius") == 1e16
+    assert number(1e15, "rad", "separation") == 1e15 and number(1e16, "m", "radius") == 1e16
     with pytest.raises(jv.InputError, match=r"^apart is 1e\+16 rad; it must be below 4\.5e\+15 rad"):
-        number(1e16, "rad", "apart")
+        number(1e16, "rad", "separation")
 
 
 def test_unknown_and_known_numbers_may_stand_in_one_list():

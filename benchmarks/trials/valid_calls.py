@@ -153,8 +153,8 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("scene_to_toml", scene=s)
     # Equations
     yield call("vector_field", scene=s)
-    yield call("initial_state", scene=s, start="rest", mode=None, angles=None, apart=0.0, throw=True)
-    yield call("initial_state", scene=s, start="jam", mode=3, angles=(0.0, 1.0), apart=0.0, throw=False)
+    yield call("initial_state", scene=s, start="rest", mode=None, angles=None, separation=0.0, throw=True)
+    yield call("initial_state", scene=s, start="jam", mode=3, angles=(0.0, 1.0), separation=0.0, throw=False)
     yield call("with_spin", scene=s, state=state, turning="rolling")
     yield call("natural_frequencies", scene=s)
     yield call("mode_shapes", scene=s)
@@ -179,7 +179,7 @@ def calls() -> Iterator[Callable[[], Call]]:
     yield call("whirl", scene=r, rotor_speed=(100.0, 200.0), loads="fixed")
     yield call("critical_speeds", scene=r, loads="fixed")
     # Motion
-    motion = dict(start="rest", mode=None, apart=0.0, spin_up=None, save="all", samples=16, turns=4, estimate=False)
+    motion = dict(start="rest", mode=None, separation=0.0, spin_up=None, save="all", samples=16, turns=4, estimate=False)
     more = dict(solver=None, stepsize_controller=None, adjoint=None, max_steps=None, progress_meter=None, throw=True)
     yield call("simulate", scene=s, until=0.5, **motion, **more)
     slow = dict(start="rest", mode=None, spin_up=None, save="all", samples=16, turns=4)

@@ -10,7 +10,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import UNIT, Output, app, shared
-from jaxvib.cli.document import APART, chosen_steps, run_document
+from jaxvib.cli.document import SEPARATION, chosen_steps, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
@@ -56,7 +56,7 @@ def new(kind: str, output: Output) -> None:
     "--start", type=click.Choice(["rest", "jam", "spin_up"]), default="rest", show_default=True, help="Initial state."
 )
 @click.option("--mode", type=int, help="Number of the jam mode to start in, with --start jam.")
-@APART
+@SEPARATION
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-8].")
 @click.option("--accuracy", type=float, help="Error the result may have, in place of a tolerance.")
@@ -70,7 +70,7 @@ def simulate(
     until: str,
     start: Start,
     mode: int | None,
-    apart: str | None,
+    separation: str | None,
     spin_up: str | None,
     tolerance: float | None,
     accuracy: float | None,
@@ -91,7 +91,7 @@ def simulate(
         until,
         start=start,
         mode=mode,
-        apart=apart,
+        separation=separation,
         spin_up=spin_up,
         stepsize_controller=chosen_steps(tolerance, accuracy),
         max_steps=max_steps,

@@ -8,10 +8,11 @@ import jaxvib as jv
 from jaxvib.cli.output import fields_of
 from jaxvib.errors import InputError
 
-__all__ = ["APART", "chosen_steps", "measured_document", "run_document"]
+__all__ = ["SEPARATION", "chosen_steps", "measured_document", "run_document"]
 
-APART = click.option(
-    "--apart", help="Angle between neighbouring loads at the start, such as '3 deg'; 0: all at one [side by side, or 1 deg]."
+SEPARATION = click.option(
+    "--separation",
+    help="Angle between neighbouring loads at the start, e.g. '3 deg'; 0: one angle [side by side, or 1 deg].",
 )
 
 
@@ -44,7 +45,7 @@ def run_document(run: jv.Run) -> dict[str, object]:
     return {
         **measured_document(run, run.scene),
         "regime": _regime(run.regime),
-        **fields_of(run, "together", "error", "evaluations", "seconds"),
+        **fields_of(run, "coincident", "error", "evaluations", "seconds"),
     }
 
 

@@ -79,12 +79,12 @@ def stretches(
 
 
 def pack_batch(
-    field: Callable[[Array, State], State], state: State, single: bool, together: bool, *, implicit: bool
+    field: Callable[[Array, State], State], state: State, single: bool, has_common_turns: bool, *, implicit: bool
 ) -> PackedSystem:
     """The equations of many runs that advance together; an implicit method takes the numbers of each run as a vector."""
     if implicit:
         return PackedSystem(field, state, solver=Rodas4())
-    return PackedSystem(field, state, wrapped=single, together=together, batch=True)
+    return PackedSystem(field, state, wrapped=single, has_common_turns=has_common_turns, batch=True)
 
 
 class BatchPlan(NamedTuple):
@@ -126,10 +126,10 @@ def run_in_batch(scene: Scene, state: State, plan: BatchPlan) -> BatchRun:
     Under `vmap` all runs make the same steps, so that none waits for another and no result depends on the runs beside it.
     """
     dtype = state.displacement.dtype
-    single, together = wrap_angles(scene, dtype)
+    single, has_common_turns = wrap_angles(scene, dtype)
     model = assemble(scene)
     field = dynamics_of(model)
-    motion = pack_batch(field, state, single, together, implicit=plan.implicit)
+    motion = pack_batch(field, state, single, has_common_turns, implicit=plan.implicit)
     begin, length = plan.until - plan.window, (plan.until - plan.window) / PARTS
     spacing = plan.window / (plan.samples - 1)
 

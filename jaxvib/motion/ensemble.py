@@ -183,11 +183,11 @@ def ensemble(
     begun = time.perf_counter()
     plan = plan_ensemble(make, values, until, steps=stepsize_controller, is_estimated=estimate, batch=batch)
 
-    def together(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
-        return _together(own, common, end, counts, plan.is_shared, plan.form, equations, plan.implicit)
+    def run_batch(own: list[Array], common: list[Array], end: Array, counts: Array) -> _Ends:
+        return _run_batch(own, common, end, counts, plan.is_shared, plan.form, equations, plan.implicit)
 
     counts = np.asarray([plan.each, plan.coarse] if plan.is_compared else [plan.each], plan.end.dtype)
-    ends = in_chunks(plan.batch, together, plan.own, shared=(plan.common, plan.end, counts))
+    ends = in_chunks(plan.batch, run_batch, plan.own, shared=(plan.common, plan.end, counts))
     last, load_speed, apart, finite, detached, taken = ends
     error = np.full(plan.allowed.shape, np.inf if estimate else np.nan, plan.end.dtype)
     if plan.is_compared:
@@ -206,7 +206,7 @@ def ensemble(
 
 
 @cached
-def _together(
+def _run_batch(
     own: list[Array],
     common: list[Array],
     end: Array,
@@ -232,12 +232,12 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
     **Returns** of the first: the state at its end, the loads' mean speeds over its last part, how far the second ends from
     there, whether it stayed finite, which loads did not press on their track, the steps it took.
     """
-    single, together = wrap_angles(scene, state.displacement.dtype)
+    single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
     watched = scene.loads.one_sided
     field = field_of(equations, scene)
     field = _FieldWithDetachment(field, scene) if watched else field
     state = _with_detachment(state, jnp.zeros_like(state.azimuth)) if watched else state
-    motion = pack_batch(field, state, single, together, implicit=implicit)
+    motion = pack_batch(field, state, single, has_common_turns, implicit=implicit)
     length = end / ENSEMBLE_PARTS
 
     def part(held: Y, at: tuple[Array, Array], step: Array) -> tuple[Y, tuple[Y, Array]]:
@@ -250,7 +250,7 @@ def _run(scene: Scene, state: State, end: Array, counts: Array, equations: Equat
         return jax.tree.map(lambda leaf: leaf[-2:], helds), jnp.sum(taken)
 
     helds, taken = jax.lax.map(whole, counts)
-    # Wrapped angles are counted from the first of the states that are asked for together.
+    # Wrapped angles are counted from the first of the requested states.
     ends = motion.unpack(jax.tree.map(lambda leaf: leaf[:, -1], helds))
     angle = motion.unpack(jax.tree.map(lambda leaf: leaf[0], helds)).azimuth
     last, other = (jax.tree.map(lambda leaf, k=k: leaf[k], ends) for k in (0, -1))

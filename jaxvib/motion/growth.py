@@ -104,7 +104,7 @@ def growth(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     stretches: int = 40,
 ) -> Growth:
     """Estimate the largest Lyapunov exponent of a motion: the rate at which two motions separate that begin close together.
@@ -132,7 +132,7 @@ def growth(
     - `scene` with a drive of constant speed
     - `until`, s or text: approximate length of all stretches together; each is a whole number of turns of the rotor; typical:
       20 to 200
-    - `start`, `mode`, `apart` as `simulate`
+    - `start`, `mode`, `separation` as `simulate`
     - `stretches`, at least 8; typical: 40 (the default). They must be so many that motions a rounding apart are not far apart
       after one
 
@@ -156,7 +156,7 @@ def growth(
     if count(stretches, "stretches") < 8:
         raise InputError("stretches", f"is {stretches}; at least 8 are needed to tell a rate from its scatter")
     end = float(number(until, "s", "until", low=0.0, open_low=True))
-    state = start_state(scene, start, mode, apart)
+    state = start_state(scene, start, mode, separation)
     stretch, unit = whole_turns(scene, end / stretches), natural_units(scene)
     double = state.displacement.dtype.itemsize >= 8
     separation, steps = (1e-6, Tolerance(1e-10)) if double else (1e-2, Tolerance(1e-5))
@@ -254,9 +254,9 @@ def _distance(a: State, b: State, scale: State) -> float:
     return math.sqrt(float(sum(parts)))
 
 
-def _at_distance(a: State, b: State, scale: State, apart: float) -> State:
-    """State at the distance `apart` from `a` towards `b`; if the two are equal, `a` with its displacements moved."""
+def _at_distance(a: State, b: State, scale: State, separation: float) -> State:
+    """State at the distance `separation` from `a` towards `b`; if the two are equal, `a` with its displacements moved."""
     distance = _distance(a, b, scale)
     if distance == 0.0:
-        return eqx.tree_at(lambda s: s.displacement, a, a.displacement + apart * scale.displacement)
-    return jax.tree.map(lambda x, y: x + (y - x) * (apart / distance), a, b)
+        return eqx.tree_at(lambda s: s.displacement, a, a.displacement + separation * scale.displacement)
+    return jax.tree.map(lambda x, y: x + (y - x) * (separation / distance), a, b)

@@ -150,10 +150,12 @@ def integrate(
     state = jax.tree.map(lambda leaf: jnp.where(exists, leaf, 0.0), state)
     (fastest, slowest), unit = frequency_bounds(scene), natural_units(scene)
     saves = _saves(scene, end, slowest, plan)
-    single, together = wrap_angles(scene, state.displacement.dtype)
+    single, has_common_turns = wrap_angles(scene, state.displacement.dtype)
     model = assemble(scene)
     field = dynamics_of(model)
-    motion = PackedSystem(field, state, wrapped=single and plan.solver is None, together=together, solver=plan.solver)
+    motion = PackedSystem(
+        field, state, wrapped=single and plan.solver is None, has_common_turns=has_common_turns, solver=plan.solver
+    )
     solver = motion.method(plan.adjoint) if plan.solver is None else plan.solver
     first_step, controller = _steps(motion, state, unit, plan.control, end, fastest)
     solution = solve(
@@ -195,7 +197,7 @@ def integrate(
         evaluations=steps * _stages(solver),
         seconds=unknown,
         scene=scene,
-        together=_is_together(state.azimuth[None]) & _is_together(states.azimuth),
+        coincident=_is_coincident(state.azimuth[None]) & _is_coincident(states.azimuth),
     )
 
 
@@ -229,7 +231,7 @@ def _steps(
     return None if isinstance(control, diffrax.StepTo) else 0.05 / fastest, control
 
 
-def _is_together(angle: Array) -> Array:
+def _is_coincident(angle: Array) -> Array:
     """True if several loads have one angle (..., count) all the time, up to the growth of rounding errors."""
     apart = jnp.max(jnp.max(angle, axis=1) - jnp.min(angle, axis=1))
     return (angle.shape[1] > 1) & (apart < jnp.finfo(angle.dtype).eps ** 0.4)

@@ -93,7 +93,7 @@ def plan_run(
     *,
     start: Start | State,
     mode: int | None,
-    apart: Number | None,
+    separation: Number | None,
     spin_up: Number | None,
     save: Literal["all", "window"],
     samples: int | None,
@@ -115,7 +115,7 @@ def plan_run(
     periods = np.asarray(count(turns, "turns"), end.dtype)
     control = _step_control(end, steps, estimate)
     scene = with_spin_up_drive(asked, end, start, spin_up)
-    state = start_state(scene, start, mode, apart, throw=throw)
+    state = start_state(scene, start, mode, separation, throw=throw)
 
     known = is_known(scene, end, state)
     is_estimated = isinstance(control, StepControl) and (known if estimate is None else estimate)
@@ -150,16 +150,18 @@ def plan_run(
 def plan_stretch(scene: Scene, length: float, state: State, steps: StepChoice, *, throw: bool) -> RunPlan:
     """Plan one of several runs that follow each other, without a trajectory and an estimate. **Raises** `InputError`."""
     return plan_run(
-        scene, length, start=state, mode=None, apart=None, spin_up=None, save="window", samples=None, turns=20, estimate=False,
-        solver=None, steps=steps, adjoint=None, max_steps=None, progress_meter=None, throw=throw,
+        scene, length, start=state, mode=None, separation=None, spin_up=None, save="window", samples=None, turns=20,
+        estimate=False, solver=None, steps=steps, adjoint=None, max_steps=None, progress_meter=None, throw=throw,
     )  # fmt: skip
 
 
-def start_state(scene: Scene, start: Start | State, mode: int | None, apart: Number | None, *, throw: bool = True) -> State:
+def start_state(
+    scene: Scene, start: Start | State, mode: int | None, separation: Number | None, *, throw: bool = True
+) -> State:
     """Return the state of a start by name, or a user's state, validated. **Raises** `InputError`."""
     if isinstance(start, State):
-        return validate_state(scene, start, mode, apart)
-    return initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+        return validate_state(scene, start, mode, separation)
+    return initial_state(scene, start, mode=mode, separation=separation, throw=throw)
 
 
 def enough_steps(fastest: Array | np.ndarray, end: Array) -> int:

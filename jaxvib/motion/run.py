@@ -56,7 +56,7 @@ class RunStatus(eqx.Enumeration):
     creeping = (
         "the loads balance the rotor, and creep from one arrangement that does so to the next: what is left changes slowly"
     )
-    would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
+    would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
     refused = REFUSED
 
 
@@ -71,8 +71,8 @@ class Run(AbstractMeasured, Result):
     - `steps` taken, and how many of them were `rejected`
     - `error`, estimated; NaN if no estimate was requested, infinite if it cannot be estimated; typical: 1e-8 to 1e-5
     - `scene` that ran
-    - `together`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even if
-      that is unstable. If such a motion repeats itself, the linearized equations show whether loads a little apart leave it;
+    - `coincident`: True if several loads started at one angle and stayed at one angle, as loads with the same numbers do even
+      if that is unstable. If such a motion repeats itself, the linearized equations show whether loads a little apart leave it;
       its status is then `would_separate`, and it is not `settled`
     - `evaluations` of the vector field (0 if the method does not count them) and `seconds`: the cost, including the runs with
       larger steps for the error, and compilation if the program was new; `seconds` is NaN under a JAX transformation
@@ -94,7 +94,7 @@ class Run(AbstractMeasured, Result):
     evaluations: Array = eqx.field(metadata=in_unit(""))
     seconds: Array = eqx.field(metadata=in_unit("s"))
     scene: Scene = eqx.field(metadata=SCENE)
-    together: Array | bool = eqx.field(default=False, metadata=in_unit(""))
+    coincident: Array | bool = eqx.field(default=False, metadata=in_unit(""))
 
     @property
     def settled(self) -> Array:
@@ -118,7 +118,7 @@ class Run(AbstractMeasured, Result):
         if unstable:
             first, state = [f"not settled: {self.message}"], "repeats itself only while the loads are at one angle"
         end = RunStatus[RunStatus.done] if unstable else self.message
-        one_angle = "  all loads ran at one angle, as they started: the motion of loads a little apart may be another one"
+        one_angle = "  all loads stayed at the one angle at which they started: slightly separated loads may move otherwise"
         return "\n".join(
             [
                 *first,
@@ -129,7 +129,7 @@ class Run(AbstractMeasured, Result):
                 f"rotor at {float(self.window.rotor_speed[-1]):.6g} rad/s",
                 f"  {self.extent(self.scene)}",
                 f"  {self.regime.summary()}",
-                *([one_angle] if self.together and not (unstable or self.settled) else []),
+                *([one_angle] if self.coincident and not (unstable or self.settled) else []),
                 *self._detachment(),
             ]
         )

@@ -20,7 +20,7 @@ from jaxvib.motion.integrate import frequency_bounds, whole_turns
 from jaxvib.motion.plan import RunPlan, plan_stretch, start_state
 from jaxvib.motion.run import Run, RunStatus, judged_by_separation
 from jaxvib.motion.simulate import last_state, run_planned
-from jaxvib.motion.start import APART, Start
+from jaxvib.motion.start import START_SEPARATION, Start
 from jaxvib.motion.steps import StepChoice, Tolerance
 from jaxvib.results.status import member, status_name
 from jaxvib.runtime.devices import on_device
@@ -60,7 +60,7 @@ def settle(
     *,
     start: Start | State | None = None,
     mode: int | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     drift: float | None = None,
     periods: int = 100,
     stretches: int = 200,
@@ -84,7 +84,7 @@ def settle(
 
     - `scene` with a drive of constant speed
     - `start`, `mode`: as `simulate`; default: near the jam mode `mode`, at rest without a mode
-    - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
+    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam too
     - `drift`: the change that counts as none, see `Measured`; typical: 1e-3 to 1e-8. If it is given the motion must come to
       less. The default is 1e-6, in single precision 1e-3, and a motion that is steady in the mean or creeps has settled too.
       The estimated distance of the motion from its end, from the slowest decay of the carrier or from the fall of the drift,
@@ -95,8 +95,8 @@ def settle(
     - `throw`: raise if the motion has not settled by then; otherwise the `drift` of the last run shows it, or its status if it
       failed
 
-    A motion that only loads at exactly one angle keep does not count as settled: if they start at one angle (`apart=0`), its
-    status is `would_separate`, see `Run`.
+    A motion that only loads at exactly one angle keep does not count as settled: if they start at one angle (`separation=0`),
+    its status is `would_separate`, see `Run`.
 
     **Returns** the `Run` of the last stretch, without a trajectory and without an estimate of its error.
 
@@ -110,7 +110,7 @@ def settle(
     >>> bool(jv.settle(scene, mode=1).drift < 1e-6)
     True
     """
-    plan = _plan_settle(scene, start, mode, apart, drift, periods, stretches, stepsize_controller, throw=throw)
+    plan = _plan_settle(scene, start, mode, separation, drift, periods, stretches, stepsize_controller, throw=throw)
     run, has_settled = _settled(plan, throw=throw)
     if throw and not has_settled:
         raise ComputationError(
@@ -144,7 +144,7 @@ def _plan_settle(
     scene: Scene,
     start: Start | State | None,
     mode: int | None,
-    apart: Number | None,
+    separation: Number | None,
     drift: float | None,
     periods: int,
     stretches: int,
@@ -163,8 +163,8 @@ def _plan_settle(
     # An imbalance goes on from where it was: the rotor is there after whole turns.
     length = whole_turns(scene, 2.0 * math.pi * periods / float(frequency_bounds(scene)[1]))
     start = ("rest" if mode is None else "jam") if start is None else start
-    apart = APART if apart is None and isinstance(start, str) and start == "jam" else apart
-    state = start_state(scene, start, mode, apart, throw=throw)
+    separation = START_SEPARATION if separation is None and isinstance(start, str) and start == "jam" else separation
+    state = start_state(scene, start, mode, separation, throw=throw)
     return _SettlePlan(
         first=plan_stretch(scene, length, state, Tolerance(1e-9 if double else 1e-5) if steps is None else steps, throw=throw),
         stretches=count(stretches, "stretches"),
@@ -178,18 +178,18 @@ def _plan_settle(
 def _settled(plan: _SettlePlan, *, throw: bool) -> tuple[Run, bool]:
     """Return the run of the last stretch, and true if the motion has settled or is unstable and continues at one angle."""
     length, state = float(plan.first.end), plan.first.state
-    together, drifts, measured, regimes = True, [], [], []
+    coincident, drifts, measured, regimes = True, [], [], []
     while True:
         run = run_planned(dataclasses.replace(plan.first, state=state), throw=throw)
-        is_together, together = bool(run.together), together and bool(run.together)
-        run = dataclasses.replace(run, together=on_device(np.asarray(together)))
+        is_coincident, coincident = bool(run.coincident), coincident and bool(run.coincident)
+        run = dataclasses.replace(run, coincident=on_device(np.asarray(coincident)))
         if not bool(run.finished):
             return run, False
         drifts.append(float(run.drift))
         if drifts[-1] < plan.drift and _distance(drifts, run, plan.decay, length) < _AWAY * plan.drift:
             judged = _judged(run, "done")
             # Loads that are not at exactly one angle leave an unstable motion by themselves.
-            if is_together or status_name(judged.status) == "done":
+            if is_coincident or status_name(judged.status) == "done":
                 return judged, True
         if plan.remembered is not None:
             measured.append([drifts[-1], float(run.omega), float(run.foundation_force), *np.asarray(run.amplitude).tolist()])
@@ -255,11 +255,11 @@ def _steady_in_the_mean(seen: np.ndarray) -> bool:
         return False
     quarters = values.reshape(4, -1, values.shape[1])
     means = quarters.mean(axis=1)
-    apart = means.max(axis=0) - means.min(axis=0)
+    separation = means.max(axis=0) - means.min(axis=0)
     error = np.sqrt(quarters.var(axis=1, ddof=1).mean(axis=0) / quarters.shape[1])
     size = np.abs(means).mean(axis=0)
     size[2:] = size[2:].max()  # a drift is relative to the largest amplitude
-    return bool(np.all(apart <= np.maximum(_SCATTER * error, 0.5 * np.median(drift) * size)))
+    return bool(np.all(separation <= np.maximum(_SCATTER * error, 0.5 * np.median(drift) * size)))
 
 
 def _is_creeping(regimes: Sequence[Regime]) -> bool:

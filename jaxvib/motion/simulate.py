@@ -42,7 +42,7 @@ def simulate(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int | None = None,
@@ -65,9 +65,9 @@ def simulate(
       the time `spin_up`; default: half of `until`), or a `State`; see `initial_state`
     - `mode`: number of the jam mode for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `spin_up`, s; typical: 1 to 20
-    - `apart`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads that
-      start at exactly one angle (`apart=0`) stay at one angle (`Run.together`); if that motion repeats itself but is unstable
-      against their separation, the status is `would_separate`
+    - `separation`: angle between neighbouring loads at a named start, rad; default: side by side or 1 degree, in a jam 0. Loads
+      that start at exactly one angle (`separation=0`) stay at one angle (`Run.coincident`); if that motion repeats itself but
+      is unstable against their separation, the status is `would_separate`
     - `save`: "all" keeps `samples` evenly spaced states; "window" keeps no trajectory, only the measured quantities
     - `samples` (default: 16384; 262144 for runs of more than 1024 turns of the rotor; 2000 under a JAX transformation);
       typical: 20 for each vibration. They cost memory, hardly time
@@ -119,7 +119,7 @@ def simulate(
         until,
         start=start,
         mode=mode,
-        apart=apart,
+        separation=separation,
         spin_up=spin_up,
         save=save,
         samples=samples,
@@ -195,7 +195,7 @@ def _run_in_stretches(plan: RunPlan, control: Control, *, is_measured: bool) -> 
         last,
         **{name: _sum([getattr(run, name) for run in runs]) for name in ("steps", "rejected", "evaluations")},
         window=dataclasses.replace(last.window, time=last.window.time + length * (number - 1)),
-        together=on_device(np.all([known(run.together) for run in runs])),
+        coincident=on_device(np.all([known(run.coincident) for run in runs])),
     )
 
 
@@ -312,9 +312,9 @@ def last_state(scene: Scene, run: Run) -> State:
     """State at the end of a run under a constant speed, from which the run can go on: angles within a turn keep their
     digits."""
     last = jax.tree.map(lambda leaf: np.asarray(leaf)[-1], run.window.state)
-    _, together = wrap_angles(scene, last.displacement.dtype)
+    _, has_common_turns = wrap_angles(scene, last.displacement.dtype)
     first = np.ravel(last.azimuth)[0]
-    inside = tuple(x - 2.0 * np.pi * np.round((first if together else x) / (2.0 * np.pi)) for x in last.angle)
+    inside = tuple(x - 2.0 * np.pi * np.round((first if has_common_turns else x) / (2.0 * np.pi)) for x in last.angle)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, last.displacement.dtype), eqx.tree_at(lambda y: y.angle, last, inside))
 
 

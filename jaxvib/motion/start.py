@@ -26,12 +26,21 @@ from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.units import Number, Numbers, known_number, numbers
 from jaxvib.units.known import when_known
 
-__all__ = ["APART", "Start", "Turning", "initial_state", "require_start", "validate_state", "with_spin", "with_spin_up_drive"]
+__all__ = [
+    "START_SEPARATION",
+    "Start",
+    "Turning",
+    "initial_state",
+    "require_start",
+    "validate_state",
+    "with_spin",
+    "with_spin_up_drive",
+]
 
 Start = Literal["rest", "jam", "spin_up"]
 """Names of initial states: everything at rest; near a jam mode; at rest, the rotor brought up smoothly."""
 
-APART = math.radians(1.0)
+START_SEPARATION = math.radians(1.0)
 """Angle between neighbouring loads at the start, rad, unless they lie side by side: loads at exactly one angle would stay at
 one angle, stable or not."""
 
@@ -46,7 +55,7 @@ def initial_state(
     *,
     mode: int | None = None,
     angles: Numbers | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     throw: bool = True,
 ) -> State:
     """Return an initial state.
@@ -59,10 +68,10 @@ def initial_state(
     - `mode`: number of the jam mode, for "jam"; typical: 1, 3, 5, the modes that are stable for light loads
     - `angles`: the loads' angles about the rotor's axis, rad, (count,); or one number for the middle of all loads, in place of
       the angle of `Loads.rest` at rest and 0 in a jam. The platforms of a jam go with the mean angle; typical: -pi to pi
-    - `apart`: angle between neighbouring loads, rad; typical: 0.02. Loads that touch (`LoadContact`) start this much further
-      apart than side by side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0 in a
-      jam, whose theory is about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at
-      exactly one angle (`apart=0`) stay at one angle, even if the motion is unstable against their separation
+    - `separation`: angle between neighbouring loads, rad; typical: 0.02. Loads that touch (`LoadContact`) start this much
+      further apart than side by side. Default: at rest side by side if the loads' `ball_radius` is known, otherwise 1 degree; 0
+      in a jam, whose theory is about loads at one angle, and for `angles` (count,). Loads with the same numbers that start at
+      exactly one angle (`separation=0`) stay at one angle, even if the motion is unstable against their separation
     - `throw`: raise if the mode does not exist; otherwise, and under a JAX transformation, the state is NaN
 
     A motor's rotor starts at rest, at the angle 0.
@@ -88,7 +97,7 @@ def initial_state(
     def phases(rest: float | Array) -> Array:
         middle = known(rest if angles is None else numbers(angles, "rad", "angles", n))
         one_each = angles is not None and not isinstance(angles, str) and np.ndim(angles) > 0  # pyright: ignore[reportArgumentType]
-        return middle + _places(scene, start, apart, one_each=one_each)
+        return middle + _places(scene, start, separation, one_each=one_each)
 
     if start != "jam":
         rotor = None if scene.drive.ideal else (zero[0], zero[0])
@@ -116,17 +125,17 @@ def initial_state(
     return with_spin(scene, _in_jam(modes.omega, modes.displacement, row, angle))
 
 
-def _places(scene: Scene, start: Start, apart: Number | None, *, one_each: bool) -> Array | np.ndarray:
+def _places(scene: Scene, start: Start, separation: Number | None, *, one_each: bool) -> Array | np.ndarray:
     """Return the loads' angles relative to their middle, (count,) rad; `one_each`: each load has its own angle already."""
     n = scene.loads.count
     touching = has_term(scene.effects, LoadInteraction)
     wide = getattr(scene.loads, "ball_radius", None) is not None
-    usual = apart is None and start != "jam"
+    usual = separation is None and start != "jam"
     side_by_side = not one_each and (touching or (usual and wide))
-    if apart is not None:
-        gap = known_number(apart, "rad", "apart", low=0.0)
+    if separation is not None:
+        gap = known_number(separation, "rad", "separation", low=0.0)
     else:
-        gap = min(APART, math.pi / n) if usual and not (wide or one_each) else 0.0
+        gap = min(START_SEPARATION, math.pi / n) if usual and not (wide or one_each) else 0.0
     evenly = gap * (np.arange(n) - 0.5 * (n - 1)).astype(scene.drive.speed.dtype)
     return evenly + known(scene.loads.offsets()) if side_by_side else evenly
 
@@ -222,13 +231,13 @@ def _require_shorter(duration: float, end: float) -> None:
         raise InputError("spin_up", f"is {duration:g} s, longer than the run of {end:g} s; run longer")
 
 
-def validate_state(scene: Scene, state: State, mode: int | None, apart: Number | None = None) -> State:
+def validate_state(scene: Scene, state: State, mode: int | None, separation: Number | None = None) -> State:
     """Return a user's initial state, completed by the loads' own rotation.
 
-    **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `apart` is given beside it.
+    **Raises** `InputError` if its shapes are not those of the scene, or if a `mode` or `separation` is given beside it.
     """
-    if apart is not None:
-        raise InputError("apart", f"is {quoted(apart)}, which goes with named starts; put the loads' angles into the State")
+    if separation is not None:
+        raise InputError("separation", f"is {quoted(separation)}, for named starts only; put the angles into the State")
     if mode is not None:
         raise InputError("mode", f"is {quoted(mode)}, for start='jam' only; leave it out if the start is a State")
     nd, n = scene.machine.structure().mass.shape[0], scene.loads.count

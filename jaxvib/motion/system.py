@@ -47,24 +47,25 @@ class PackedSystem(eqx.Module):
     Where angles are wrapped the integrator holds each within a turn, and beside it the whole turns it has done: a long run in
     single precision keeps its phase, for an angle of a million radians has no digits left of where in a turn it is.
 
-    **Arguments**: the vector field; a state; `wrapped` whether angles are; `together` whether all loads' angles are wrapped by
-    the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that integrates
-    them, if it is not `method`.
+    **Arguments**: the vector field; a state; `wrapped` whether angles are; `has_common_turns` whether all loads' angles are
+    wrapped by the same turns, so that their differences stay; `batch`: true if many runs advance together; the `solver` that
+    integrates them, if it is not `method`.
 
     **Attributes**: `program` the equations, on numbers where `is_scalarized`, else on arrays, None where JAX lets nobody read
-    programs; `size` how many numbers the state has; `apart` whether they are held one by one; `args` the arguments of `term`.
+    programs; `size` how many numbers the state has; `is_on_scalars` whether they are held one by one; `args` the arguments of
+    `term`.
     """
 
     args: Args
     program: ClosedJaxpr | None = eqx.field(static=True)
     is_scalarized: bool = eqx.field(static=True)
     size: int = eqx.field(static=True)
-    apart: bool = eqx.field(static=True)
+    is_on_scalars: bool = eqx.field(static=True)
     fences: bool = eqx.field(static=True)
     like: Any = eqx.field(static=True)
     shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     wrapped: bool = eqx.field(static=True)
-    together: bool = eqx.field(static=True)
+    has_common_turns: bool = eqx.field(static=True)
     batch: bool = eqx.field(static=True)
 
     def __init__(
@@ -73,11 +74,11 @@ class PackedSystem(eqx.Module):
         state: State,
         *,
         wrapped: bool = False,
-        together: bool = False,
+        has_common_turns: bool = False,
         batch: bool = False,
         solver: diffrax.AbstractSolver | None = None,
     ):
-        self.wrapped, self.together, self.batch = wrapped, together, batch
+        self.wrapped, self.has_common_turns, self.batch = wrapped, has_common_turns, batch
         leaves, self.like = jax.tree.flatten(state)
         self.shapes = tuple(leaf.shape for leaf in leaves)
         self.size = sum(leaf.size for leaf in leaves)
@@ -91,8 +92,8 @@ class PackedSystem(eqx.Module):
         if program is not None:
             # Entry by entry already here, so that the time loop has no arrays to take apart.
             self.args = scalars_of(field)
-        self.apart = self.is_scalarized and (batch or is_written)
-        self.fences = self.apart and solver is None
+        self.is_on_scalars = self.is_scalarized and (batch or is_written)
+        self.fences = self.is_on_scalars and solver is None
 
     @property
     def term(self) -> diffrax.ODETerm:
@@ -109,7 +110,7 @@ class PackedSystem(eqx.Module):
 
     def pack(self, state: State) -> Held:
         """A state (or a tree like it) as the integrator holds it."""
-        y = tuple(scalars_of(state)) if self.apart else ravel(state)
+        y = tuple(scalars_of(state)) if self.is_on_scalars else ravel(state)
         return (y, jax.tree.map(jnp.zeros_like, y)) if self.wrapped else y
 
     def unpack(self, held: Held) -> State:
@@ -126,9 +127,9 @@ class PackedSystem(eqx.Module):
         first = y[int(np.argmax(angles))]
 
         def whole(x: Array, is_angle: np.ndarray, is_load: np.ndarray) -> Array:
-            return jnp.where(is_angle, jnp.round(jnp.where(is_load & self.together, first, x) / _TURN), 0.0)
+            return jnp.where(is_angle, jnp.round(jnp.where(is_load & self.has_common_turns, first, x) / _TURN), 0.0)
 
-        masks = (tuple(angles), tuple(loads)) if self.apart else (angles, loads)
+        masks = (tuple(angles), tuple(loads)) if self.is_on_scalars else (angles, loads)
         done = jax.tree.map(whole, y, *masks)
         return _turned(y, done, -1.0), jax.tree.map(jnp.add, turns, done)
 
@@ -144,7 +145,7 @@ class PackedSystem(eqx.Module):
 
     def _state(self, y: Held) -> State:
         """States along a leading axis."""
-        rows = jnp.stack(y, axis=-1) if self.apart else y
+        rows = jnp.stack(y, axis=-1) if self.is_on_scalars else y
         ends = np.cumsum([math.prod(shape) for shape in self.shapes])
         parts = [
             rows[..., end - math.prod(shape) : end].reshape(*rows.shape[:-1], *shape)
@@ -164,10 +165,10 @@ class PackedSystem(eqx.Module):
         run = jaxpr_as_fun(self.program)
         if not self.is_scalarized:
             return ravel(run(jnp.asarray(t, y.dtype), *jax.tree.leaves(self._state(y)), *jax.tree.leaves(args)))
-        numbers = y if self.apart else jnp.unstack(y)
+        numbers = y if self.is_on_scalars else jnp.unstack(y)
         given = [jnp.asarray(t, numbers[0].dtype), *numbers, *args]
         rates = fenced(self.program, given) if self.fences else run(*given)
-        return tuple(rates) if self.apart else jnp.stack(rates)
+        return tuple(rates) if self.is_on_scalars else jnp.stack(rates)
 
 
 def _turned(y: Held, turns: Held, sign: float) -> Held:

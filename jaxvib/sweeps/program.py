@@ -13,7 +13,7 @@ from jaxvib.errors import InputError
 from jaxvib.machine.scene import Scene
 from jaxvib.motion.batch import BATCH_SIZE, PARTS, BatchPlan, run_in_batch
 from jaxvib.motion.integrate import frequency_bounds
-from jaxvib.motion.start import APART, Start, initial_state
+from jaxvib.motion.start import START_SEPARATION, Start, initial_state
 from jaxvib.motion.stiffness import fastest_decay, steps_of
 from jaxvib.runtime.programs import cached
 from jaxvib.sweeps.axes import Spot, put, put_start
@@ -64,8 +64,8 @@ def _each(
         this = put(scene, spots, value)
         evaluation, run = Evaluation(this), None
         if plan is not None:
-            apart = APART if start == "jam" else None  # at one angle, no run would show that a jam is unstable
-            state = put_start(initial_state(this, start, mode=mode, apart=apart, throw=False), spots, value)
+            separation = START_SEPARATION if start == "jam" else None  # at one angle, no run would show that a jam is unstable
+            state = put_start(initial_state(this, start, mode=mode, separation=separation, throw=False), spots, value)
             run = run_in_batch(this, state, plan)
 
         def read(measure: Measure) -> Array:

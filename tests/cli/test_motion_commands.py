@@ -84,12 +84,12 @@ def test_loads_start_apart_as_typed_in_every_command(typed, monkeypatch, command
     asked = []
 
     def noted(scene, *positional, **named):
-        asked.append(named["apart"])
+        asked.append(named["separation"])
         raise jv.ComputationError("stopped", "no more is needed")
 
     monkeypatch.setattr(f"jaxvib.{command.replace('-', '_')}", noted)
     words = (command, "machine.toml", *(() if command == "settle" else ("--until", "1s")))
-    assert typed(*words, "--apart", "3 deg")[0] == typed(*words)[0] == 1
+    assert typed(*words, "--separation", "3 deg")[0] == typed(*words)[0] == 1
     assert asked == ["3 deg", None]
 
 

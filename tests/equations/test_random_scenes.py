@@ -107,7 +107,7 @@ def derivatives():
     base = eqx.tree_at(lambda s: s.effects, SCENES["two platforms"], ())
     base = eqx.tree_at(lambda s: s.loads, base, jv.pendulums(count=2, mass=0.4, radius=0.1, drag=0.9, inertia=1e-3))
     restore = ravel_pytree(base)[1]
-    start = jv.initial_state(base, apart=0.5)
+    start = jv.initial_state(base, separation=0.5)
 
     def jam(flat):
         return jv.jam_modes(restore(flat)).select(1, throw=False).foundation_force

@@ -172,9 +172,9 @@ def test_growth_starts_as_far_apart_as_asked(monkeypatch):
         raise jv.ComputationError("stopped", "no more is needed")
 
     monkeypatch.setattr("jaxvib.motion.growth.run_planned", noted)
-    for apart in (None, "10 deg", 0.0):
+    for separation in (None, "10 deg", 0.0):
         with pytest.raises(jv.ComputationError, match="no more"):
-            jv.growth(s, 10.0, apart=apart)
+            jv.growth(s, 10.0, separation=separation)
     np.testing.assert_allclose(np.degrees(starts), [1.0, 10.0, 0.0], atol=1e-12)
     with pytest.raises(jv.InputError, match="goes with named starts"):
-        jv.growth(s, 10.0, start=jv.initial_state(s), apart=0.0)
+        jv.growth(s, 10.0, start=jv.initial_state(s), separation=0.0)

@@ -75,7 +75,7 @@ def two_pendulums(mass, drag, imbalance):
     machine = jv.planar_rotor(mass=37.0, stiffness=1.16e6, damping=843.0)
     loads = jv.pendulums(count=2, mass=mass, radius=0.08, drag=drag)
     s = jv.Scene(machine, loads, jv.ConstantSpeed(460.0), effects=(jv.StaticImbalance(imbalance),))
-    return s, jv.initial_state(s, apart="3 deg")
+    return s, jv.initial_state(s, separation="3 deg")
 
 
 def test_a_motion_that_beats_has_settled_in_the_mean():
@@ -141,12 +141,12 @@ def test_single_precision_goes_on_from_stretch_to_stretch(monkeypatch):
     assert not np.allclose(np.exp(1j * phase), 1.0, atol=0.3)
 
 
-@pytest.mark.parametrize(("apart", "steady"), [(2.5, True), (6.0, False)])
-def test_means_of_quarters_are_judged_by_their_own_error(apart, steady):
+@pytest.mark.parametrize(("separation", "steady"), [(2.5, True), (6.0, False)])
+def test_means_of_quarters_are_judged_by_their_own_error(separation, steady):
     """40 stretches a quarter, scattering by +-1e-3 about means that are so many errors of a mean apart."""
     swing = 1e-3 * np.tile([1.0, -1.0], 20)
     error = np.std(swing, ddof=1) / np.sqrt(40.0)
-    quarters = [1.0 + swing + (apart * error if k == 2 else 0.0) for k in range(4)]
+    quarters = [1.0 + swing + (separation * error if k == 2 else 0.0) for k in range(4)]
     values = np.concatenate(quarters)
     seen = np.stack([np.full(160, 1e-7) * (1.0 + 0.1 * np.tile([1.0, -1.0], 80)), values, values, values, values], axis=1)
     assert _steady_in_the_mean(seen) is steady
@@ -166,11 +166,11 @@ def begins_at(monkeypatch, s, **given):
     return starts[0]
 
 
-@pytest.mark.parametrize("given", [{"mode": 3}, {}, {"start": "rest"}, {"apart": "1 deg"}])
+@pytest.mark.parametrize("given", [{"mode": 3}, {}, {"start": "rest"}, {"separation": "1 deg"}])
 def test_loads_settle_from_angles_one_degree_apart(monkeypatch, given):
     s = scene("two_mass", "balls", speed=150.0)
     np.testing.assert_allclose(np.diff(begins_at(monkeypatch, s, **given).azimuth), np.deg2rad([1.0, 1.0]), rtol=1e-12)
-    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, apart=0.0).azimuth), [0.0, 0.0])
+    np.testing.assert_array_equal(np.diff(begins_at(monkeypatch, s, separation=0.0).azimuth), [0.0, 0.0])
 
 
 @pytest.mark.parametrize(("periods", "stretches"), [(100, 32), (400, 32), (50, 64), (30, 108)])

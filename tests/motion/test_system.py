@@ -61,7 +61,7 @@ def test_a_state_comes_back_as_it_was(name, solver):
     state = rotor_state(case(name), 5)
     for wrapped in (False, True):
         motion = PackedSystem(jv.vector_field(case(name)), state, wrapped=wrapped, solver=solver)
-        assert motion.apart == (isinstance(solver, UnrolledDopri8) and motion.is_scalarized)
+        assert motion.is_on_scalars == (isinstance(solver, UnrolledDopri8) and motion.is_scalarized)
         back = motion.unpack(jax.tree.map(lambda x: x[None], motion.pack(state)))
         jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), back, state)
 
@@ -71,14 +71,14 @@ def test_wrapping_counts_every_turn(machine):
     """Both for numbers held one by one and for a vector."""
     s = scene(machine, "balls")
     state = eqx.tree_at(lambda y: y.angle, some_state(s), (jnp.asarray([7.0, -20.0, 1.0]),))
-    for together in (False, True):
-        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, together=together)
-        assert motion.apart == (machine == "one_mass")
+    for has_common_turns in (False, True):
+        motion = PackedSystem(jv.vector_field(s), state, wrapped=True, has_common_turns=has_common_turns)
+        assert motion.is_on_scalars == (machine == "one_mass")
         method = motion.method()
         assert isinstance(method, (LoopDopri8, UnrolledDopri8)) and method.wrap is not None
         held = method.wrap(motion.pack(state))
         inside = np.asarray(motion._state(jax.tree.map(lambda x: x[None], held[0])).angle[0][0])
-        if together:
+        if has_common_turns:
             # All by the turns of the first.
             np.testing.assert_allclose(np.diff(inside), np.diff(state.angle[0]), rtol=1e-14)
             assert abs(inside[0]) <= np.pi

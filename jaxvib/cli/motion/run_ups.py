@@ -8,7 +8,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import Output, app, shared, table
-from jaxvib.cli.document import APART
+from jaxvib.cli.document import SEPARATION
 
 
 @app.command("run-ups")
@@ -17,7 +17,7 @@ from jaxvib.cli.document import APART
 @click.option("--drag", "drags", multiple=True, help="Drag of the loads, such as '0.5 N s/m', repeatable [the scene's].")
 @click.option("--starts", type=int, help="So many random sets of angles [one, loads beside each other at the bottom].")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the random angles.")
-@APART
+@SEPARATION
 @click.option("--tolerance", type=float, help="Error a step may make [1e-7].")
 @click.option("--batch", type=int, default=16, show_default=True, help="So many go side by side.")
 @shared
@@ -27,7 +27,7 @@ def run_ups(
     drags: tuple[str, ...],
     starts: int | None,
     seed: int,
-    apart: str | None,
+    separation: str | None,
     tolerance: float | None,
     batch: int,
     output: Output,
@@ -38,7 +38,9 @@ def run_ups(
     each = [float(number(drag, "N s/m", "--drag", low=0.0)) for drag in drags] or None
     steps = None if tolerance is None else jv.Tolerance(tolerance)
     loaded = jv.load_scene(scene)
-    found = jv.run_ups(loaded, until, drag=each, starts=starts, seed=seed, apart=apart, batch=batch, stepsize_controller=steps)
+    found = jv.run_ups(
+        loaded, until, drag=each, starts=starts, seed=seed, separation=separation, batch=batch, stepsize_controller=steps
+    )
     output.picture("run_ups.png", found.plot)
     output.keep("run_ups.npz", found)
     kinds = sorted(set(found.kind.ravel().tolist()))

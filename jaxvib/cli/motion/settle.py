@@ -9,7 +9,7 @@ import click
 
 import jaxvib as jv
 from jaxvib.cli.app import SPEED, WITHOUT, Output, app, loaded_scene, shared
-from jaxvib.cli.document import APART, chosen_steps, measured_document, run_document
+from jaxvib.cli.document import SEPARATION, chosen_steps, measured_document, run_document
 from jaxvib.cli.output import CSV
 from jaxvib.errors import InputError
 
@@ -26,7 +26,7 @@ _MODE = click.option("--mode", type=int, help="Number of the jam mode to start i
 @click.argument("scene", type=click.Path(path_type=Path))
 @_START
 @_MODE
-@APART
+@SEPARATION
 @click.option("--drift", type=float, help="Relative change that counts as none [1e-6, or steady in the mean].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-9].")
 @click.option("--stretches", type=int, default=200, show_default=True, help="Give up after so many stretches.")
@@ -36,7 +36,7 @@ def settle(
     scene: Path,
     start: Start | None,
     mode: int | None,
-    apart: str | None,
+    separation: str | None,
     drift: float | None,
     tolerance: float | None,
     stretches: int,
@@ -49,7 +49,9 @@ def settle(
     """
     loaded = loaded_scene(scene, speed=speed, constant=True)
     steps = chosen_steps(tolerance, None)
-    run = jv.settle(loaded, start=start, mode=mode, apart=apart, drift=drift, stretches=stretches, stepsize_controller=steps)
+    run = jv.settle(
+        loaded, start=start, mode=mode, separation=separation, drift=drift, stretches=stretches, stepsize_controller=steps
+    )
     output.picture("history.png", run.plot)
     output.keep("run.npz", run)
     output.done(run_document(run), run.summary, "settle", run)
@@ -60,7 +62,7 @@ def settle(
 @click.option("--until", required=True, help="End time, such as 20s or '10 min'.")
 @_START
 @_MODE
-@APART
+@SEPARATION
 @click.option("--spin-up", help="Time in which the rotor comes up, with --start spin_up [half of --until].")
 @click.option("--tolerance", type=float, help="Error a step may make [1e-4].")
 @WITHOUT
@@ -71,7 +73,7 @@ def envelope(
     until: str,
     start: Start | None,
     mode: int | None,
-    apart: str | None,
+    separation: str | None,
     spin_up: str | None,
     tolerance: float | None,
     without: tuple[str, ...],
@@ -82,7 +84,7 @@ def envelope(
     loaded = loaded_scene(scene, without)
     begin = ("rest" if mode is None else "jam") if start is None else start
     steps = None if tolerance is None else jv.Tolerance(tolerance)
-    run = jv.envelope(loaded, until, start=begin, mode=mode, apart=apart, spin_up=spin_up, stepsize_controller=steps)
+    run = jv.envelope(loaded, until, start=begin, mode=mode, separation=separation, spin_up=spin_up, stepsize_controller=steps)
     output.picture("envelope.png", run.plot)
     output.keep("envelope.npz", run)
     output.csv(csv, run, "trajectory_time")
@@ -95,7 +97,7 @@ def envelope(
 @click.option("--until", required=True, help="How long all stretches are together, such as 60s.")
 @_START
 @_MODE
-@APART
+@SEPARATION
 @SPEED
 @click.option("--stretches", type=int, default=40, show_default=True, help="Into how many stretches it is cut, 8 at least.")
 @shared
@@ -104,7 +106,7 @@ def growth(
     until: str,
     start: Start | None,
     mode: int | None,
-    apart: str | None,
+    separation: str | None,
     speed: str | None,
     stretches: int,
     output: Output,
@@ -114,6 +116,6 @@ def growth(
         raise InputError("--start", "is 'spin_up'; how disturbances grow is asked under a constant speed, from rest or a jam")
     begin = ("rest" if mode is None else "jam") if start is None else start
     loaded = loaded_scene(scene, speed=speed, constant=True)
-    found = jv.growth(loaded, until, start=begin, mode=mode, apart=apart, stretches=stretches)
+    found = jv.growth(loaded, until, start=begin, mode=mode, separation=separation, stretches=stretches)
     output.picture("growth.png", found.plot)
     output.done(found.as_dict(), found.summary, "growth", found)

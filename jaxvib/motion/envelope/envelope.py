@@ -129,7 +129,7 @@ def envelope(
     *,
     start: Start | State = "rest",
     mode: int | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     spin_up: Number | None = None,
     save: Literal["all", "window"] = "all",
     samples: int = 256,
@@ -155,8 +155,8 @@ def envelope(
 
     - `scene`, without effects other than gravity
     - `until`, s; typical: 5 to 600
-    - `start`, `mode`, `apart`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: loads that
-      start apart separate if the averaged motion at one angle is unstable
+    - `start`, `mode`, `separation`, `spin_up`, `turns`, `adjoint`, `throw`: as `simulate`. Each load has its own phase: loads
+      that start apart separate if the averaged motion at one angle is unstable
     - `save`: "all" keeps `samples` (default 256) evenly spaced times; "window" keeps only the measuring window
     - `stepsize_controller`: `Tolerance`, the error that a step may make, relative to the largest amplitude, and absolute in
       natural units, for rates the rotor's speed, for phases 1 rad; typical: 1e-3 to 1e-6, default 1e-4. Or a step size
@@ -195,11 +195,11 @@ def envelope(
         chosen = np.asarray(small_number(chosen.tolerance, "tolerance", end, 10.0), end.dtype)
     asked, scene = scene, with_spin_up_drive(scene, end, start, spin_up)
     if isinstance(start, State):
-        state = validate_state(scene, start, mode, apart)
+        state = validate_state(scene, start, mode, separation)
     else:
         # From rest, which is known without looking, the state is made in the compiled run: out here it would take longer.
-        known = start in ("rest", "spin_up") and mode is None and apart is None
-        state = None if known else initial_state(scene, start, mode=mode, apart=apart, throw=throw)
+        known = start in ("rest", "spin_up") and mode is None and separation is None
+        state = None if known else initial_state(scene, start, mode=mode, separation=separation, throw=throw)
     run = _run(
         scene, end, state, solver, chosen, adjoint, samples if save == "all" else 0, turns, count(max_steps, "max_steps")
     )

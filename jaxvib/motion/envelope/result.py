@@ -31,7 +31,7 @@ class EnvelopeStatus(eqx.Enumeration):
     not_finite = "the motion grew beyond all bounds"
     no_step = "a step of the method could not be computed: its implicit equations were not solved"
     no_start = "the state to start from does not exist or is not finite"
-    would_separate = "all loads are at nearly one angle, but this motion is unstable: loads a little further apart leave it"
+    would_separate = "all loads are at nearly one angle, but this motion is unstable: slightly separated loads leave it"
     refused = REFUSED
     not_turning = "a load turns too slowly against gravity, or is not lifted by its drag, for gravity to average out"
 

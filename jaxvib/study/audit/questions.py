@@ -19,7 +19,7 @@ from jaxvib.motion.analysis.scaled_error import natural_units
 from jaxvib.motion.run import Run
 from jaxvib.motion.settle import settle
 from jaxvib.motion.simulate import simulate
-from jaxvib.motion.start import APART, initial_state, with_spin
+from jaxvib.motion.start import START_SEPARATION, initial_state, with_spin
 from jaxvib.results.status import status_name
 from jaxvib.steady.jams.jam import jam_modes
 from jaxvib.steady.orbits.describe import OrbitStatus
@@ -108,7 +108,7 @@ class JamQuestion(NamedTuple):
         n = scene.loads.count
         orbit = jam_orbit(admitted(scene), mode=self.mode, throw=False)
         displacement, velocity, (angle,), rate = orbit.at(jnp.zeros(()))
-        spread = APART * jnp.asarray(np.arange(n) - 0.5 * (n - 1))
+        spread = START_SEPARATION * jnp.asarray(np.arange(n) - 0.5 * (n - 1))
         return with_spin(scene, State(displacement, velocity, (angle + spread,), rate))
 
     def full(self, scene: Scene) -> Values:

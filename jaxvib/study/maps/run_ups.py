@@ -110,7 +110,7 @@ def run_ups(
     starts: int | None = None,
     seed: int = 0,
     angles: Sequence[Sequence[float]] | None = None,
-    apart: Number | None = None,
+    separation: Number | None = None,
     stepsize_controller: StepChoice | None = None,
     batch: int = 16,
     max_steps: int | None = None,
@@ -126,9 +126,9 @@ def run_ups(
     - `starts`: number of sets of random angles, uniform over the circle, by `seed`; typical: 32 to 1000. From few starts a
       share is known to 1 / sqrt(starts) only
     - `seed` of the random angles
-    - `angles`: the sets themselves, (ns, count) rad, in place of `starts`. Default: one set, at the bottom and as far `apart`
-      as in `simulate`
-    - `apart`: angle between neighbouring loads of that set, rad; typical: 0.02
+    - `angles`: the sets themselves, (ns, count) rad, in place of `starts`. Default: one set, at the bottom with the
+      `separation` of `simulate`
+    - `separation`: angle between neighbouring loads of that set, rad; typical: 0.02
     - `stepsize_controller`: as `simulate`, but no `Accuracy`; the default is `Tolerance(1e-7)`, in single precision 1e-5
     - `batch`: number of runs that go side by side on each core; typical: 16 (the default)
     - `max_steps`: a run fails after this number of steps; default: as `simulate`, 2^20 at least
@@ -166,9 +166,10 @@ def run_ups(
     n = scene.loads.count
     if starts is not None and angles is not None:
         raise InputError("starts", "goes without angles: either random angles or those that are named")
-    if apart is not None and not (starts is None and angles is None):
+    if separation is not None and not (starts is None and angles is None):
         raise InputError(
-            "apart", f"is {quoted(apart)}, which goes without starts and angles: it places the loads of a single start"
+            "separation",
+            f"is {quoted(separation)}; it places the loads of a single start, leave out starts and angles",
         )
     if angles is not None:
         sets = np.asarray(angles, dtype=float)
@@ -179,7 +180,7 @@ def run_ups(
         if has_term(scene.effects, LoadInteraction):
             sets = np.sort(sets, axis=1)  # on one track in the order of their numbers
     else:
-        sets = np.asarray(initial_state(scene, apart=apart).azimuth)[None]
+        sets = np.asarray(initial_state(scene, separation=separation).azimuth)[None]
     count(batch, "batch")
     require_start(scene, (jnp.asarray(sets),))
 

@@ -26,8 +26,8 @@ def two_balls(drag, speed, mass=0.5):
 
 def test_three_balls_balance_a_rotor_unless_at_one_angle():
     s = three_balls(ball_radius=0.011)
-    apart, one_angle = (jv.simulate(s, 10.0, apart=a, save="window", estimate=False) for a in (None, 0.0))
-    assert apart.regime.label == "balanced" and float(apart.foundation_force) < 1.0
+    separated, one_angle = (jv.simulate(s, 10.0, separation=a, save="window", estimate=False) for a in (None, 0.0))
+    assert separated.regime.label == "balanced" and float(separated.foundation_force) < 1.0
     assert one_angle.status_name == "would_separate" and not bool(one_angle.settled) and bool(one_angle.finished)
     assert one_angle.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
     np.testing.assert_allclose(one_angle.foundation_force, 215.5, rtol=1e-3)
@@ -37,8 +37,8 @@ def test_three_balls_balance_a_rotor_unless_at_one_angle():
     ("given", "expected"),
     [
         (dict(), np.deg2rad([-1.0, 0.0, 1.0])),
-        (dict(apart="3 deg"), np.deg2rad([-3.0, 0.0, 3.0])),
-        (dict(apart=0.0), [0.0, 0.0, 0.0]),
+        (dict(separation="3 deg"), np.deg2rad([-3.0, 0.0, 3.0])),
+        (dict(separation=0.0), [0.0, 0.0, 0.0]),
         (dict(angles=0.5 - np.pi / 2), 0.5 + np.deg2rad([-1.0, 0.0, 1.0])),
         (dict(angles=[0.0, 0.0, 0.0]), [np.pi / 2] * 3),
     ],
@@ -71,7 +71,7 @@ def test_separation_grows_as_the_exact_multipliers_say(drag, speed, mode, separa
     orbit = jv.jam_orbit(s, mode=mode)
     rates = np.log(np.abs(np.asarray(orbit.multipliers))) * float(orbit.omega) / (2.0 * np.pi)
     run = jv.simulate(s, 20.0, start="jam", mode=mode, save="window", estimate=False)
-    assert bool(run.together) and float(run.drift) < 1e-3 and bool(orbit.stable) != separates
+    assert bool(run.coincident) and float(run.drift) < 1e-3 and bool(orbit.stable) != separates
     assert run.status_name == ("would_separate" if separates else "done") and bool(run.settled) != separates
     np.testing.assert_allclose(
         separation_rate(s, run.window), np.max(rates) if separates else -0.5 / (2 * 1.4 * 0.5), rtol=1e-3
@@ -83,14 +83,14 @@ def test_unequal_loads_are_judged_by_the_whole_state():
     s, mass = two_balls(5.0, 100.0), jnp.asarray([0.4, 0.6])
     unequal = eqx.tree_at(lambda x: (x.loads.mass, x.loads.drag), s, (mass, 10.0 * mass))
     run = jv.simulate(unequal, 20.0, start="jam", mode=3, save="window", estimate=False)
-    assert bool(run.together) and would_separate(unequal, run.window)
+    assert bool(run.coincident) and would_separate(unequal, run.window)
     equal = jv.simulate(s, 20.0, start="jam", mode=3, save="window", estimate=False)
     np.testing.assert_allclose(separation_rate(unequal, run.window), separation_rate(s, equal.window), rtol=1e-3)
 
 
 def test_settle_never_calls_an_unstable_common_angle_settled():
     s = two_balls(5.0, 100.0)
-    one_angle = jv.settle(s, apart=0.0)
+    one_angle = jv.settle(s, separation=0.0)
     assert one_angle.status_name == "would_separate" and not bool(one_angle.settled)
     assert one_angle.summary().startswith("not settled: ")
     free = jv.settle(s, drift=1e-3)

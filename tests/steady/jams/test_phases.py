@@ -280,12 +280,12 @@ def test_jams_by_slope_are_judged_for_loads_that_may_part():
     assert growth[2] < 0.0 < growth[3] and growth[4] > 0.0
     # The full equations, loads 0.01 rad apart, and together.
     asked = dict(start="jam", mode=5, estimate=False, samples=2)
-    glued, parted = (jv.simulate(s, 2.0, apart=a, **asked) for a in (0.0, 0.01))
-    apart = [float(np.ptp(run.trajectory.state.angle[0][k])) for run in (glued, parted) for k in (0, -1)]
-    assert apart[0] == 0.0 and apart[1] < 1e-6 and abs(apart[2] - 0.02) < 1e-12 and apart[3] > 0.5
-    assert bool(glued.together) and not bool(parted.together)
-    assert glued.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
-    assert "unstable" not in parted.summary()
+    coincident, separated = (jv.simulate(s, 2.0, separation=a, **asked) for a in (0.0, 0.01))
+    separation = [float(np.ptp(run.trajectory.state.angle[0][k])) for run in (coincident, separated) for k in (0, -1)]
+    assert separation[0] == 0.0 and separation[1] < 1e-6 and abs(separation[2] - 0.02) < 1e-12 and separation[3] > 0.5
+    assert bool(coincident.coincident) and not bool(separated.coincident)
+    assert coincident.summary().startswith("not settled: all loads are at nearly one angle, but this motion is unstable")
+    assert "unstable" not in separated.summary()
 
 
 def test_every_jam_is_listed_once_and_in_order():

@@ -61,9 +61,9 @@ def test_run_ups_start_as_far_apart_as_asked():
         jv.balls(count=2, mass=0.4, radius=0.08, drag=0.5),
         jv.SpinUp(60.0, duration=1.0),
     )
-    for apart in ("10 deg", 0.0):
-        found = jv.run_ups(s, 0.1, apart=apart, stepsize_controller=jv.Tolerance(1e-5))
-        np.testing.assert_allclose(np.degrees(np.ptp(found.angle)), 10.0 if apart else 0.0, atol=1e-12)
+    for separation in ("10 deg", 0.0):
+        found = jv.run_ups(s, 0.1, separation=separation, stepsize_controller=jv.Tolerance(1e-5))
+        np.testing.assert_allclose(np.degrees(np.ptp(found.angle)), 10.0 if separation else 0.0, atol=1e-12)
     for others in ({"starts": 3}, {"angles": [[0.0, 0.1]]}):
-        with pytest.raises(jv.InputError, match=r"apart is '10 deg', which goes without starts and angles"):
-            jv.run_ups(s, 0.1, apart="10 deg", **others)
+        with pytest.raises(jv.InputError, match=r"separation is '10 deg'; it places the loads of a single start"):
+            jv.run_ups(s, 0.1, separation="10 deg", **others)
